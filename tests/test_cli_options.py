@@ -45,7 +45,7 @@ def test_help_shows_the_text_and_the_default_of_every_option() -> None:
             assert f"{option.help} [default: ({option.show_default})]" in text, (command, option.name)
         elif option.default is not None and option.default is not False and not option.required:
             seen += 1
-            word = "masks" if option.default is True else option.default
+            word = option.name if option.default is True else option.default
             assert f"{option.help} [default: {word}]" in text, (command, option.name)
     assert seen > 30
 

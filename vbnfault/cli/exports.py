@@ -67,3 +67,27 @@ def report(
     from ..output.report import Limits, write_report
 
     typer.echo(str(write_report(store, out, Limits(gallery=samples, pixels=pixels))))
+
+
+@app.command(rich_help_panel=_PANEL)
+def view(
+    store: StoreArgument,
+    port: Annotated[int, whole(0, 65535, "Port of the server on this machine; 0 takes a free one.")] = 0,
+    browser: Annotated[bool, typer.Option(help="Open the page in a browser.")] = True,
+) -> None:
+    """Show a store in a browser: every sample with its masks, layers and parameters. Ctrl-C ends it."""
+    import signal
+    import webbrowser
+
+    from ..output.viewer import Viewer
+    from ..store import open_store
+
+    viewer = Viewer(open_store(store), port)
+    typer.echo(f"{viewer.url}  (Ctrl-C ends it)")
+    if browser:
+        webbrowser.open(viewer.url)
+    before = signal.signal(signal.SIGINT, lambda *_: viewer.stop())  # this is how a viewer ends: no error
+    try:
+        viewer.serve()
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -1,0 +1,411 @@
+"""The viewer: what its server gives and refuses, and its page in a real browser, clicks included."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from browser import WHY_NOT, Page, found, opened
+from synthetic import FAULTS, fake_sample, filled, flip, make_spec
+
+from vbnfault import store as st
+from vbnfault.core.errors import InputError
+from vbnfault.output.viewer import Viewer
+from vbnfault.output.viewer.listing import NOT_KNOWN, Listing
+
+
+class Served:
+    """A viewer that serves in a thread."""
+
+    def __init__(self, store: st.Store) -> None:
+        self.store, self.viewer = store, Viewer(store)
+        self.thread = threading.Thread(target=self.viewer.serve)
+        self.thread.start()
+
+    def ask(self, path: str, method: str = "GET", **headers: str) -> tuple[int, bytes, dict[str, str]]:
+        """Return status, body and headers of a request."""
+        connection = http.client.HTTPConnection("127.0.0.1", self.viewer.port, timeout=60)
+        connection.putrequest(method, path, skip_host="Host" in headers)
+        for name, value in headers.items():
+            connection.putheader(name, value)
+        connection.endheaders()
+        answer = connection.getresponse()
+        try:
+            return answer.status, answer.read(), dict(answer.getheaders())
+        finally:
+            connection.close()
+
+    def json(self, path: str) -> dict:
+        """Return a JSON object."""
+        return dict(json.loads(self.ask(path)[1]))
+
+    def stop(self) -> None:
+        """End the server."""
+        self.viewer.stop()
+        self.thread.join()
+
+
+@pytest.fixture(scope="module")
+def served(described_store: Path) -> Iterator[Served]:
+    """A viewer of a finished store of a real scene."""
+    one = Served(st.open_store(described_store))
+    yield one
+    one.stop()
+
+
+# --- the server ---------------------------------------------------------------------------------------------
+
+
+def test_files_of_the_store_are_served_by_byte_ranges(served: Served) -> None:
+    name = served.store.file_name("image", 0)
+    content = (served.store.path / name).read_bytes()
+    size = len(content)
+    assert served.ask(f"/store/{name}")[:2] == (200, content)
+    for asked, start, stop in (
+        ("5-9", 5, 10),
+        ("7-", 7, size),
+        ("-16", size - 16, size),
+        (f"0-{10 * size}", 0, size),
+    ):
+        status, body, headers = served.ask(f"/store/{name}", Range=f"bytes={asked}")
+        assert (status, body) == (206, content[start:stop])
+        assert headers["Content-Range"] == f"bytes {start}-{stop - 1}/{size}"
+    for asked in ("bytes=9-5", f"bytes={size}-", "bytes=-", "lines=1-2", "bytes=1-2,4-5"):
+        assert served.ask(f"/store/{name}", Range=asked)[0] == 416
+    status, body, headers = served.ask(f"/store/{name}", "HEAD")
+    assert (status, body, headers["Content-Length"]) == (200, b"", str(size))
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/store/../../etc/passwd",
+        "/store/image/../zarr.json",
+        "/store/README.md",
+        "/store/image/c/99/0/0/0",
+        "/store//etc/passwd",
+        "/store/image/c/0/0/0/0%00",
+        "/nothing",
+        "/api/nothing",
+        "/api/sample/6",
+        "/api/sample/-1",
+        "/api/layer/split/0",
+        "/api/small/0?side=100000",
+    ],
+)
+def test_nothing_else_is_served(path: str, served: Served) -> None:
+    assert served.ask(path)[0] == 404
+
+
+def test_requests_for_another_host_are_refused(served: Served) -> None:
+    for host in ("evil.example", f"evil.example:{served.viewer.port}", "127.0.0.1", "127.0.0.1:1", ""):
+        assert served.ask("/", Host=host)[0] == 403
+        assert served.ask("/store/zarr.json", Host=host)[0] == 403
+    assert served.ask("/", Host=f"localhost:{served.viewer.port}")[0] == 200
+    assert served.ask("/", "POST")[0] == 501
+    assert served.viewer.server.server_address[0] == "127.0.0.1"
+
+
+def test_the_page_takes_nothing_from_elsewhere(served: Served) -> None:
+    _, body, headers = served.ask("/")
+    assert headers["Content-Security-Policy"].startswith("default-src 'self'")
+    assert headers["Cross-Origin-Resource-Policy"] == "same-origin"
+    assert b"http" not in body
+    for name in ("view.js", "layers.js", "view.css", "zarrita.js"):
+        assert served.ask(f"/{name}")[0] == 200
+
+
+def test_a_taken_port_is_refused_with_a_sentence(served: Served) -> None:
+    with pytest.raises(InputError, match=f"--port {served.viewer.port}: .*0 takes a free port"):
+        Viewer(served.store, served.viewer.port)
+
+
+def test_layers_and_scalars_are_those_of_the_store(served: Served) -> None:
+    data = served.store
+    for name, row in data.spec.pixel_layers.items():
+        status, body, _ = served.ask(f"/api/layer/{name}/4")
+        assert status == 200
+        np.testing.assert_array_equal(
+            np.frombuffer(body, row.dtype).reshape(data.spec.shape(row)), data.read(name, 4, 5)[0]
+        )
+    sample = served.json("/api/sample/4")["values"]
+    assert sample["exposure_s"] == {"value": data.read("exposure_s", 4, 5)[0], "units": "s"}
+    assert sample["parameters"] == json.loads(data.read("parameters", 4, 5)[0])
+    assert sample["split"] == data.read("split", 4, 5)[0]
+
+
+def test_small_images_show_the_masks_where_asked(served: Served) -> None:
+    plain, masked = (served.ask(f"/api/small/3?side=160&masks={k}")[1] for k in (0, 1))
+    decoded = cv2.imdecode(np.frombuffer(plain, np.uint8), cv2.IMREAD_COLOR)
+    assert decoded.shape == (32, 40, 3)  # not enlarged
+    assert plain != masked
+
+
+# --- the listing --------------------------------------------------------------------------------------------
+
+
+def columns(store: st.Store) -> tuple[np.ndarray, np.ndarray]:
+    """Return the injected faults [word, sample] and split, stratum, finished [3, sample]."""
+    data, words = Listing(store).columns, -(-len(store.spec.faults) // 32)
+    bits = np.frombuffer(data, "<u4", words * store.samples).reshape(words, -1)
+    return bits, np.frombuffer(data, np.uint8, offset=bits.nbytes).reshape(3, -1)
+
+
+def test_the_listing_holds_every_sample(tmp_path: Path) -> None:
+    store = st.create(tmp_path / "s.zarr", make_spec(layers=()), 23)
+    st.write_samples(store, [fake_sample(store.spec, i) for i in (*range(6), 21, 22)])
+    bits, (split, stratum, finished) = columns(store)
+    injected = store.read("injected").astype(bool)
+    np.testing.assert_array_equal((bits[0][:, None] >> np.arange(len(FAULTS))) & 1, injected)
+    assert np.flatnonzero(finished).tolist() == [0, 1, 2, 3, 4, 5, 21, 22]
+    names = store.read("split")
+    assert [st.SPLITS[k] if k != NOT_KNOWN else "" for k in split] == names.tolist()
+    np.testing.assert_array_equal(stratum, store.read("stratum"))
+
+
+def test_more_classes_than_a_word_has_bits(tmp_path: Path) -> None:
+    faults = tuple(f"fault_{k}" for k in range(35))
+    store = st.create(tmp_path / "s.zarr", make_spec(faults=faults, mask_any_faults=(), layers=()), 1)
+    sample = fake_sample(make_spec(layers=()), 0)
+    injected = np.arange(35) % 3 == 1
+    sample.scalars.update(injected=injected, parameters={})
+    sample.layers.update(mask=np.zeros((35, 24, 32), bool), mask_any=np.zeros((24, 32), bool))
+    st.write_samples(store, [sample])
+    bits, _ = columns(store)
+    assert [(int(bits[k >> 5, 0]) >> (k & 31)) & 1 for k in range(35)] == injected.astype(int).tolist()
+
+
+def test_severity_is_the_rank_of_what_was_drawn(tmp_path: Path) -> None:
+    models = {
+        "dust_on_optics": "gaussian",
+        "broken_pixels": "texture",
+        "straylight": "traced",
+        "vignetting": "cos4",
+    }
+    attributes = {"scene": {}, "fault_models": models}
+    store = st.create(tmp_path / "s.zarr", make_spec(layers=(), attributes=attributes), 4)
+    made = []
+    for i, grains in enumerate((30, 10, 20, 20)):
+        sample = fake_sample(store.spec, i)
+        drawn = {"dust_on_optics": {"x_px": [1] * grains}, "straylight": {"veil_fraction": 0.1 * i, "flares": []}}
+        sample.scalars["parameters"] = drawn | ({"vignetting": {"mask_loss": 0.1}} if i else {})
+        made.append(sample)
+    st.write_samples(store, made)
+    ranks = np.frombuffer(Listing(store).severities, np.uint8).reshape(4, 4)
+    assert ranks[0].tolist() == [254, 0, 127, 127]
+    assert ranks[2].tolist() == [0, 85, 169, 254]
+    assert (ranks[[1, 3]] == NOT_KNOWN).all()
+
+
+def test_damage_is_said_in_a_sentence(whole: st.Store) -> None:
+    flip(whole.file("image", 0), 200)
+    shutil.rmtree(whole.path / "exposure_s" / "c")
+    flip(whole.file("tries", 1), 12)
+    one = Served(whole)
+    try:
+        status, body, _ = one.ask("/api/layer/image/0")
+        assert (status, b"the build command repairs it" in body) == (422, True)
+        assert one.ask("/api/small/0")[0] == 422
+        assert one.json("/api/sample/0") == {"index": 0, "finished": False}
+    finally:
+        one.stop()
+
+
+@pytest.mark.slow
+def test_the_command_prints_its_address_and_ends_with_ctrl_c(finished_store: Path) -> None:
+    command = [sys.executable, "-m", "vbnfault", "view", str(finished_store), "--no-browser", "--port", "0"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        address = process.stdout.readline().split()[0]
+        port = int(address.rstrip("/").rpartition(":")[2])
+        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=60)
+        connection.request("GET", "/api/store")
+        assert json.loads(connection.getresponse().read())["samples"] == 10
+        connection.close()
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=60)
+    assert (process.returncode, errors) == (0, "")
+
+
+# --- the page in a browser ----------------------------------------------------------------------------------
+
+needs_browser = pytest.mark.skipif(found() is None, reason=WHY_NOT)
+_SUM = """document.getElementById('canvas').getContext('2d').getImageData(0, 0, 1200, 700).data
+  .reduce((a, b) => a + b, 0)"""
+
+
+@pytest.fixture(scope="module")
+def page() -> Iterator[Page]:
+    """A browser."""
+    with opened() as one:
+        one.look(1366, 768)
+        yield one
+
+
+def ready(page: Page, served: Served) -> None:
+    """Open the page and wait for its listing and its first image."""
+    page.goto("about:blank")
+    page.goto(served.viewer.url)
+    page.wait("window.vbnfault?.listing && performance.getEntriesByName('first-image').length")
+
+
+@needs_browser
+def test_the_grid_shows_filters_and_goes(page: Page, served: Served) -> None:
+    ready(page, served)
+    injected = served.store.read("injected").astype(bool)
+    assert page.evaluate("document.querySelectorAll('.tile').length") == 6
+    page.wait("[...document.querySelectorAll('.tile img')].every((i) => i.complete && i.naturalWidth === 40)")
+
+    page.click('[data-filter="classes:0"]')
+    assert page.evaluate("window.vbnfault.count") == injected[:, 0].sum()
+    page.click('[data-filter="classes:1"]')
+    assert page.evaluate("window.vbnfault.count") == injected[:, :2].any(axis=1).sum()
+    page.click("#mode")  # all of the chosen classes
+    assert page.evaluate("window.vbnfault.count") == injected[:, :2].all(axis=1).sum()
+    page.click("#clear")
+    assert page.evaluate("window.vbnfault.count") == 6
+    page.click('[data-filter="classes:none"]')
+    assert page.evaluate("window.vbnfault.count") == (~injected.any(axis=1)).sum()
+    page.click("#clear")
+    split = served.store.read("split").tolist()
+    k = st.SPLITS.index(split[0])
+    page.click(f'[data-filter="splits:{k}"]')
+    assert page.evaluate("window.vbnfault.count") == split.count(split[0])
+    page.click("#clear")
+
+    page.click("#number")
+    page.type("4")
+    page.press("Enter")
+    assert page.evaluate("document.activeElement.dataset.index") == "4"
+    page.press("ArrowLeft")
+    assert page.evaluate("document.activeElement.dataset.index") == "3"
+    page.press("m")
+    page.wait("[...document.querySelectorAll('.tile img')].every((i) => i.src.endsWith('masks=1'))")
+    page.press("?")
+    assert page.evaluate("document.getElementById('help').open")
+    page.press("Escape")
+    page.wait("!document.getElementById('help').open")
+    assert page.errors == []
+
+
+@needs_browser
+def test_one_sample_by_mouse_and_by_keys(page: Page, served: Served) -> None:
+    ready(page, served)
+    data = served.store
+    index = int(np.flatnonzero(data.read("injected").astype(bool)[:, 0])[0])
+    page.click(f'.tile[data-index="{index}"]')
+    page.wait("performance.getEntriesByName('sample').length")
+    page.wait(f"document.querySelector('#parameters').textContent.includes('{FAULTS[0].replace('_', ' ')}')")
+    # zarrita read image and mask from the files of the store, and the page holds their values
+    read = page.evaluate("window.vbnfault.sources")
+    assert read["zarr"] >= 2
+    assert read["server"] == 0
+    image = data.read("image", index, index + 1)[0]
+    assert page.evaluate("[...window.vbnfault.view.pixels.data]") == image.ravel().tolist()
+    masks = data.read("mask", index, index + 1)[0]
+    areas = page.evaluate("window.vbnfault.view.masks.map((m) => (m ? m.area : 0))")
+    np.testing.assert_allclose(areas, masks.reshape(len(FAULTS), -1).mean(axis=1))
+
+    before = page.evaluate(_SUM)
+    page.click('#masks [data-fault="0"]')
+    without = page.evaluate(_SUM)
+    assert without != before
+    page.press("1")
+    assert page.evaluate(_SUM) == before
+
+    for key, name in (("c", "clean"), ("d", "depth_m"), ("n", "normal"), ("s", "semantic"), ("x", "difference")):
+        page.press(key)
+        page.wait(f"window.vbnfault.view.layer === '{name}' && document.getElementById('message').hidden")
+        page.wait(f"document.querySelector('[data-layer={name}]').getAttribute('aria-checked') === 'true'")
+    depth = "window.vbnfault.view.pixels?.layer.name === 'depth_m'"
+    page.click("[data-layer=depth_m]")
+    page.wait(depth)
+    stored = data.read("depth_m", index, index + 1)[0].ravel()
+    shown = page.evaluate("[...window.vbnfault.view.pixels.data].map((v) => (Number.isFinite(v) ? v : -1))")
+    np.testing.assert_array_equal(shown, np.where(np.isfinite(stored), stored, -1))
+    page.press("e")
+    page.wait("document.getElementById('kind').textContent.startsWith('effects')")
+
+    page.press("i")
+    page.press("ArrowRight" if index < 5 else "ArrowLeft")
+    other = index + 1 if index < 5 else index - 1
+    page.wait(f"document.getElementById('name').textContent === 'Sample {other}'")
+    page.press("+")
+    assert page.evaluate("window.vbnfault.view.zoom") > 1
+    page.press("Escape")
+    assert page.evaluate("document.getElementById('viewer').hidden")
+    assert page.evaluate("document.activeElement.dataset.index") == str(other)
+    assert page.errors == []
+    assert all(
+        u.startswith((served.viewer.url, "blob:", "data:", "about:")) for u in page.requests if "file:" not in u
+    )
+
+
+@needs_browser
+def test_layers_that_the_browser_cannot_decode_come_from_the_server(page: Page, served: Served) -> None:
+    ready(page, served)
+    script = """(async () => {
+      const { read } = await import("/layers.js");
+      const about = await (await fetch("/api/store")).json();
+      const layer = about.layers.find((l) => l.name === "normal");
+      delete globalThis.Float16Array;
+      const other = await import("/layers.js?again");
+      const one = await read(layer, 1), two = await other.read(layer, 1);
+      return [[...one.data], [...two.data], other.sources.server];
+    })()"""
+    one, two, by_server = page.evaluate(script)
+    assert by_server == 1
+    assert one == two == served.store.read("normal", 1, 2)[0].astype(float).ravel().tolist()
+
+
+@needs_browser
+def test_unfinished_and_damaged_samples_are_named(page: Page, tmp_path: Path) -> None:
+    store = filled(tmp_path / "s.zarr", 6)
+    shutil.rmtree(store.path / "done" / "c")
+    st.write_samples(store, [fake_sample(store.spec, i) for i in (0, 1, 2)])
+    shutil.rmtree(store.path / "image")
+    store = st.open_store(store.path)
+    one = Served(store)
+    try:
+        page.goto("about:blank")
+        page.goto(one.viewer.url)
+        page.wait("window.vbnfault?.listing")
+        page.wait("document.querySelector('.tile[data-index=\"5\"]').textContent.includes('not finished')")
+        page.wait("document.querySelector('.tile[data-index=\"0\"]').textContent.includes('cannot be read')")
+        page.click('.tile[data-index="0"]')
+        page.wait("document.getElementById('message').textContent.includes('the build command repairs it')")
+    finally:
+        one.stop()
+        page.errors.clear()  # the browser logs each refused request
+
+
+@needs_browser
+def test_more_samples_than_a_browser_can_scroll_px(page: Page, tmp_path: Path) -> None:
+    store = st.create(tmp_path / "s.zarr", make_spec(layers=(), shard_samples=16), 600_000)
+    st.write_samples(store, [fake_sample(store.spec, i) for i in (0, 599_999)])
+    one = Served(store)
+    try:
+        page.goto("about:blank")
+        page.goto(one.viewer.url)
+        page.wait("window.vbnfault?.listing")
+        page.press("End")
+        page.wait("document.activeElement.dataset.index === '599999'")
+        page.wait("document.activeElement.querySelector('img')?.naturalWidth > 0")
+        box = page.evaluate(
+            "(() => { const b = document.activeElement.getBoundingClientRect(); return [b.top, b.bottom]; })()"
+        )
+        assert box[0] >= 40
+        assert box[1] <= 768
+        assert page.evaluate("document.querySelectorAll('.tile').length") < 100
+    finally:
+        one.stop()

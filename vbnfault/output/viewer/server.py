@@ -1,0 +1,371 @@
+"""Serve a store and the page that shows it, on this machine alone.
+
+The page reads full images by byte ranges of the store's own files with zarrita.js. Three things come from here
+instead: the columns of the listing (one request for all samples, where Zarr would need one for each shard), small
+images of the grid (a browser would have to decode each full image), and layers whose codec or data type the browser
+lacks.
+
+The server listens on the loopback interface only. It refuses requests whose header `Host` names another machine, so
+that no page of the web can reach it by a name that resolves to this address, and answers only reading requests.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import threading
+from collections.abc import Callable
+from functools import cached_property, lru_cache
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from importlib import resources
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...core import images
+from ...core.errors import InputError, VbnfaultError
+from ...store import SCALARS, SEMANTIC, SPLITS, STRATA, ShardReader, Store, disk
+from ..contact_sheet import COLOURS, abbreviations, overlay, resized, resized_mask
+from .listing import Listing
+
+_PAGE = {
+    "": ("index.html", "text/html; charset=utf-8"),
+    "view.js": ("view.js", "text/javascript; charset=utf-8"),
+    "layers.js": ("layers.js", "text/javascript; charset=utf-8"),
+    "zarrita.js": ("zarrita.js", "text/javascript; charset=utf-8"),
+    "view.css": ("view.css", "text/css; charset=utf-8"),
+}
+# nothing of the page comes from elsewhere, and no other page may hold it
+_HEADERS = {
+    "Content-Security-Policy": "default-src 'self'; img-src 'self' blob: data:; frame-ancestors 'none'",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+}
+_RANGE = re.compile(r"bytes=(?:(\d+)-(\d*)|-(\d+))")
+_SIDES_PX = (160, 240, 320)  # of the small images
+_JPEG_QUALITY = 82
+_MOST_SMALL = 3000  # small images that are kept, of some 10 kB each
+_KEPT_S = 60
+
+
+class _Missing(Exception):
+    """Report that a request names nothing that is served."""
+
+
+class Viewer:
+    """Serve a store on the loopback interface.
+
+    Parameters
+    ----------
+    store
+        An open store.
+    port
+        Port to listen on; 0 takes a free one.
+
+    Raises
+    ------
+    InputError
+        If nothing can listen on the port.
+    """
+
+    def __init__(self, store: Store, port: int = 0) -> None:
+        self.store = store
+        self.listing = Listing(store)
+        self._lock = threading.Lock()
+        try:
+            self.server = ThreadingHTTPServer(("127.0.0.1", port), _handler(self))
+        except OSError as error:
+            raise InputError(f"--port {port}: {error.strerror}; 0 takes a free port") from error
+        self.server.daemon_threads = True
+
+    @property
+    def port(self) -> int:
+        """Return the port."""
+        return int(self.server.server_address[1])
+
+    @property
+    def url(self) -> str:
+        """Return the address of the page."""
+        return f"http://127.0.0.1:{self.port}/"
+
+    def serve(self) -> None:
+        """Answer requests until `stop` is called; the listing is read meanwhile."""
+        threading.Thread(target=self.columns, daemon=True).start()
+        try:
+            self.server.serve_forever(poll_interval=0.1)
+        finally:
+            self.server.server_close()
+
+    def stop(self) -> None:
+        """End `serve`; may be called by a signal's handler."""
+        threading.Thread(target=self.server.shutdown, daemon=True).start()
+
+    # --- what is served -------------------------------------------------------------------------------------
+
+    def answer(self, path: str, query: dict[str, str]) -> tuple[bytes, str, str]:
+        """Return body, kind and cache time of a request that is not for a file of the store. Raises _Missing."""
+        if path in _PAGE:
+            name, kind = _PAGE[path]
+            return resources.files(__package__).joinpath("page", name).read_bytes(), kind, "no-cache"
+        what, _, rest = path.removeprefix("api/").partition("/")
+        routes: dict[str, Callable[[], tuple[bytes, str]]] = {
+            "store": lambda: (_json(self.about), "application/json"),
+            "listing": lambda: (self.columns(), "application/octet-stream"),
+            "severity": lambda: (self.severities(), "application/octet-stream"),
+            "sample": lambda: (_json(self.sample(_index(rest, self.store.samples))), "application/json"),
+            "small": lambda: (self.small(rest, query), "image/jpeg"),
+            "layer": lambda: (self.layer(rest), "application/octet-stream"),
+        }
+        if not path.startswith("api/") or what not in routes:
+            raise _Missing
+        body, kind = routes[what]()
+        return body, kind, f"private, max-age={_KEPT_S}" if what == "small" else "no-store"
+
+    def columns(self) -> bytes:
+        """Return the columns of the listing; only one thread reads them."""
+        with self._lock:
+            return self.listing.columns
+
+    def severities(self) -> bytes:
+        """Return the severities; only one thread reads them."""
+        with self._lock:
+            return self.listing.severities
+
+    @cached_property
+    def about(self) -> dict[str, Any]:
+        """Return what the page needs to know of the store."""
+        store, spec = self.store, self.store.spec
+        short = abbreviations(spec.faults)
+        return {
+            "title": str(store.attributes.get("title") or ""),
+            "name": str(store.path).rstrip("/").rpartition("/")[2],
+            "samples": store.samples,
+            "width": spec.width,
+            "height": spec.height,
+            "faults": [
+                {
+                    "name": fault,
+                    "short": short[fault],
+                    "colour": COLOURS[k % len(COLOURS)],
+                    "localised": fault in (spec.localised_faults or spec.faults),
+                    "model": str(store.attributes.get("fault_models", {}).get(fault, "")),
+                }
+                for k, fault in enumerate(spec.faults)
+            ],
+            "layers": [
+                {
+                    "name": name,
+                    "dtype": row.dtype,
+                    "shape": list(spec.shape(row)),
+                    "dims": list(row.dims[1:]),
+                    "units": row.units,
+                    "about": row.long_name,
+                    "names": list(SEMANTIC) if name == "semantic" else list(row.names),
+                }
+                for name, row in spec.pixel_layers.items()
+            ],
+            "splits": list(SPLITS),
+            "strata": list(STRATA),
+        }
+
+    def sample(self, index: int) -> dict[str, Any]:
+        """Return every scalar of a sample as JSON-able data, with the names of site, lens and device."""
+        store, spec = self.store, self.store.spec
+        number, values = index // spec.shard_samples, dict[str, Any]()
+        damaged = []
+        for name, row in SCALARS.items():
+            try:
+                value = store.column(name, number)[index - store.shard(number).start]
+            except FileNotFoundError:
+                return {"index": index, "finished": False}
+            except (OSError, ValueError):
+                damaged.append(name)
+                continue
+            values[name] = str(value) if row.is_text else _plain(value)
+            if row.units not in ("1", ""):
+                values[name] = {"value": values[name], "units": row.units}
+        for name in ("parameters", "proposal"):
+            try:
+                values[name] = json.loads(values.get(name) or "{}", parse_int=_exact)
+            except (ValueError, RecursionError):
+                damaged.append(name)
+        names = {"site": spec.site_names, "lens": spec.lens_names, "detector_individual": spec.detector_names}
+        for name, known in names.items():
+            k = values.get(name)
+            if isinstance(k, int) and 0 <= k < len(known):
+                values[name] = known[k]
+        if isinstance(values.get("stratum"), int):
+            values["stratum"] = STRATA[values["stratum"]] if values["stratum"] < len(STRATA) else "?"
+        return {"index": index, "finished": True, "damaged": damaged, "values": values}
+
+    def pixels(self, name: str, index: int) -> NDArray[Any]:
+        """Return a layer of a sample, compared with its checksum. Raises VbnfaultError if it cannot be read."""
+        if name not in self.store.spec.pixel_layers:
+            raise _Missing
+        row, reader = self.store.spec.pixel_layers[name], ShardReader(self.store, (name,))
+        fetched = reader.fetch(index // self.store.spec.shard_samples, [index])[index]
+        out = np.empty(self.store.spec.shape(row), dtype=row.dtype)
+        reader.decode(fetched, name, out)
+        return out
+
+    def layer(self, rest: str) -> bytes:
+        """Return the decoded bytes of a layer of a sample, little-endian: for browsers that cannot decode it."""
+        name, _, index = rest.partition("/")
+        pixels = self.pixels(name, _index(index, self.store.samples))
+        return pixels.astype(pixels.dtype.newbyteorder("<"), copy=False).tobytes()
+
+    def small(self, rest: str, query: dict[str, str]) -> bytes:
+        """Return a small image of a sample as JPEG, of 160, 240 or 320 px, with its masks if `masks` is 1."""
+        side = int(query.get("side", "240")) if query.get("side", "240").isdecimal() else 240
+        if side not in _SIDES_PX:
+            raise _Missing
+        return self._small(_index(rest, self.store.samples), side, query.get("masks") == "1")
+
+    @cached_property
+    def _small(self) -> Callable[[int, int, bool], bytes]:
+        """Return what makes small images, and keeps the latest."""
+        return lru_cache(_MOST_SMALL)(self._make_small)
+
+    def _make_small(self, index: int, side_px: int, masks: bool) -> bytes:
+        """Return a small image of a sample as JPEG."""
+        spec = self.store.spec
+        scale = min(1.0, side_px / max(spec.height, spec.width))
+        size = (max(1, round(spec.width * scale)), max(1, round(spec.height * scale)))
+        rgb = resized(self.pixels("image", index)[..., :3], size)
+        if masks and spec.faults:
+            small = np.stack([resized_mask(mask, size) for mask in self.pixels("mask", index)])
+            localised = [fault in (spec.localised_faults or spec.faults) for fault in spec.faults]
+            rgb = overlay(rgb, small, [bool(mask.any()) for mask in small], localised)
+        return images.encoded(rgb, ".jpg", _JPEG_QUALITY)
+
+    def part(self, name: str, header: str | None) -> tuple[bytes, int, int, int]:
+        """Return a part of a file of the store, its start, its end and the size of the file.
+
+        `header`: the header `Range`, None for the whole file. Raises _Missing if there is no such file, ValueError
+        if the range is none.
+        """
+        if not self._is_served(name):
+            raise _Missing
+        asked = _RANGE.fullmatch(header or "bytes=0-")
+        if asked is None:
+            raise ValueError(header)
+        first, last, suffix = (int(group) if group else None for group in asked.groups())
+        try:
+            size = self._size(name)
+            start = max(0, size - suffix) if suffix is not None else first or 0
+            stop = size if last is None else min(last + 1, size)
+            if start >= stop and header is not None:
+                raise ValueError(header)
+            parts = disk.read_parts(self.store.path / name, 0, lambda _: [(start, stop - start)])
+        except (OSError, VbnfaultError) as error:
+            raise _Missing from error
+        return parts[0][1], start, stop, size
+
+    def _size(self, name: str) -> int:
+        """Return the size of a file of the store in bytes."""
+        return (self.store.path / name).stat().st_size
+
+    def _is_served(self, name: str) -> bool:
+        """Return whether a name may belong to a file of the store: metadata or a chunk of one of its arrays."""
+        if name == "zarr.json":
+            return True
+        array, _, rest = name.partition("/")
+        known = array in self.store.spec.arrays or array in ("fault", "channel", "sample", "layer")
+        return known and (rest == "zarr.json" or re.fullmatch(r"c(?:/\d{1,9}){1,6}", rest) is not None)
+
+
+def _index(text: str, samples: int) -> int:
+    """Return the index of a sample. Raises _Missing if there is no such sample."""
+    if not (text.isascii() and text.isdecimal() and len(text) < 12 and int(text) < samples):
+        raise _Missing
+    return int(text)
+
+
+def _exact(digits: str) -> int | str:
+    """Return a whole number, as text where a browser's numbers would round it."""
+    return int(digits) if abs(int(digits)) < 2**53 else digits
+
+
+def _plain(value: Any) -> Any:
+    """Return numpy values as JSON-able data; None for what is not finite."""
+    if isinstance(value, np.ndarray):
+        return [_plain(entry) for entry in value]
+    plain = value.item() if isinstance(value, np.generic) else value
+    return None if isinstance(plain, float) and not math.isfinite(plain) else plain
+
+
+def _json(value: Any) -> bytes:
+    """Return data as JSON."""
+    return json.dumps(value, separators=(",", ":"), allow_nan=False).encode()
+
+
+def _handler(viewer: Viewer) -> type[BaseHTTPRequestHandler]:
+    """Return the class that answers the requests for a viewer."""
+
+    class Handler(BaseHTTPRequestHandler):
+        """Answer one connection."""
+
+        protocol_version = "HTTP/1.1"
+        server_version, sys_version = "vbnfault", ""
+        disable_nagle_algorithm = True
+
+        def do_GET(self) -> None:
+            """Answer a request."""
+            self._reply(*self._answered())
+
+        do_HEAD = do_GET
+
+        def log_message(self, format: str, *args: Any) -> None:
+            """Print nothing: a page asks for hundreds of files."""
+
+        def _answered(self) -> tuple[int, bytes, dict[str, str]]:
+            """Return status, body and headers."""
+            hosts = {f"{name}:{viewer.port}" for name in ("127.0.0.1", "localhost")}
+            if self.headers.get("Host", "") not in hosts:
+                return HTTPStatus.FORBIDDEN, b"this server answers this machine only", {}
+            path, _, query = self.path.partition("?")
+            try:
+                if path.startswith("/store/"):
+                    return self._file(path.removeprefix("/store/"))
+                pairs = dict(pair.partition("=")[::2] for pair in query.split("&"))
+                body, kind, cache = viewer.answer(path.lstrip("/"), pairs)
+                return HTTPStatus.OK, body, {"Content-Type": kind, "Cache-Control": cache}
+            except _Missing:
+                return HTTPStatus.NOT_FOUND, b"not found", {}
+            except VbnfaultError as error:  # damaged, or not finished: the page shows the sentence
+                return HTTPStatus.UNPROCESSABLE_ENTITY, str(error).encode(), {"Content-Type": "text/plain"}
+
+        def _file(self, name: str) -> tuple[int, bytes, dict[str, str]]:
+            """Return status, body and headers of a file of the store."""
+            header = self.headers.get("Range")
+            try:
+                body, start, stop, size = viewer.part(name, header)
+            except ValueError:
+                return HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE, b"", {}
+            kind = "application/json" if name.endswith(".json") else "application/octet-stream"
+            headers = {"Accept-Ranges": "bytes", "Content-Type": kind, "Cache-Control": "no-store"}
+            if header is None:
+                return HTTPStatus.OK, body, headers
+            return (
+                HTTPStatus.PARTIAL_CONTENT,
+                body,
+                {**headers, "Content-Range": f"bytes {start}-{stop - 1}/{size}"},
+            )
+
+        def _reply(self, status: int, body: bytes, headers: dict[str, str]) -> None:
+            """Send an answer."""
+            try:
+                self.send_response(status)
+                for name, value in {**_HEADERS, **headers, "Content-Length": str(len(body))}.items():
+                    self.send_header(name, value)
+                self.end_headers()
+                if self.command != "HEAD":
+                    self.wfile.write(body)
+            except (BrokenPipeError, ConnectionResetError):  # the page has scrolled on
+                self.close_connection = True
+
+    return Handler
