@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from browser import WHY_NOT, Page, found, opened
 from synthetic import FAULTS, fake_sample, filled, flip, make_spec
+from test_cli import run
 
 from vbnfault import store as st
 from vbnfault.core.errors import InputError
@@ -235,6 +236,18 @@ def test_the_command_prints_its_address_and_ends_with_ctrl_c(finished_store: Pat
         process.send_signal(signal.SIGINT)
         _, errors = process.communicate(timeout=60)
     assert (process.returncode, errors) == (0, "")
+
+
+def test_the_command_opens_a_browser_unless_told_not_to(
+    finished_store: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[str] = []
+    monkeypatch.setattr("webbrowser.open", asked.append)
+    monkeypatch.setattr(Viewer, "serve", lambda viewer: viewer.server.server_close())
+    assert run(monkeypatch, "view", str(finished_store), "--browser") == 0
+    assert [url[:17] for url in asked] == ["http://127.0.0.1:"]
+    assert run(monkeypatch, "view", str(finished_store), "--no-browser") == 0
+    assert len(asked) == 1
 
 
 # --- the page in a browser ----------------------------------------------------------------------------------
