@@ -319,10 +319,9 @@ def test_one_sample_by_mouse_and_by_keys(page: Page, served: Served) -> None:
     page.click(f'.tile[data-index="{index}"]')
     page.wait("performance.getEntriesByName('sample').length")
     page.wait(f"document.querySelector('#parameters').textContent.includes('{FAULTS[0].replace('_', ' ')}')")
-    # zarrita read image and mask from the files of the store, and the page holds their values
+    # zarrita read masks from the files of the store, the server decoded the rest; the values are those of the store
     read = page.evaluate("window.vbnfault.sources")
-    assert read["zarr"] >= 2
-    assert read["server"] == 0
+    assert read["zarr"] >= 1
     image = data.read("image", index, index + 1)[0]
     assert page.evaluate("[...window.vbnfault.view.pixels.data]") == image.ravel().tolist()
     masks = data.read("mask", index, index + 1)[0]
