@@ -293,8 +293,9 @@ class SceneInLens:
             finer = _STEPS_OF_SPIKES if self.lens.surfaces[self.lens.stop].blades else 1
             field = float(np.hypot(*self.render.half))
             directions = _directions(grid, field, self.sensor, self.image, self._efl_px, finer)
-            burst = starburst_of_source(self.lens, self.nodes_nm, grid.block / grid.focal_px)
-            kernels, mix = wing_spectra(burst, self.nodes_nm, directions, self.sensor)
+            kernels, mix = _wings(
+                self.lens, tuple(self.nodes_nm.tolist()), grid.block / grid.focal_px, directions, self.sensor
+            )
             # the Sun's starburst scales with the beam across its direction, too
             kept = (self._lit(places.slope) / np.hypot(1, places.slope)).astype(np.float32)
             gains = np.einsum("cb,b,bk->kcb", weights, self.passed, mix).astype(np.float32)
@@ -445,6 +446,15 @@ def _places(
         angle=angle,
         rest=(position - angle).astype(np.float32),
     )
+
+
+@lru_cache(maxsize=4)
+def _wings(
+    lens: Prescription, nodes_nm: tuple[float, ...], width_rad: float, directions: DirectionGrid, sensor: SensorGrid
+) -> tuple[tuple[F32, ...], F64]:
+    """Return `wing_spectra` of sources of this width; they are cached for the camera."""
+    nodes = np.array(nodes_nm)
+    return wing_spectra(starburst_of_source(lens, nodes, width_rad), nodes, directions, sensor)
 
 
 @lru_cache(maxsize=8)
