@@ -169,9 +169,10 @@ def _column_background(image: F32, sky: Mask, background: float, bright: float) 
 def shift_between(real: Look, rendered: Look, *, search_px: int) -> tuple[float, float]:
     """Return the shift (x, y) in px that moves the rendered image onto the real one, to a tenth of a pixel.
 
-    It maximises the correlation of the two lit silhouettes.
+    It maximises the correlation of brightness, which is 0 outside the lit silhouettes. The silhouettes alone give
+    a shift up to a pixel off: in them the terminator, which depends on relief, counts as much as the limb.
     """
-    a, b = (ndimage.gaussian_filter(one.lit.astype(np.float32), 1.0) for one in (real, rendered))
+    a, b = (ndimage.gaussian_filter(np.clip(one.level, 0, 1) * one.lit, 1.0) for one in (real, rendered))
     product = np.fft.rfft2(a) * np.conj(np.fft.rfft2(b))
     correlation = np.fft.irfft2(product, a.shape)
     correlation = np.roll(correlation, (search_px, search_px), (0, 1))[: 2 * search_px + 1, : 2 * search_px + 1]

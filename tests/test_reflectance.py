@@ -236,6 +236,15 @@ def test_disc_functions() -> None:
     np.testing.assert_allclose(of("lommel_seeliger") / 0.06, [1, 2 * 0.5 / 1.5, 1, 2 * c / (c + 0.5)], rtol=1e-12)
     share = 1 - 0.019 * 60 + 2.42e-4 * 3600 - 1.46e-6 * 216000
     assert of("mcewen")[1] / 0.06 == pytest.approx(share * 2 / 3 + (1 - share) / 2, rel=1e-12)
+    # on the equator in mid-phase, γ = α/2, and at the mirror point D = cos(α/2) / cos(γ) = 1; at i = 0, e = 60°,
+    # γ = 60° = α: D = cos(30°) cos(π/4) / cos(60°) (Shkuratov et al. 2011)
+    at_limb = math.cos(math.radians(30)) * math.cos(math.pi / 4) / 0.5
+    np.testing.assert_allclose(of("akimov")[[0, 2]] / 0.06, [1, 1], rtol=1e-9)
+    akimov = radiance_factor(
+        registry()["akimov"]().at(np.array([550.0]), np.array([1.0])),
+        *directions(np.radians([[0, 60, 0], [30, 30, 180]])),
+    )[0]
+    np.testing.assert_allclose(akimov, [at_limb, 1], rtol=1e-9)
     # 0.047 mag per degree: 60° are 2.82 magnitudes
     np.testing.assert_allclose(of("lambert", 0.047)[:2] / of("lambert")[:2], [1, 10 ** (-0.4 * 2.82)], rtol=1e-9)
 
@@ -255,8 +264,8 @@ def test_every_model_is_the_same_in_numpy_and_in_the_renderer(name: str) -> None
     terms = np.stack(np.broadcast_arrays(*(term.numpy() for term in ground.evaluate(dr, *triples))))
     got = np.pi * np.einsum("tb,tn->bn", ground.weights, terms)
     assert len(terms) == ground.terms
-    # float32: see test_hapke_in_the_renderers_float32
-    np.testing.assert_allclose(got, radiance_factor(ground, light, view), rtol=2e-4)
+    # float32: see test_hapke_in_the_renderers_float32; the limb of Akimov's function is 3e-4 off at e = 89°
+    np.testing.assert_allclose(got, radiance_factor(ground, light, view), rtol=4e-4 if name == "akimov" else 2e-4)
     assert not radiance_factor(ground, [[0.6, 0, -0.8]], [[0, 0, 1]]).any(), "light from below the surface"
 
 
@@ -290,7 +299,7 @@ def test_a_model_defined_here_alone_is_a_key_of_the_scene_file() -> None:
         ({"model": "powered", "exponent": 3}, "body.photometry.exponent = 3: must be a number from 0.5 to 1"),
         ({"model": "lambert", "exponent": 0.6}, "exponent = 0.6: is a key of powered, not of model = 'lambert'"),
         ({"model": "powered", "exponant": 0.6}, r"exponant: unknown key \(did you mean exponent\?\)"),
-        ({"model": "minnart"}, r"model = 'minnart': must be one of hapke, .*mcewen, .*powered"),
+        ({"model": "minnart"}, r"model = 'minnart': must be one of akimov, .*mcewen, .*powered"),
     ):
         with pytest.raises(InputError, match=sentence):
             parsed(**wrong)

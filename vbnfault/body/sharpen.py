@@ -60,16 +60,25 @@ def _deviation(vertices_m: Float64, faces: Int32, baseline_m: float) -> float:
 
 def _lost_heights(vertices_m: Float64, faces: Int32) -> Float64:
     """Return along each normal how far one step of smoothing over a mean edge moves a vertex inwards."""
-    stiffness, area = _laplacian(vertices_m, faces)
-    system = scipy.sparse.diags(area) + mean_edge_m(vertices_m, faces) ** 2 * stiffness
-    jacobi = scipy.sparse.diags(1 / system.diagonal())
-    smooth = np.empty_like(vertices_m)
-    for axis in range(3):
-        smooth[:, axis], _ = linalg.cg(
-            system, area * vertices_m[:, axis], x0=vertices_m[:, axis], rtol=_TOLERANCE, M=jacobi
-        )
+    smooth = smoothed(vertices_m, faces, vertices_m, mean_edge_m(vertices_m, faces))
     normals = vertex_normals(vertices_m, faces)
     return np.asarray(np.einsum("ni,ni->n", vertices_m - smooth, normals)[:, None] * normals)
+
+
+def smoothed(vertices_m: Float64, faces: Int32, values: Float64, length_m: float) -> Float64:
+    """Return values at the vertices of a mesh after one step of implicit smoothing, float64[n, k].
+
+    Waves of the wavenumber k are multiplied by 1 / (1 + k² length_m²).
+    """
+    stiffness, area = _laplacian(vertices_m, faces)
+    system = scipy.sparse.diags(area) + length_m**2 * stiffness
+    jacobi = scipy.sparse.diags(1 / system.diagonal())
+    out = np.empty_like(values)
+    for column in range(values.shape[1]):
+        out[:, column], _ = linalg.cg(
+            system, area * values[:, column], x0=values[:, column], rtol=_TOLERANCE, M=jacobi
+        )
+    return out
 
 
 def _laplacian(vertices_m: Float64, faces: Int32) -> tuple[scipy.sparse.csr_matrix, NDArray[np.float64]]:

@@ -16,9 +16,9 @@ scene file, its JSON Schema and its identity, and the renderer.
 
 Every model gives the bidirectional reflectance r in sr⁻¹, so that I/F = πr. r is the radiance over the irradiance
 of the beam on a plane normal to the beam (r = BRDF · cos i). Each formula is written once, over an array namespace
-`m`: numpy (`NUMPY`, float64) is the reference, drjit (float32) runs in the renderer. `m` has exp, log, sqrt, atan,
-maximum, minimum and select(condition, then, else). Constants must be plain Python numbers, because a numpy scalar
-times a drjit array is a numpy array.
+`m`: numpy (`NUMPY`, float64) is the reference, drjit (float32) runs in the renderer. `m` has exp, log, sqrt, cos,
+atan, maximum, minimum and select(condition, then, else). Constants must be plain Python numbers, because a numpy
+scalar times a drjit array is a numpy array.
 
 Directions are unit vectors in the local frame of the surface, with z along its normal. `light` points towards the
 Sun and `view` towards the camera; each is a triple of arrays. No angle is computed by arccos: in float32 this gives
@@ -47,7 +47,14 @@ F64 = NDArray[np.float64]
 Triple = tuple[Any, Any, Any]
 
 NUMPY = SimpleNamespace(
-    exp=np.exp, log=np.log, sqrt=np.sqrt, atan=np.arctan, maximum=np.maximum, minimum=np.minimum, select=np.where
+    exp=np.exp,
+    log=np.log,
+    sqrt=np.sqrt,
+    cos=np.cos,
+    atan=np.arctan,
+    maximum=np.maximum,
+    minimum=np.minimum,
+    select=np.where,
 )
 
 # Below this cosine a direction counts as grazing. An interpolated normal may put the camera slightly below the
