@@ -12,7 +12,7 @@ import signal
 import sys
 import tempfile
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -155,3 +155,14 @@ def small_scene(**tables: dict[str, Any]) -> dict[str, Any]:
     for name, table in tables.items():
         scene[name] = {**scene.get(name, {}), **table}
     return scene
+
+
+@pytest.fixture(scope="session")
+def s3_server() -> Iterator[Any]:
+    """A server of S3 on this machine, started once."""
+    pytest.importorskip("obstore")
+    from s3_server import S3Server
+
+    server = S3Server()
+    yield server
+    server.close()

@@ -240,7 +240,7 @@ class Broken:
         raise InputError("67P.obj: no such mesh")
 
 
-def run(out: Path, session: object = None, samples: int = SAMPLES, **options: object) -> bd.Summary:
+def run(out: Path | str, session: object = None, samples: int = SAMPLES, **options: object) -> bd.Summary:
     """Build made-up samples; `options` are fields of `BuildPlan` and of `BuildOptions`."""
     of_plan = {f.name for f in dataclasses.fields(bd.BuildPlan)} & options.keys()
     planned: dict = {"spec": make_spec(), "site": site_of(samples)} | {name: options.pop(name) for name in of_plan}

@@ -64,7 +64,7 @@ class WorkOptions:
 @grouped
 def build(
     scene: SceneArgument,
-    out: Annotated[Path, typer.Option(help="Path of the Zarr store to make or to resume.")],
+    out: Annotated[str, typer.Option(help="Path or URL of the Zarr store to make or to resume.")],
     options: SceneOptions,
     work: WorkOptions,
     append: Annotated[
@@ -84,8 +84,10 @@ def build(
 
 @app.command(rich_help_panel=_PANEL)
 def merge(
-    stores: Annotated[list[Path], typer.Argument(help="Paths of stores of one dataset.", metavar="STORE...")],
-    out: Annotated[Path, typer.Option(help="Path of the store that gets all samples; one of STORE, or a new one.")],
+    stores: Annotated[list[str], typer.Argument(help="Stores of one dataset: paths or URLs.", metavar="STORE...")],
+    out: Annotated[
+        str, typer.Option(help="Path or URL of the store that gets all samples; one of STORE, or a new one.")
+    ],
     move: Annotated[bool, typer.Option(help="Remove each shard from its store once it is merged.")] = False,
 ) -> None:
     """Join stores of one dataset, made with --shard-range, into one store."""
@@ -100,7 +102,7 @@ def merge(
 def retake(
     store: StoreArgument,
     scene: Annotated[str, typer.Option(help="Path of a scene file, or name of a packaged scene.")],
-    out: Annotated[Path, typer.Option(help="Path of the new store, made or resumed.")],
+    out: Annotated[str, typer.Option(help="Path or URL of the new store, made or resumed.")],
     options: SceneValues,
     work: WorkOptions,
 ) -> None:
@@ -197,7 +199,7 @@ def digest(store: StoreArgument) -> None:
 def migrate(
     store: StoreArgument,
     out: Annotated[
-        Path | None,
+        str | None,
         typer.Option(help="Path of a copy, which takes fewer bytes; without it the store itself is changed."),
     ] = None,
 ) -> None:

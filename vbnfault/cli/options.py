@@ -25,7 +25,7 @@ MOST_PROCESSES = 1024
 MOST_SEED = 2**63 - 1
 
 SceneArgument = Annotated[str, typer.Argument(help="Path of a scene file, or name of a packaged scene.")]
-StoreArgument = Annotated[Path, typer.Argument(help="Path of a Zarr store.")]
+StoreArgument = Annotated[str, typer.Argument(help="Path or URL (s3://, gs://, az://, file://) of a Zarr store.")]
 PluginOption = Annotated[
     list[str] | None,
     typer.Option(

@@ -9,12 +9,11 @@ interruptions and repairs.
 from __future__ import annotations
 
 import contextlib
-import shutil
+import os
 import sys
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,7 +23,7 @@ from .. import store as store_module
 from ..core import environment
 from ..core.errors import InputError, VbnfaultError, shown
 from ..core.interrupts import Stopped, exit_code, finishing, interruptible
-from ..store import FaultCounts, Planned, Store, StoreSpec
+from ..store import FaultCounts, Location, Planned, Store, StoreSpec, Url, files_of, located
 from .dask import check_scheduler, run_on_dask
 from .errors import BuildFailed, Interrupted
 from .lock import locked, others_at_work, prepared_by_one
@@ -218,7 +217,7 @@ class Summary:
         Lines that describe what the scene will photograph.
     """
 
-    path: Path
+    path: Location
     samples: int
     shards: int
     sites: int
@@ -244,7 +243,9 @@ class Summary:
     def outlook(self) -> list[str]:
         """Return lines that say what there is to do."""
         head = f"{self._where}: {self.samples} samples at {self.sites} sites in {self.shards} shards"
-        size = f"about {size_text(self.estimated_bytes)}, {size_text(self.free_bytes)} free"
+        size = f"about {size_text(self.estimated_bytes)}"
+        if self.free_bytes != sys.maxsize:
+            size += f", {size_text(self.free_bytes)} free"
         lines = [f"{head}, {size}; {self.finished} of them were finished before"]
         if self.optics:
             lines.append(f"lens: {self.optics}")
@@ -273,7 +274,7 @@ class Summary:
 def build(
     session_factory: SessionFactory,
     plan: BuildPlan,
-    out: str | Path,
+    out: str | os.PathLike[str] | Url,
     options: BuildOptions | None = None,
 ) -> Summary:
     """Build, resume, repair or extend the store at `out`; the module's docstring describes how.
@@ -300,7 +301,7 @@ def build(
     VbnfaultError
         If the files cannot be written, the disk is too small, or the cluster fails.
     """
-    options, path = options or BuildOptions(), Path(out)
+    options, path = options or BuildOptions(), located(out)
     summary = _outlook(plan, path, options)
     if options.dry_run:
         return summary
@@ -342,7 +343,7 @@ def _run(
     return run
 
 
-def _interrupted(path: Path, samples: int, stop: Stopped | KeyboardInterrupt) -> Interrupted:
+def _interrupted(path: Location, samples: int, stop: Stopped | KeyboardInterrupt) -> Interrupted:
     """Return the error that says how many samples are finished after an interruption."""
     with finishing():
         done = store_module.open_store(path).finished() if store_module.is_store(path) else 0
@@ -352,7 +353,7 @@ def _interrupted(path: Path, samples: int, stop: Stopped | KeyboardInterrupt) ->
     )
 
 
-def _outlook(plan: BuildPlan, path: Path, options: BuildOptions) -> Summary:
+def _outlook(plan: BuildPlan, path: Location, options: BuildOptions) -> Summary:
     """Return what a build would do. Raises InputError if the store at `path` holds another scene."""
     finished, shards = 0, options.shards_of(plan.shards)
     part = None if options.shard_range is None else shards
@@ -371,14 +372,14 @@ def _outlook(plan: BuildPlan, path: Path, options: BuildOptions) -> Summary:
         sites=len(np.unique(plan.site[shards.start * plan.spec.shard_samples :][:samples])),
         finished=finished,
         estimated_bytes=plan.spec.estimated_sample_bytes * samples,
-        free_bytes=_free_bytes(path),
+        free_bytes=files_of(path).free_bytes() or sys.maxsize,
         fault_counts=plan.fault_counts(),
         estimated_seconds=None if seconds is None else seconds * samples / len(plan.site),
         optics=plan.spec.attributes.get("optics", {}).get("summary", ""),
     )
 
 
-def _locked_store(plan: BuildPlan, path: Path, options: BuildOptions, stack: contextlib.ExitStack) -> Store:
+def _locked_store(plan: BuildPlan, path: Location, options: BuildOptions, stack: contextlib.ExitStack) -> Store:
     """Lock what the build writes until the stack ends, and return the store, created, repaired or extended.
 
     Of several builds that write different shards, the first one prepares the store. The others find it whole.
@@ -403,7 +404,7 @@ def _locked_store(plan: BuildPlan, path: Path, options: BuildOptions, stack: con
         return store
 
 
-def _prepared_store(plan: BuildPlan, path: Path, options: BuildOptions) -> Store:
+def _prepared_store(plan: BuildPlan, path: Location, options: BuildOptions) -> Store:
     """Create, repair or extend the store, and return it open for writing. The caller holds its lock."""
     samples = len(plan.site)
     if options.overwrite or not store_module.is_store(path):
@@ -424,17 +425,6 @@ def _do_tasks(session_factory: SessionFactory, run: Run, options: BuildOptions) 
     else:
         threads = options.threads or max(1, environment.usable_cores() // options.workers)
         Pool(workers, run, threads, options.recycle_shards).work(options.workers)
-
-
-def _free_bytes(path: Path) -> int:
-    """Return the free space at a path, in bytes; sys.maxsize if the system does not report it."""
-    for folder in (path, *path.absolute().parents):
-        try:
-            usage = shutil.disk_usage(folder)
-        except (OSError, ValueError):  # it does not exist yet, is not accessible, or is no valid name
-            continue
-        return usage.free if usage.total else sys.maxsize  # some mounts report a size of 0
-    return sys.maxsize
 
 
 def _check_room(summary: Summary, spec: StoreSpec) -> None:

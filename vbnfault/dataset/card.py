@@ -9,14 +9,13 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from .. import store as stores
 from ..faults import registry
 from ..scene import config
 from ..scene.bodies import named_body
-from ..store import Store, disk
+from ..store import Location, Store, Url, disk
 from .croissant import store_croissant
 from .statistics import Statistics, statistics
 
@@ -30,7 +29,7 @@ _PAPER = (
 )
 
 
-def write_card(path: str | os.PathLike[str] | Store) -> list[Path]:
+def write_card(path: str | os.PathLike[str] | Url | Store) -> list[Location]:
     """Write the card and the Croissant description into a store and return their paths.
 
     Raises
@@ -44,13 +43,13 @@ def write_card(path: str | os.PathLike[str] | Store) -> list[Path]:
     numbers = statistics(store)
     files = {README: card(store, numbers), CROISSANT: to_json(store_croissant(store))}
     with disk.explained(store.path, "writing the card"):
-        disk.write(store.path, ((name, text.encode()) for name, text in files.items()))
+        store.files.write((name, text.encode()) for name, text in files.items())
     return [store.path / name for name in files]
 
 
 def has_card(store: Store) -> bool:
     """Return whether a store holds its card and its Croissant description."""
-    return all((store.path / name).is_file() for name in (README, CROISSANT))
+    return all(store.files.exists(name) for name in (README, CROISSANT))
 
 
 def to_json(document: Mapping[str, Any]) -> str:

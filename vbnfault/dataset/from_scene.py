@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -77,7 +78,7 @@ def estimated_seconds(session: pipeline.Session) -> float:
 
 def build_scene(
     scene: Scene | str | Path,
-    out: str | Path,
+    out: str | os.PathLike[str] | store.Url,
     options: build.BuildOptions | None = None,
     *,
     samples: int | None = None,
@@ -92,7 +93,7 @@ def build_scene(
     scene : Scene, str or Path
         A scene, the path of a scene file, or the name of a packaged scene.
     out : str or Path
-        Path of the store.
+        Path or URL of the store.
     options : BuildOptions, optional
         How the build does its work: number of processes, cluster, progress.
     samples : int, optional
@@ -125,7 +126,7 @@ def build_scene(
     options = dataclasses.replace(options or build.BuildOptions(), **keywords)
     if not isinstance(scene, Scene):
         source, scene = source or str(scene), config.load_scene(scene)
-    source, out = source or "scene", Path(out)
+    source, out = source or "scene", store.located(out)
     if not options.dry_run:
         llvm.find()  # raises VbnfaultError: without LLVM every sample would fail
     if append and samples is None and not options.overwrite and store.is_store(out):
@@ -137,7 +138,7 @@ def build_scene(
     return dataclasses.replace(summary, description=tuple(description))
 
 
-def with_card(out: Path, summary: build.Summary) -> build.Summary:
+def with_card(out: store.Location, summary: build.Summary) -> build.Summary:
     """Write the card of a complete store that was built or has none, and return the summary of its build."""
     if summary.counts is not None:
         opened = store.open_store(out)

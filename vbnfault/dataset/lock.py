@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import platform
 import re
 import stat
 import threading
@@ -22,6 +21,9 @@ from types import ModuleType
 from typing import Any, NamedTuple
 
 from ..core.errors import InputError, VbnfaultError
+from ..store import Location, Url
+from . import claims
+from .owners import has_ended, overlap, still_writing, this_process
 
 fcntl: ModuleType | None
 try:
@@ -35,8 +37,10 @@ _SECONDS_TO_PREPARE = 600.0  # after which a command does not wait any longer un
 
 
 @contextlib.contextmanager
-def locked(path: Path, shards: range | None = None) -> Iterator[None]:
+def locked(path: Location, shards: range | None = None) -> Iterator[None]:
     """Hold the lock of the store or study at `path`, or of some of its shards, during a `with` block.
+
+    In an object store, `claims` does this.
 
     The lock is a locked file beside the store, `.NAME.lock`, or `.NAME.shards-A-B.lock` for the shards A to B - 1.
     So it exists before the store does, and it stays when the store is replaced. The operating system releases the
@@ -55,15 +59,19 @@ def locked(path: Path, shards: range | None = None) -> Iterator[None]:
         No lock can be made at this path.
     """
     with contextlib.ExitStack() as stack:
+        if isinstance(path, Url):
+            stack.enter_context(claims.claimed(path, shards))
+            yield
+            return
         _take(path, _stem(path, shards), stack)
         for held in _held_locks(path):
-            if held.shards != shards and _overlap(held.shards, shards):
+            if held.shards != shards and overlap(held.shards, shards):
                 raise held.error(path)
         yield
 
 
 @contextlib.contextmanager
-def prepared_by_one(path: Path) -> Iterator[None]:
+def prepared_by_one(path: Location) -> Iterator[None]:
     """Let the commands that write shards of one store pass a `with` block one after the other.
 
     In it, a command takes the lock of its shards, and the first one creates or repairs the store. Raises
@@ -71,6 +79,10 @@ def prepared_by_one(path: Path) -> Iterator[None]:
     """
     until = time.monotonic() + _SECONDS_TO_PREPARE
     with contextlib.ExitStack() as stack:
+        if isinstance(path, Url):
+            stack.enter_context(claims.prepared(path, _SECONDS_TO_PREPARE))
+            yield
+            return
         while True:
             try:
                 _take(path, f".{path.name}.prepare", stack)
@@ -82,19 +94,16 @@ def prepared_by_one(path: Path) -> Iterator[None]:
         yield
 
 
-def others_at_work(path: Path, shards: range) -> bool:
+def others_at_work(path: Location, shards: range) -> bool:
     """Return whether other commands write other shards of the store at `path` now."""
+    if isinstance(path, Url):
+        return any(others != shards for others in claims.ranges_at_work(path))
     return any(held.shards not in (None, shards) for held in _held_locks(path))
 
 
 def _stem(path: Path, shards: range | None) -> str:
     """Return the name of a lock without its ending."""
     return f".{path.name}" if shards is None else f".{path.name}.shards-{shards.start}-{shards.stop}"
-
-
-def _overlap(a: range | None, b: range | None) -> bool:
-    """Return whether two commands write to the same shards; None stands for the whole store."""
-    return a is None or b is None or (a.start < b.stop and b.start < a.stop)
 
 
 class _HeldLock(NamedTuple):
@@ -105,7 +114,8 @@ class _HeldLock(NamedTuple):
 
     def error(self, path: Path) -> VbnfaultError:
         """Return the error for a command that wants the same."""
-        return _held(path, _read_owner(self.file), self.file if self.file.suffix == ".owner" else None, self.shards)
+        file = self.file if self.file.suffix == ".owner" else None
+        return _held(path, _read_owner(self.file), file, self.shards)
 
 
 def _held_locks(path: Path) -> Iterator[_HeldLock]:
@@ -120,7 +130,7 @@ def _held_locks(path: Path) -> Iterator[_HeldLock]:
         if match is None:
             continue
         file = path.absolute().with_name(name)
-        is_held = _is_locked(file) if match[3] == "lock" else not _has_ended(_read_owner(file))
+        is_held = _is_locked(file) if match[3] == "lock" else not has_ended(_read_owner(file))
         if is_held:
             yield _HeldLock(range(int(match[1]), int(match[2])) if match[1] else None, file)
         elif match[3] == "owner":
@@ -190,7 +200,7 @@ def _lock_file(path: Path, file: Path, stack: contextlib.ExitStack) -> bool:
                 if (named.st_dev, named.st_ino) == (status.st_dev, status.st_ino):
                     if not stat.S_ISDIR(status.st_mode):
                         os.ftruncate(handle, 0)
-                        os.write(handle, json.dumps(_this_process()).encode())
+                        os.write(handle, json.dumps(this_process()).encode())
                         undo.callback(file.unlink, missing_ok=True)  # before it is closed
                     stack.push(undo.pop_all())
                     return True
@@ -199,13 +209,13 @@ def _lock_file(path: Path, file: Path, stack: contextlib.ExitStack) -> bool:
 
 def _own(path: Path, file: Path, stack: contextlib.ExitStack) -> None:
     """Make an owner's file and keep its heart-beat going until the stack ends, which removes the file."""
-    owner = _this_process() | {"token": uuid.uuid4().hex}
+    owner = this_process() | {"token": uuid.uuid4().hex}
     while True:
         try:
             handle = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
         except FileExistsError:
             other = _read_owner(file)
-            if not _has_ended(other):
+            if not has_ended(other):
                 raise _held(path, other, file) from None
             _remove_owner(file, other)
             continue
@@ -229,13 +239,6 @@ def _own(path: Path, file: Path, stack: contextlib.ExitStack) -> None:
     stack.callback(ended.set)
 
 
-def _this_process() -> dict[str, Any]:
-    """Return host, process number and start time of this process."""
-    import psutil
-
-    return {"host": platform.node(), "pid": os.getpid(), "started": psutil.Process().create_time()}
-
-
 def _read_owner(file: Path) -> dict[str, Any]:
     """Return the content of an owner's file; empty if it cannot be read."""
     try:
@@ -243,25 +246,6 @@ def _read_owner(file: Path) -> dict[str, Any]:
     except (OSError, ValueError):
         return {}
     return owner if isinstance(owner, dict) else {}
-
-
-def _has_ended(owner: dict[str, Any]) -> bool:
-    """Return whether a lock's owner was a process of this host that has ended.
-
-    The start time is compared, too: another process may have got the number of the owner.
-    """
-    import psutil
-
-    if owner.get("host") != platform.node() or not isinstance(owner.get("pid"), int):
-        return False
-    try:
-        process = psutil.Process(owner["pid"])
-        same = process.create_time() == owner.get("started")
-    except psutil.NoSuchProcess:
-        return True
-    except psutil.Error:
-        return False
-    return not same or process.status() == psutil.STATUS_ZOMBIE
 
 
 def _remove_owner(file: Path, owner: dict[str, Any]) -> None:
@@ -283,12 +267,9 @@ def _remove_owner(file: Path, owner: dict[str, Any]) -> None:
 def _held(
     path: Path, owner: dict[str, Any], file: Path | None = None, shards: range | None = None
 ) -> VbnfaultError:
-    """Return the error for a lock that another command holds."""
-    by = f" (process {owner['pid']} on {owner['host']})" if {"pid", "host"} <= owner.keys() else ""
-    what = "to it" if shards is None else f"shards {shards.start}:{shards.stop} of it"
-    sentence = f"{path}: another command is writing {what}{by}; wait until it ends"
+    """Return the error for a lock that another command holds; `file`: its file, if that has a heart-beat."""
+    beat = ""
     if file is not None:
         with contextlib.suppress(OSError):
             beat = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(file.stat().st_mtime))
-            sentence += f", or delete {file} if it has ended: its last heart-beat was at {beat}"
-    return VbnfaultError(sentence)
+    return still_writing(path, owner, shards, file if beat else None, beat)

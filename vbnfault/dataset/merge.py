@@ -11,7 +11,6 @@ import contextlib
 import os
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,7 @@ from numpy.typing import NDArray
 from .. import store as store_module
 from ..core.errors import InputError, VbnfaultError
 from ..core.interrupts import Stopped, check, exit_code, finishing, interruptible
-from ..store import SampleDigests, Store, StoreSpec, spans
+from ..store import Location, SampleDigests, Store, StoreSpec, Url, located, spans
 from . import card, versions
 from .errors import Interrupted
 from .lock import locked
@@ -46,7 +45,7 @@ class MergeSummary:
         Whether the stores have given their shards away.
     """
 
-    path: Path
+    path: Location
     samples: int
     finished: int
     before: int
@@ -73,8 +72,8 @@ class MergeSummary:
 
 
 def merge_stores(
-    stores: Sequence[str | os.PathLike[str]],
-    out: str | os.PathLike[str],
+    stores: Sequence[str | os.PathLike[str] | Url],
+    out: str | os.PathLike[str] | Url,
     *,
     move: bool = False,
     progress: bool = True,
@@ -87,8 +86,8 @@ def merge_stores(
 
 
 def join_stores(
-    stores: Sequence[str | os.PathLike[str]],
-    out: str | os.PathLike[str],
+    stores: Sequence[str | os.PathLike[str] | Url],
+    out: str | os.PathLike[str] | Url,
     *,
     move: bool = False,
     progress: bool = True,
@@ -117,9 +116,9 @@ def join_stores(
     Interrupted
         After Ctrl-C, SIGTERM or SIGHUP; the same call resumes.
     """
-    target = Path(out)
-    paths = dict.fromkeys(map(Path, stores))
-    sources = [store_module.open_store(path) for path in paths if path.resolve() != target.resolve()]
+    target = located(out)
+    paths = dict.fromkeys(map(located, stores))
+    sources = [store_module.open_store(path) for path in paths if not _same(path, target)]
     if not sources:
         raise InputError(f"--out {target}: there is nothing to merge: give at least one other store")
     with interruptible(), contextlib.ExitStack() as stack:
@@ -136,6 +135,13 @@ def join_stores(
     return summary
 
 
+def _same(path: Location, other: Location) -> bool:
+    """Return whether two locations are the same folder or URL."""
+    if isinstance(path, Url) or isinstance(other, Url):
+        return path == other
+    return path.resolve() == other.resolve()
+
+
 @dataclass
 class _Counts:
     """Count what becomes of the samples."""
@@ -148,7 +154,7 @@ class _Counts:
 class _Merge:
     """Join stores; the constructor compares them and prepares the store that gets their samples."""
 
-    def __init__(self, sources: Sequence[Store], target: Path, *, move: bool) -> None:
+    def __init__(self, sources: Sequence[Store], target: Location, *, move: bool) -> None:
         exists = store_module.is_store(target)
         known = [*([store_module.open_store(target)] if exists else []), *sources]
         for other in known[1:]:

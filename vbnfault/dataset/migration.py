@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from pathlib import Path
 
 from .. import store as stores
 from ..store import Store
@@ -45,7 +44,7 @@ def migrate_store(
             store = stores.migrate(source.path)
             write_card(store)
             return store
-        with locked(Path(out)):
+        with locked(stores.check_target(source, out)):
             store = stores.migrate_copy(stores.open_store(path), out, progress=progress)
             write_card(store)
             return store

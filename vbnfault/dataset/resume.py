@@ -9,12 +9,12 @@ from typing import Any, NamedTuple
 
 from .. import store as store_module
 from ..core.errors import InputError
-from ..store import Planned, Store, StoreSpec
+from ..store import Planned, Store, StoreSpec, Url
 from . import versions
 
 
 def planned_blocks(
-    out: str | os.PathLike[str], samples: int, *, append: int = 0, overwrite: bool = False
+    out: str | os.PathLike[str] | Url, samples: int, *, append: int = 0, overwrite: bool = False
 ) -> tuple[int, ...]:
     """Return the sizes of the planned blocks: those of an existing store, and one of size `append` if it is not 0.
 

@@ -71,9 +71,9 @@ _SAME_FOCAL_LENGTH = 1e-6  # as a fraction: 1e-3 px at the border of 2048 px
 
 
 def retake(
-    path: str | os.PathLike[str] | Store,
+    path: str | os.PathLike[str] | store.Url | Store,
     scene: Scene | str | Path,
-    out: str | os.PathLike[str],
+    out: str | os.PathLike[str] | store.Url,
     options: build.BuildOptions | None = None,
     *,
     source: str | None = None,
@@ -115,15 +115,15 @@ def retake(
     options = dataclasses.replace(options or build.BuildOptions(), **keywords)
     if not isinstance(scene, Scene):
         source, scene = source or str(scene), config.load_scene(scene)
-    source, out = source or "scene", Path(out)
+    source, target = source or "scene", store.located(out)
     opened = store.open_store(path)
-    if out.absolute() == opened.path.absolute():
-        raise InputError(f"--out {out}: is the store itself; choose another path")
+    if target.absolute() == opened.path.absolute():
+        raise InputError(f"--out {target}: is the store itself; choose another path")
     if not options.dry_run:
         llvm.find()
     contents = file_contents.Contents()
     with contents.in_use():
-        build_plan = _planned(opened, scene, source, out, options)
+        build_plan = _planned(opened, scene, source, target, options)
     contents.complete()
     factory = RetakeFactory(
         scene=scene,
@@ -133,10 +133,12 @@ def retake(
         threads=options.threads,
         contents=contents,
     )
-    return with_card(out, build.build(factory, build_plan, out, options))
+    return with_card(target, build.build(factory, build_plan, target, options))
 
 
-def _planned(opened: Store, scene: Scene, source: str, out: Path, options: build.BuildOptions) -> build.BuildPlan:
+def _planned(
+    opened: Store, scene: Scene, source: str, out: store.Location, options: build.BuildOptions
+) -> build.BuildPlan:
     """Return what a retake builds. Raises InputError if store and scene do not belong together."""
     _check_radiance(opened)
     repeats = _repeats(opened, scene, source)
@@ -212,7 +214,7 @@ def _checksums(opened: Store, samples: NDArray[np.int64]) -> str:
     return total.hexdigest()
 
 
-def _samples(opened: Store, out: Path, options: build.BuildOptions) -> NDArray[np.int64]:
+def _samples(opened: Store, out: store.Location, options: build.BuildOptions) -> NDArray[np.int64]:
     """Return the samples of the store that are taken: the finished ones, or those that the new store began with."""
     done = [i for number in opened.begun() for i, finished in opened.done(number).items() if finished]
     if not done:
@@ -338,7 +340,7 @@ class RetakeFactory:
     """
 
     scene: Scene
-    path: Path
+    path: store.Location
     attributes: Mapping[str, Any]
     faults: Sequence[str]
     threads: int | None = None

@@ -9,7 +9,6 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -20,7 +19,7 @@ from ..core import activity
 from ..core.errors import InputChanged, VbnfaultError
 from ..core.interrupts import check, finishing
 from ..core.quantities import Sample
-from ..store import Encoded, Planned, SampleDigests, Store
+from ..store import Encoded, Location, Planned, SampleDigests, Store
 from .errors import BuildFailed
 from .progress import Progress
 from .work import Fatal, Lazy, Queue, Tick, describe
@@ -70,7 +69,7 @@ class SampleWorkers:
     """
 
     factory: SessionFactory
-    path: Path
+    path: Location
 
     def __call__(self) -> _SampleWorker:
         return _SampleWorker(self)

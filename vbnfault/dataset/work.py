@@ -45,14 +45,14 @@ class Job(Protocol):
     Attributes
     ----------
     path
-        Where the results are written.
+        Where the results are written, for messages.
     tasks
         Number of tasks.
     task_noun, item_noun
         What messages call a task and an item.
     """
 
-    path: Path
+    path: Any
     progress: Progress
     task_noun: str
     item_noun: str

@@ -18,6 +18,7 @@ Only this package imports zarr. A sample has layers (arrays with one value or ve
 """
 
 from .arrays import EFFECT_RULE, LAYERS, REQUIRED_LAYERS, SCALARS, SEMANTIC, Array, Member
+from .bucket import OWN, Bucket, Url
 from .check import (
     Planned,
     Problem,
@@ -35,6 +36,7 @@ from .check import (
 )
 from .codec import Encoded, encode, mask_union
 from .counts import FaultCounts
+from .files import Location, files_of, located
 from .formats import FORMAT_VERSION
 from .group import Store, create, is_store, open_store, write_samples
 from .labelled import open_dataset
@@ -47,6 +49,7 @@ __all__ = [
     "EFFECT_RULE",
     "FORMAT_VERSION",
     "LAYERS",
+    "OWN",
     "REQUIRED_LAYERS",
     "SCALARS",
     "SEMANTIC",
@@ -54,9 +57,11 @@ __all__ = [
     "STRATA",
     "VOLATILE_ATTRIBUTES",
     "Array",
+    "Bucket",
     "Encoded",
     "FaultCounts",
     "FetchedSample",
+    "Location",
     "Member",
     "Planned",
     "Problem",
@@ -65,6 +70,7 @@ __all__ = [
     "ShardReader",
     "Store",
     "StoreSpec",
+    "Url",
     "append_samples",
     "check_shard",
     "check_target",
@@ -74,7 +80,9 @@ __all__ = [
     "encode",
     "examine",
     "examine_shard",
+    "files_of",
     "is_store",
+    "located",
     "mask_union",
     "migrate",
     "migrate_copy",

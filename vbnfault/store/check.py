@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from ..core.errors import VbnfaultError
 from ..core.quantities import soft_kind
 from .arrays import SCALARS
+from .bucket import Url
 from .codec import DIGEST_BYTES, crc_of_scalars, mask_union, sample_digest, threads
 from .compressors import compressor
 from .counts import FaultCounts
@@ -79,7 +80,7 @@ def examine_shard(store: Store, number: int, *, labels: bool = False) -> ShardCh
     """
     samples = store.shard(number)
     columns, unreadable = _columns(store, number)
-    if "done" not in columns and store.file("image", number).exists():
+    if "done" not in columns and store.files.exists(store.file_name("image", number)):
         problem = Problem(tuple(samples), f"done of samples {spans(samples)}: {unreadable['done']}")
         return ShardCheck([problem], {}, {}, {})
     finished = [i for i in samples if "done" in columns and columns["done"][i - samples.start]]
@@ -146,16 +147,17 @@ def _columns(store: Store, number: int) -> tuple[dict[str, NDArray[Any]], dict[s
     """
     columns: dict[str, NDArray[Any]] = {}
     unreadable: dict[str, str] = {}
-    for name in ("done", "crc32c", *SCALARS):
-        file = store.file(name, number).relative_to(store.path)
-        try:
-            columns[name] = store.column(name, number)
-        except FileNotFoundError:
-            unreadable[name] = f"the chunk file {file} is missing"
-        except ValueError:
-            unreadable[name] = f"cannot be decoded, {file} is damaged"
-        except OSError as error:
-            unreadable[name] = f"{file} cannot be read: {error.strerror}"
+    for names in (("done",), ("crc32c", *SCALARS)):
+        for name, column in zip(names, store.columns(names, number), strict=True):
+            file = store.file_name(name, number)
+            if not isinstance(column, Exception):
+                columns[name] = column
+            elif isinstance(column, FileNotFoundError):
+                unreadable[name] = f"the chunk file {file} is missing"
+            elif isinstance(column, ValueError):
+                unreadable[name] = f"cannot be decoded, {file} is damaged"
+            else:
+                unreadable[name] = f"{file} cannot be read: {column.strerror}"
         if "done" not in columns:
             break
     return columns, unreadable
@@ -168,7 +170,7 @@ def _chunks(store: Store, number: int, finished: list[int]) -> tuple[dict[str, d
     for name in store.spec.pixel_layers:
         if store.spec.empty(name):
             continue
-        file = store.file(name, number).relative_to(store.path)
+        file = store.file_name(name, number)
         try:
             chunks[name] = store.chunk(name, number)
         except FileNotFoundError:
@@ -193,7 +195,7 @@ def _layers(
             layers[name] = b""
         if name not in chunks:
             continue
-        file, why = store.file(name, number).relative_to(store.path), ""
+        file, why = store.file_name(name, number), ""
         if i not in chunks[name]:
             why = f"has no chunk in {file}"
         else:
@@ -228,7 +230,7 @@ def _not_built(samples: list[int]) -> Iterator[str]:
         yield f"samples {listed} are not built yet" if len(samples) > 1 else f"sample {listed} is not built yet"
 
 
-def problem_samples(store: str | os.PathLike[str] | Store) -> list[int]:
+def problem_samples(store: str | os.PathLike[str] | Url | Store) -> list[int]:
     """Return the samples that must be built or rebuilt: unfinished, missing or damaged ones, in ascending order."""
     store = open_store(store)
     begun = store.begun()
@@ -276,7 +278,7 @@ class Report(NamedTuple):
 
 
 def verify(
-    path: str | os.PathLike[str] | Store,
+    path: str | os.PathLike[str] | Url | Store,
     *,
     expected: Planned | None = None,
     exact: bool = False,
@@ -287,7 +289,7 @@ def verify(
 
 
 def examine(
-    path: str | os.PathLike[str] | Store,
+    path: str | os.PathLike[str] | Url | Store,
     *,
     expected: Planned | None = None,
     exact: bool = False,
@@ -508,7 +510,7 @@ class SampleDigests:
         return total.hexdigest()
 
 
-def digest(path: str | os.PathLike[str] | Store, *, progress: Callable[[int], None] | None = None) -> str:
+def digest(path: str | os.PathLike[str] | Url | Store, *, progress: Callable[[int], None] | None = None) -> str:
     """Return the sha256 (hex) of the data in a store: root attributes, schema, and decoded arrays of its samples.
 
     The digest does not depend on the creation time, the sharding or the compression. The store is read once, shard

@@ -1,4 +1,6 @@
-"""Read, write, rename and remove the files of a store; writes are durable and of whole files only.
+"""Read, write, rename and remove files on a disk; writes are durable and of whole files only.
+
+The functions take paths, for anything that must be durable. `Disk` does the same for the files of one store.
 
 A batch of files is written under temporary names in the same folders (`*.partial`), flushed to the device with
 fsync, and renamed; then the folders are flushed. After a loss of power each file is either the old or the new one.
@@ -11,6 +13,8 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import re
+import shutil
 import stat
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -330,3 +334,188 @@ def remove_partials(folder: Path) -> None:
         elif name.endswith(PARTIAL):
             with contextlib.suppress(FileNotFoundError):
                 os.unlink(path)
+
+
+# --- one store ----------------------------------------------------------------------------------------------
+
+
+class Disk:
+    """Read and write the files of a store in a folder; see `files.Files` for the methods."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._folder = str(path)
+
+    def read(self, name: str) -> bytes:
+        """Return the content of a file, see `read`."""
+        return read(f"{self._folder}/{name}")  # a large store has many files, and paths take longer than this
+
+    def read_each(self, names: Sequence[str]) -> Iterator[bytes | OSError]:
+        """Yield the content of each file, or why it cannot be read."""
+        for name in names:
+            try:
+                yield self.read(name)
+            except OSError as error:
+                yield error
+
+    def read_parts(
+        self, name: str, tail: int, choose: Callable[[bytes], Sequence[tuple[int, int]]]
+    ) -> list[tuple[int, bytes]]:
+        """Return parts of a file, see `read_parts`."""
+        return read_parts(self.path / name, tail, choose)
+
+    def names(self, folder: str) -> list[str]:
+        """Return the names in a folder."""
+        return names(self.path / folder)
+
+    def exists(self, name: str) -> bool:
+        """Return whether something has this name, also a broken link."""
+        return os.path.lexists(self.path / name)
+
+    def stamp(self, name: str) -> object:
+        """Return inode and modification time, which change if a file is replaced; None if there is no file."""
+        try:
+            status = os.stat(self.path / name)
+        except OSError:
+            return None
+        return status.st_ino, status.st_mtime_ns
+
+    def expect_file(self, name: str) -> None:
+        """Raise Misplaced if the name belongs to something else than a file."""
+        expect_file(self.path / name)
+
+    def zarr(self) -> Path:
+        """Return what zarr and xarray open."""
+        return self.path
+
+    def failure(self, error: Exception, name: str) -> VbnfaultError | None:
+        """Return the error for a failure of zarr that is no damage."""
+        return denied(error, self.path / name) if isinstance(error, PermissionError) else None
+
+    def write(self, files: Iterable[tuple[str, bytes | Path]]) -> None:
+        """Replace files durably, see `write`."""
+        write(self.path, files)
+
+    def remove(self, files: Iterable[str]) -> None:
+        """Remove files durably."""
+        remove(self.path, files)
+
+    def copied(self, name: str, *, link: bool) -> bytes | Path:
+        """Return a file as `write` of another store takes it."""
+        return self.path / name if link else self.read(name)
+
+    def why_occupied(self, own: Iterable[str]) -> str:
+        """Return why no store can be created here, as a clause; what a killed creation has left is beside it."""
+        if self.path.exists() and (not self.path.is_dir() or any(self.path.iterdir())):
+            return "exists and is no vbnfault store, so it is left alone; choose another --out"
+        above = next(p for p in self.path.absolute().parents if p.exists())
+        return "" if above.is_dir() else f"no store can be created here: {above} is a file, not a folder"
+
+    def create(self, files: Iterable[tuple[str, bytes]], *, old: bool) -> None:
+        """Make a store of these files, in place of an `old` one, under a temporary name, and rename it."""
+        target = self.path.absolute()
+        target.parent.mkdir(parents=True, exist_ok=True)
+        _remove_abandoned(target)
+        with _hidden_folder(target) as hidden:
+            write(hidden, files)
+            _replace(hidden, target, old=old)
+
+    def remove_leftovers(self) -> None:
+        """Remove the temporary files of killed processes."""
+        remove_partials(self.path)
+
+    def free_bytes(self) -> int | None:
+        """Return the free space in bytes; None if the system does not report it."""
+        for folder in (self.path, *self.path.absolute().parents):
+            try:
+                usage = shutil.disk_usage(folder)
+            except (OSError, ValueError):  # it does not exist yet, is not accessible, or is no valid name
+                continue
+            return usage.free if usage.total else None  # some mounts report a size of 0
+        return None
+
+
+def _replace(hidden: Path, target: Path, *, old: bool) -> None:
+    """Rename a new store to its final name, durably. An `old` store is removed, or restored if renaming fails."""
+    if not old:
+        if target.is_dir():
+            target.rmdir()
+        rename(hidden, target)
+        return
+    retired = _hidden_name(target)
+    rename(target, retired)
+    try:
+        rename(hidden, target)
+    except OSError:
+        if not target.exists():
+            rename(retired, target)
+        raise
+    with contextlib.suppress(OSError):
+        remove_tree(retired)
+
+
+# --- folders in which a store is created before it has its name --------------------------------------------
+#
+# A process that works in such a folder holds a lock on it, which ends with the process: a folder that can be locked
+# is abandoned. If the file system has no locks, an abandoned folder cannot be recognised, and none is removed.
+
+
+def _hidden_name(target: Path) -> Path:
+    """Return a new, unique temporary name beside `target`."""
+    return target.with_name(f".{target.name}.{uuid.uuid4().hex}{PARTIAL}")
+
+
+@contextlib.contextmanager
+def _hidden_folder(target: Path) -> Iterator[Path]:
+    """Make a new, locked folder beside `target`; remove it at the end unless it was renamed."""
+    while True:
+        folder = _hidden_name(target)
+        os.mkdir(folder)
+        lock = _lock_folder(folder, wait=True)
+        if folder.is_dir():  # otherwise another process removed it as abandoned before it was locked
+            break
+        _unlock_folder(lock)
+    try:
+        yield folder
+    finally:
+        with contextlib.suppress(OSError):
+            remove_tree(folder)
+        _unlock_folder(lock)
+
+
+def _remove_abandoned(target: Path) -> None:
+    """Remove the temporary folders of killed processes that were creating a store of this name."""
+    own = re.compile(rf"\.{re.escape(target.name)}\.[0-9a-f]{{32}}{re.escape(PARTIAL)}")
+    for name in names(target.parent):
+        folder = target.with_name(name)
+        if own.fullmatch(name) and folder.is_dir() and not folder.is_symlink():
+            lock = _lock_folder(folder, wait=False)
+            if lock is not None:
+                with contextlib.suppress(OSError):
+                    remove_tree(folder)
+                _unlock_folder(lock)
+
+
+def _lock_folder(folder: Path, *, wait: bool) -> int | None:
+    """Lock a folder and return a handle for `_unlock_folder`.
+
+    None if another process holds the lock (and not `wait`), or if the file system has no locks.
+    """
+    try:
+        import fcntl
+
+        lock = os.open(folder, os.O_RDONLY)
+    except (ImportError, OSError):
+        return None
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+    except OSError:
+        os.close(lock)
+        return None
+    return lock
+
+
+def _unlock_folder(lock: int | None) -> None:
+    """Release the lock that `_lock_folder` returned, if any."""
+    if lock is not None:
+        os.close(lock)

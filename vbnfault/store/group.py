@@ -5,14 +5,10 @@ Only whole files are written, and `done` is written last.
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
-import re
-import uuid
 import warnings
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -22,6 +18,7 @@ from ..core.errors import InputError, VbnfaultError
 from ..core.quantities import Sample
 from . import disk
 from .arrays import SCALARS
+from .bucket import Url
 from .codec import (
     Encoded,
     chunk_ranges,
@@ -32,6 +29,7 @@ from .codec import (
     join_shard,
     split_shard,
 )
+from .files import Files, Location, files_of, located
 from .formats import FIRST_PROGRAM, FORMAT_VERSION, READ_VERSIONS
 from .layout import (
     CHECKSUM,
@@ -67,8 +65,8 @@ class Store:
     read the files directly.
     """
 
-    def __init__(self, path: Path, attributes: dict[str, Any], mode: str) -> None:
-        self.path = path
+    def __init__(self, files: Files, attributes: dict[str, Any], mode: str) -> None:
+        self.files, self.path = files, files.path
         self.root_attributes = attributes
         self.attributes = {k: v for k, v in attributes.items() if k not in OWN_ATTRIBUTES}
         self.samples = int(attributes["samples"])
@@ -76,7 +74,6 @@ class Store:
         self._mode: Any = mode
         self._arrays: dict[str, zarr.Array[Any]] = {}
         self._shapes: dict[str, tuple[int, ...]] = {}
-        self._folder = str(path)
 
     @property
     def shards(self) -> int:
@@ -94,11 +91,13 @@ class Store:
             import zarr  # not above: reading the files directly needs no zarr, and its import takes 0.4 s
 
             try:
-                disk.expect_file(self.path / name / DOCUMENT)
-                self._arrays[name] = zarr.open_array(self.path / name, mode=self._mode, zarr_format=3)
-            except PermissionError as error:
-                raise disk.denied(error, self.path / name) from error
+                self.files.expect_file(f"{name}/{DOCUMENT}")
+                root = self.files.zarr()
+                self._arrays[name] = zarr.open_array(root, path=name, mode=self._mode, zarr_format=3)
             except Exception as error:  # zarr raises many types for metadata that it cannot parse
+                failure = self.files.failure(error, name)
+                if failure is not None:
+                    raise failure from error
                 raise VbnfaultError(
                     f"{self.path}: {self.why_closed(name)}; the build command re-creates it"
                 ) from error
@@ -108,12 +107,12 @@ class Store:
         """Change root attributes on disk, in `spare` first. A store must be opened again to show them."""
         self.root_attributes = sealed({**self.root_attributes, **json.loads(json.dumps(values))})
         arrays = array_documents(self.spec.members(self.samples))
-        disk.write(self.path, [(f"{SPARE}/{DOCUMENT}", to_bytes(group_document(self.root_attributes)))])
-        disk.write(self.path, [(DOCUMENT, to_bytes(group_document(self.root_attributes, arrays)))])
+        self.files.write([(f"{SPARE}/{DOCUMENT}", to_bytes(group_document(self.root_attributes)))])
+        self.files.write([(DOCUMENT, to_bytes(group_document(self.root_attributes, arrays)))])
 
     def why_closed(self, name: str) -> str:
         """Return why `array` cannot open an array, as a clause."""
-        if not os.path.lexists(self.path / name / DOCUMENT):
+        if not self.files.exists(f"{name}/{DOCUMENT}"):
             return f"array {name} is missing"
         return f"array {name} cannot be opened, {name}/{DOCUMENT} is damaged"
 
@@ -123,13 +122,14 @@ class Store:
         try:
             if name in self.spec.arrays:
                 for number in range(start // self.spec.shard_samples, -(-stop // self.spec.shard_samples)):
-                    disk.expect_file(self.file(name, number))
+                    self.files.expect_file(self.file_name(name, number))
             values = self.array(name)[start:stop]
         except VbnfaultError:
             raise
-        except PermissionError as error:
-            raise disk.denied(error, self.path / name) from error
         except Exception as error:
+            failure = self.files.failure(error, name)
+            if failure is not None:
+                raise failure from error
             raise VbnfaultError(
                 f"{self.path}: {name} of samples {start}-{stop - 1} cannot be read ({error}); "
                 f"the build command repairs it"
@@ -146,10 +146,10 @@ class Store:
             raise InputError(f"{self.path}: sample {index} does not exist; the range is 0 to {self.samples - 1}")
         chosen = [name for name in self.spec.pixel_layers if layers is None or name in layers]
         compared = [k for k, name in enumerate(self.spec.checked) if name in chosen or name not in self.spec.arrays]
-        file = self.file("done", index // self.spec.shard_samples)
+        file = self.file_name("done", index // self.spec.shard_samples)
         mismatches = 0
         while mismatches < _READS:
-            stamp = _stamp(file)
+            stamp = self.files.stamp(file)
             if not self.read("done", index, index + 1)[0]:
                 raise InputError(f"{self.path}: sample {index} is not finished yet; the build command resumes")
             crcs = self.read("crc32c", index, index + 1)[0].tolist()
@@ -159,7 +159,7 @@ class Store:
             if [*crcs_of_layers, crc_of_scalars(scalars)] == [crcs[k] for k in compared]:
                 return Sample(index=index, layers=arrays, scalars=scalars)
             # a process that rewrites the sample replaces the file of `done` first
-            mismatches += _stamp(file) == stamp
+            mismatches += self.files.stamp(file) == stamp
         raise VbnfaultError(
             f"{self.path}: sample {index} does not match its stored crc32c; the build command repairs it"
         )
@@ -171,24 +171,42 @@ class Store:
         """
         number = index // self.spec.shard_samples
         scalars: dict[str, Any] = {}
-        for name, row in SCALARS.items():
-            try:
-                value = self.column(name, number)[index - self.shard(number).start]
-            except (OSError, ValueError) as error:
+        for (name, row), column in zip(SCALARS.items(), self.columns(SCALARS, number), strict=True):
+            if isinstance(column, Exception):
                 raise VbnfaultError(
-                    f"{self.path}: {name} of sample {index} cannot be read ({error}); the build command repairs it"
-                ) from error
+                    f"{self.path}: {name} of sample {index} cannot be read ({column}); the build command repairs it"
+                ) from column
+            value = column[index - self.shard(number).start]
             scalars[name] = str(value) if row.is_text else value
         return scalars
 
+    def columns(self, names: Iterable[str], number: int) -> Iterator[NDArray[Any] | OSError | ValueError]:
+        """Yield several scalars for all samples of a shard, or why one cannot be read, in the order of `names`."""
+        wanted = list(names)
+        stored = [name for name in wanted if 0 not in self._shape(name)]
+        contents = dict(zip(stored, self.files.read_each([self.file_name(n, number) for n in stored]), strict=True))
+        for name in wanted:
+            content = contents.get(name, b"")
+            if isinstance(content, OSError):
+                yield content
+                continue
+            try:
+                yield self._column(name, number, content)
+            except ValueError as error:
+                yield error
+
     def column(self, name: str, number: int) -> NDArray[Any]:
         """Return a scalar for all samples of a shard. Raises OSError or ValueError if its chunk is damaged."""
+        content = b"" if 0 in self._shape(name) else self.files.read(self.file_name(name, number))
+        return self._column(name, number, content)
+
+    def _column(self, name: str, number: int, content: bytes) -> NDArray[Any]:
+        """Return a scalar for all samples of a shard from its chunk file. Raises ValueError if that is damaged."""
         row, shape = self.spec.arrays[name], self._shape(name)
         samples = len(self.shard(number))
         if 0 in shape:
             return np.zeros((samples, *shape), dtype=row.dtype)
-        values = decode_values(disk.read(f"{self._folder}/{self.file_name(name, number)}"), row.dtype)
-        return values.reshape(self.spec.shard_samples, *shape)[:samples]
+        return decode_values(content, row.dtype).reshape(self.spec.shard_samples, *shape)[:samples]
 
     def _shape(self, name: str) -> tuple[int, ...]:
         """Return the shape of one sample of an array; a large store asks for it a hundred thousand times."""
@@ -215,7 +233,7 @@ class Store:
 
     def begun(self) -> list[int]:
         """Return the shards that have files, in ascending order; no sample of any other shard is built yet."""
-        listed = {*disk.names(self.path / "done" / "c"), *disk.names(self.path / "image" / "c")}
+        listed = {*self.files.names("done/c"), *self.files.names("image/c")}
         numbers = {int(name) for name in listed if name.isascii() and name.isdecimal()}
         return sorted(n for n in numbers if n < self.shards)
 
@@ -233,7 +251,7 @@ class Store:
         counts: dict[bytes, int] = {}  # most files have the same content, so each content is decoded once
         for number in self.begun():
             try:
-                data = disk.read(f"{self._folder}/{self.file_name('done', number)}")
+                data = self.files.read(self.file_name("done", number))
                 if data not in counts or number >= full:
                     counts[data] = sum(self.done(number).values())
             except OSError:
@@ -244,8 +262,8 @@ class Store:
         """Return the name, relative to the store, of the file that holds an array's values for one shard."""
         return f"{name}/c/{number}{'/0' * len(self._shape(name))}"
 
-    def file(self, name: str, number: int) -> Path:
-        """Return the path of the file that holds an array's values for one shard."""
+    def file(self, name: str, number: int) -> Any:
+        """Return the path or the URL of the file that holds an array's values for one shard."""
         return self.path / self.file_name(name, number)
 
     def chunk(self, name: str, number: int, samples: Collection[int] | None = None) -> dict[int, bytes]:
@@ -257,7 +275,7 @@ class Store:
         if self.spec.empty(name):
             return dict.fromkeys(self.shard(number) if samples is None else samples, b"")
         if samples is None:
-            chunks = split_shard(disk.read(self.file(name, number)), size)
+            chunks = split_shard(self.files.read(self.file_name(name, number)), size)
             return {first + i: chunk for i, chunk in chunks.items()}
         wanted: dict[int, tuple[int, int]] = {}
 
@@ -266,7 +284,7 @@ class Store:
             wanted.update({i: ranges[i - first] for i in samples if i - first in ranges})
             return _joined(wanted.values())
 
-        parts = disk.read_parts(self.file(name, number), index_size(size), choose)
+        parts = self.files.read_parts(self.file_name(name, number), index_size(size), choose)
         return {
             i: data[start - begin : start - begin + length]
             for i, (start, length) in wanted.items()
@@ -297,7 +315,7 @@ class Store:
             if finished - wished:
                 self._write_done(number, wished)
             kept, chunks, columns = self._kept(number, wished)
-            disk.write(self.path, self._shard_files(number, given, kept, chunks, columns))
+            self.files.write(self._shard_files(number, given, kept, chunks, columns))
             self._write_done(number, {*given, *kept})
         return wished - kept
 
@@ -321,16 +339,16 @@ class Store:
             if any(self.done(number).values()):
                 self._write_done(number, set())
             names = [name for name in self.spec.arrays if name != "done" and not self.spec.empty(name)]
-            files = [(self.file_name(name, number), source.file(name, number)) for name in names]
-            disk.write(self.path, ((name, path if link else disk.read(path)) for name, path in files))
+            files = [self.file_name(name, number) for name in names]
+            self.files.write((file, source.files.copied(file, link=link)) for file in files)
             self._write_done(number, set(finished))
 
     def remove_shard(self, number: int) -> None:
         """Remove the files of a shard, `done` first, so that its samples are not finished any more."""
         samples = self.shard(number)
         with disk.explained(self.path, f"removing samples {samples.start}-{samples.stop - 1}"):
-            disk.remove(self.path, [self.file_name("done", number)])
-            disk.remove(self.path, [self.file_name(name, number) for name in self.spec.arrays])
+            self.files.remove([self.file_name("done", number)])
+            self.files.remove([self.file_name(name, number) for name in self.spec.arrays])
 
     def encoded(self, number: int, samples: Collection[int]) -> dict[int, Encoded]:
         """Return some samples of a shard as they are stored, for `write_shard` of another store; no digest is set.
@@ -374,7 +392,7 @@ class Store:
     def _write_done(self, number: int, finished: set[int]) -> None:
         """Mark exactly the `finished` samples of a shard as finished."""
         data = self._column_bytes("done", number, {i: i in finished for i in self.shard(number)})
-        disk.write(self.path, [(self.file_name("done", number), data)])
+        self.files.write([(self.file_name("done", number), data)])
 
     def _kept(
         self, number: int, wished: set[int]
@@ -425,41 +443,27 @@ def _joined(ranges: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
     return joined
 
 
-def _stamp(file: Path) -> tuple[int, int] | None:
-    """Return inode and modification time, which change if a file is replaced; None if there is no file."""
-    try:
-        status = os.stat(file)
-    except OSError:
-        return None
-    return status.st_ino, status.st_mtime_ns
-
-
 # --- create, open, write ----------------------------------------------------------------------------------
 
 
-def create(path: str | os.PathLike[str], spec: StoreSpec, samples: int, *, overwrite: bool = False) -> Store:
+def create(path: str | os.PathLike[str] | Url, spec: StoreSpec, samples: int, *, overwrite: bool = False) -> Store:
     """Create a store of `samples` unfinished samples and open it for writing.
 
     The store appears under its name only after all its files are written. `overwrite` replaces an existing store;
     a folder that holds anything else is never replaced. Raises InputError if the path cannot be used.
     """
-    target = Path(path)
+    target = located(path)
+    files = files_of(target)
     if samples < 1:
         raise InputError(f"samples = {samples}: must be at least 1")
     old = is_store(target)
     if old and not overwrite:
         raise InputError(f"{target}: exists already; resume it, or give --overwrite to replace it")
-    if not old and target.exists() and (not target.is_dir() or any(target.iterdir())):
-        raise InputError(f"{target}: exists and is no vbnfault store, so it is left alone; choose another --out")
-    above = next(p for p in target.absolute().parents if p.exists())
-    if not above.is_dir():
-        raise InputError(f"{target}: no store can be created here: {above} is a file, not a folder")
+    why = "" if old else files.why_occupied(name for name, _ in group_files(spec, samples))
+    if why:
+        raise InputError(f"{target}: {why}")
     try:
-        target.absolute().parent.mkdir(parents=True, exist_ok=True)
-        _remove_abandoned(target.absolute())
-        with _hidden_folder(target.absolute()) as hidden:
-            disk.write(hidden, group_files(spec, samples))
-            _replace(hidden, target.absolute(), old=old)
+        files.create(group_files(spec, samples), old=old)
     except OSError as error:
         raise InputError(f"{target}: no store can be created here: {error.strerror or error}") from error
     return open_store(target, "r+")
@@ -475,92 +479,6 @@ def group_files(spec: StoreSpec, samples: int) -> Iterator[tuple[str, bytes]]:
             yield f"{name}/{chunk}", encode_values(values)
     yield f"{SPARE}/{DOCUMENT}", to_bytes(group_document(attributes))
     yield DOCUMENT, to_bytes(group_document(attributes, arrays))
-
-
-def _replace(hidden: Path, target: Path, *, old: bool) -> None:
-    """Rename a new store to its final name, durably. An `old` store is removed, or restored if renaming fails."""
-    if not old:
-        if target.is_dir():
-            target.rmdir()
-        disk.rename(hidden, target)
-        return
-    retired = _hidden_name(target)
-    disk.rename(target, retired)
-    try:
-        disk.rename(hidden, target)
-    except OSError:
-        if not target.exists():
-            disk.rename(retired, target)
-        raise
-    with contextlib.suppress(OSError):
-        disk.remove_tree(retired)
-
-
-# --- folders in which a store is created before it has its name --------------------------------------------
-#
-# A process that works in such a folder holds a lock on it, which ends with the process: a folder that can be locked
-# is abandoned. If the file system has no locks, an abandoned folder cannot be recognised, and none is removed.
-
-
-def _hidden_name(target: Path) -> Path:
-    """Return a new, unique temporary name beside `target`."""
-    return target.with_name(f".{target.name}.{uuid.uuid4().hex}{disk.PARTIAL}")
-
-
-@contextlib.contextmanager
-def _hidden_folder(target: Path) -> Iterator[Path]:
-    """Make a new, locked folder beside `target`; remove it at the end unless it was renamed."""
-    while True:
-        folder = _hidden_name(target)
-        os.mkdir(folder)
-        lock = _lock_folder(folder, wait=True)
-        if folder.is_dir():  # otherwise another process removed it as abandoned before it was locked
-            break
-        _unlock_folder(lock)
-    try:
-        yield folder
-    finally:
-        with contextlib.suppress(OSError):
-            disk.remove_tree(folder)
-        _unlock_folder(lock)
-
-
-def _remove_abandoned(target: Path) -> None:
-    """Remove the temporary folders of killed processes that were creating a store of this name."""
-    own = re.compile(rf"\.{re.escape(target.name)}\.[0-9a-f]{{32}}{re.escape(disk.PARTIAL)}")
-    for name in disk.names(target.parent):
-        folder = target.with_name(name)
-        if own.fullmatch(name) and folder.is_dir() and not folder.is_symlink():
-            lock = _lock_folder(folder, wait=False)
-            if lock is not None:
-                with contextlib.suppress(OSError):
-                    disk.remove_tree(folder)
-                _unlock_folder(lock)
-
-
-def _lock_folder(folder: Path, *, wait: bool) -> int | None:
-    """Lock a folder and return a handle for `_unlock_folder`.
-
-    None if another process holds the lock (and not `wait`), or if the file system has no locks.
-    """
-    try:
-        import fcntl
-
-        lock = os.open(folder, os.O_RDONLY)
-    except (ImportError, OSError):
-        return None
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-    except OSError:
-        os.close(lock)
-        return None
-    return lock
-
-
-def _unlock_folder(lock: int | None) -> None:
-    """Release the lock that `_lock_folder` returned, if any."""
-    if lock is not None:
-        os.close(lock)
 
 
 # --- the root and its spare --------------------------------------------------------------------------------
@@ -582,10 +500,10 @@ class Root(NamedTuple):
         return self.damage + self.unfinished
 
 
-def read_document(path: Path) -> dict[str, Any] | None:
+def read_document(files: Files, name: str) -> dict[str, Any] | None:
     """Return the JSON object in a file; None if it is missing, unreadable or not a JSON object."""
     try:
-        document = json.loads(disk.read(path))
+        document = json.loads(files.read(name))
     except (OSError, ValueError, RecursionError):
         return None
     return document if isinstance(document, dict) else None
@@ -597,15 +515,14 @@ def _attributes_in(document: dict[str, Any] | None) -> dict[str, Any] | None:
     return attributes if isinstance(attributes, dict) and attributes.get("format") == "vbnfault" else None
 
 
-def read_root(path: Path) -> Root | None:
-    """Return the root attributes of the store at `path`; None if no copy of them is valid.
+def read_root(files: Files) -> Root | None:
+    """Return the root attributes of a store; None if no copy of them is valid.
 
     If the copy in `spare` is valid, it is used: it is written before the root, so it is never older. Each file is
     read once and the root first, so that a change by another process makes the root look older, never damaged.
     """
     spare = f"{SPARE}/{DOCUMENT}"
-    files = {DOCUMENT: path / DOCUMENT, spare: path / SPARE / DOCUMENT}
-    documents = {name: read_document(file) for name, file in files.items()}
+    documents = {name: read_document(files, name) for name in (DOCUMENT, spare)}
     attributes = {name: _attributes_in(document) for name, document in documents.items()}
     whole = {name: value for name, value in attributes.items() if value is not None and is_sealed(value)}
     # the checksum is that of the attributes; `metadata_problems` compares the rest of the root's document
@@ -614,12 +531,12 @@ def read_root(path: Path) -> Root | None:
     if not whole:
         # a store made before checksums existed
         root = attributes[DOCUMENT]
-        if root is None or CHECKSUM in root or (path / SPARE).exists():
+        if root is None or CHECKSUM in root or files.names(SPARE):
             return None
         return Root(root, damage=(f"{DOCUMENT} has no checksum and no spare copy",))
     damage = tuple(
-        f"{name} is {'damaged' if os.path.lexists(files[name]) else 'missing'}; {other} has the same attributes"
-        for name, other in (tuple(files), tuple(reversed(files)))
+        f"{name} is {'damaged' if files.exists(name) else 'missing'}; {other} has the same attributes"
+        for name, other in ((DOCUMENT, spare), (spare, DOCUMENT))
         if name not in whole
     )
     unfinished: tuple[str, ...] = ()
@@ -628,12 +545,12 @@ def read_root(path: Path) -> Root | None:
     return Root(whole.get(spare) or whole[DOCUMENT], damage, unfinished)
 
 
-def is_store(path: str | os.PathLike[str]) -> bool:
-    """Return whether there is a vbnfault store at this path."""
-    return read_root(Path(path)) is not None
+def is_store(path: str | os.PathLike[str] | Url) -> bool:
+    """Return whether there is a vbnfault store at this path or URL."""
+    return read_root(files_of(located(path))) is not None
 
 
-def open_store(path: str | os.PathLike[str] | Store, mode: str = "r") -> Store:
+def open_store(path: str | os.PathLike[str] | Url | Store, mode: str = "r") -> Store:
     """Open a store for reading (`r`) or writing (`r+`).
 
     If its root is damaged, the copy in `spare` is used. Mode `r` warns if either of them is damaged; that the root
@@ -643,13 +560,14 @@ def open_store(path: str | os.PathLike[str] | Store, mode: str = "r") -> Store:
     """
     if isinstance(path, Store):
         return path
-    path = Path(path)
-    root = read_root(path)
+    path = located(path)
+    files = files_of(path)
+    root = read_root(files)
     if root is None:
-        raise InputError(f"{path}: {_why_no_store(path)}")
+        raise InputError(f"{path}: {_why_no_store(files)}")
     _check_format(path, root.attributes.get("format_version"))
     try:
-        store = Store(path, root.attributes, mode)
+        store = Store(files, root.attributes, mode)
     except (KeyError, TypeError, ValueError, VbnfaultError) as error:
         raise InputError(f"{path}: {_NO_STORE}") from error
     if mode == "r":
@@ -661,7 +579,7 @@ def open_store(path: str | os.PathLike[str] | Store, mode: str = "r") -> Store:
 _NO_STORE = "is no vbnfault store: its root attributes are not those of one"
 
 
-def _check_format(path: Path, version: Any) -> None:
+def _check_format(path: Location, version: Any) -> None:
     """Raise InputError if a store has another format version; its sentence says what to do with the store."""
     if type(version) is not int or version < 1:
         raise InputError(f"{path}: {_NO_STORE}")
@@ -677,11 +595,11 @@ def _check_format(path: Path, version: Any) -> None:
         )
 
 
-def _why_no_store(path: Path) -> str:
-    """Return why the path cannot be opened as a store, as a clause."""
-    if not path.exists():
+def _why_no_store(files: Files) -> str:
+    """Return why there is no store, as a clause."""
+    if not files.exists(""):
         return "no such store"
-    if (path / SPARE / DOCUMENT).exists():
+    if files.exists(f"{SPARE}/{DOCUMENT}"):
         return (
             f"{DOCUMENT} and its copy {SPARE}/{DOCUMENT} are both damaged; put a copy of either in its place, "
             "or choose another --out"
@@ -689,7 +607,7 @@ def _why_no_store(path: Path) -> str:
     return "is no vbnfault store"
 
 
-def write_samples(store: str | os.PathLike[str] | Store, samples: Iterable[Sample | Encoded]) -> None:
+def write_samples(store: str | os.PathLike[str] | Url | Store, samples: Iterable[Sample | Encoded]) -> None:
     """Write samples into their shards; the other samples of those shards stay bit-identical.
 
     Only one process may write to a shard at a time. Raises ValueError for a sample that does not fit the schema or

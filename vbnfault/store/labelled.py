@@ -5,14 +5,14 @@ from __future__ import annotations
 import os
 from typing import TYPE_CHECKING
 
-from . import disk
+from .bucket import Url
 from .group import open_store
 
 if TYPE_CHECKING:
     import xarray
 
 
-def open_dataset(path: str | os.PathLike[str]) -> xarray.Dataset:
+def open_dataset(path: str | os.PathLike[str] | Url) -> xarray.Dataset:
     """Return a store as an `xarray.Dataset` with named dimensions, units and coordinates.
 
     Arrays are read when they are used, a sample of a layer at a time. README and the reference list them.
@@ -26,6 +26,9 @@ def open_dataset(path: str | os.PathLike[str]) -> xarray.Dataset:
 
     store = open_store(path)
     try:
-        return xarray.open_zarr(store.path, chunks=None)
-    except PermissionError as error:
-        raise disk.denied(error, store.path) from error
+        return xarray.open_zarr(store.files.zarr(), chunks=None, zarr_format=3)
+    except Exception as error:
+        failure = store.files.failure(error, "")
+        if failure is None:
+            raise
+        raise failure from error

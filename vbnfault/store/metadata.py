@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +13,8 @@ from numpy.typing import NDArray
 from ..core.errors import InputError
 from . import disk
 from .arrays import Member
+from .bucket import Url
+from .files import Files
 from .group import Store, open_store, read_document, read_root
 from .layout import (
     DOCUMENT,
@@ -40,7 +41,7 @@ def metadata_problems(store: Store) -> tuple[list[str], bool]:
     hopeless : bool
         Whether no sample can be read before the store is repaired.
     """
-    root = read_root(store.path)
+    root = read_root(store.files)
     problems = list(root.problems) if root is not None else [f"{DOCUMENT} and {SPARE}/{DOCUMENT} are damaged"]
     hopeless = False
     members = store.spec.members(store.samples)
@@ -48,7 +49,7 @@ def metadata_problems(store: Store) -> tuple[list[str], bool]:
     sound = {}
     for name, member in members.items():
         is_coordinate = member.values is not None
-        stored = read_document(store.path / name / DOCUMENT)
+        stored = read_document(store.files, f"{name}/{DOCUMENT}")
         if stored is None:
             problems.append(store.why_closed(name))
             hopeless |= not is_coordinate
@@ -65,7 +66,7 @@ def metadata_problems(store: Store) -> tuple[list[str], bool]:
         hopeless |= not is_coordinate and any(not clause.startswith("its attribute") for clause in differences)
         if not differences:
             sound[name] = documents[name]
-            problems += [f"array {name}: {clause}" for clause in _misvalued(store.path / name, member)]
+            problems += [f"array {name}: {clause}" for clause in _misvalued(store.files, name, member)]
     return problems + list(_root_differences(store, sound, documents)), hopeless
 
 
@@ -95,22 +96,22 @@ def _differ(a: Any, b: Any) -> bool:
     return canonical(a) != canonical(b)
 
 
-def _misvalued(folder: Path, member: Member) -> Iterator[str]:
+def _misvalued(files: Files, name: str, member: Member) -> Iterator[str]:
     """Yield a clause for each chunk of a coordinate that cannot be decoded or holds wrong values."""
     for chunk, wanted in coordinate_chunks(member):
-        stored = _values_in(folder / chunk, member.dtype)
+        stored = _values_in(files, f"{name}/{chunk}", member.dtype)
         if stored is None or stored.shape != wanted.shape:
-            yield f"its values in {folder.name}/{chunk} are missing or cannot be decoded"
+            yield f"its values in {name}/{chunk} are missing or cannot be decoded"
         elif not np.array_equal(stored, wanted):
             first = next(i for i, (a, b) in enumerate(zip(stored, wanted, strict=True)) if a != b)
             number = int(chunk.removeprefix("c/")) * member.chunks[0] + first
             yield f"its value {number} is {short(stored[first])}, not {short(wanted[first])}"
 
 
-def _values_in(file: Path, dtype: str) -> NDArray[Any] | None:
+def _values_in(files: Files, name: str, dtype: str) -> NDArray[Any] | None:
     """Return the values in a chunk file; None if it is missing or cannot be decoded."""
     try:
-        return decode_values(disk.read(file), dtype)
+        return decode_values(files.read(name), dtype)
     except (OSError, ValueError):
         return None
 
@@ -123,7 +124,7 @@ def _root_differences(
     The consolidated metadata matter because readers look there first. They must list no unknown array. They are
     compared for `sound` arrays only: any other array is reported already.
     """
-    root = read_document(store.path / DOCUMENT)
+    root = read_document(store.files, DOCUMENT)
     if root is None:
         return
     wanted = group_document(root.get("attributes") or {}, documents)
@@ -149,7 +150,7 @@ def short(value: Any) -> str:
 
 
 def append_samples(
-    store: str | os.PathLike[str] | Store, count: int, attributes: Mapping[str, Any] | None = None
+    store: str | os.PathLike[str] | Url | Store, count: int, attributes: Mapping[str, Any] | None = None
 ) -> Store:
     """Extend a store by `count` unfinished samples, set further root attributes, and open the store again.
 
@@ -165,7 +166,7 @@ def append_samples(
     return open_store(store.path, "r+")
 
 
-def recover(path: str | os.PathLike[str]) -> Store:
+def recover(path: str | os.PathLike[str] | Url) -> Store:
     """Repair a store's metadata and open it for writing. No other process may write to it meanwhile.
 
     This removes the `*.partial` files of killed processes. It rewrites root, `spare`, the metadata of arrays and
@@ -174,7 +175,7 @@ def recover(path: str | os.PathLike[str]) -> Store:
     """
     store = open_store(path, "r+")
     with disk.explained(store.path, "recovering the store"):
-        disk.remove_partials(store.path)
+        store.files.remove_leftovers()
         bring_to(store, store.root_attributes)
     return open_store(store.path, "r+")
 
@@ -184,29 +185,29 @@ def bring_to(store: Store, attributes: Mapping[str, Any]) -> None:
     attributes = sealed(attributes)
     members = spec_from_plain(attributes["store"], attributes).members(int(attributes["samples"]))
     documents = array_documents(members)
-    disk.write(store.path, _outdated_arrays(store.path, members, documents))
+    store.files.write(_outdated_arrays(store.files, members, documents))
     for name, document in (
         (f"{SPARE}/{DOCUMENT}", group_document(attributes)),
         (DOCUMENT, group_document(attributes, documents)),
     ):
-        disk.write(store.path, _outdated(store.path, {name: document}))
+        store.files.write(_outdated(store.files, {name: document}))
 
 
 def _outdated_arrays(
-    path: Path, members: Mapping[str, Member], documents: Mapping[str, Mapping[str, Any]]
+    files: Files, members: Mapping[str, Member], documents: Mapping[str, Mapping[str, Any]]
 ) -> Iterator[tuple[str, bytes]]:
     """Yield the name and right content of each array document and coordinate chunk that is wrong."""
     for name, member in members.items():
         for chunk, wanted in coordinate_chunks(member):
-            stored = _values_in(path / name / chunk, member.dtype)
+            stored = _values_in(files, f"{name}/{chunk}", member.dtype)
             if stored is None or not np.array_equal(stored, wanted):
                 yield f"{name}/{chunk}", encode_values(wanted)
-        yield from _outdated(path, {f"{name}/{DOCUMENT}": documents[name]})
+        yield from _outdated(files, {f"{name}/{DOCUMENT}": documents[name]})
 
 
-def _outdated(path: Path, documents: Mapping[str, Mapping[str, Any]]) -> Iterator[tuple[str, bytes]]:
+def _outdated(files: Files, documents: Mapping[str, Mapping[str, Any]]) -> Iterator[tuple[str, bytes]]:
     """Yield the name and right content of each document that is missing or wrong."""
     for name, wanted in documents.items():
-        stored = read_document(path / name)
+        stored = read_document(files, name)
         if stored is None or _differ(stored, wanted):
             yield name, to_bytes(wanted)

@@ -17,8 +17,10 @@ from pathlib import Path
 from ..core.errors import InputError, VbnfaultError
 from . import disk
 from .arrays import SCALARS
+from .bucket import Url
 from .codec import join_shard, threads
 from .compressors import compressor
+from .files import files_of, located
 from .formats import FORMAT_VERSION
 from .group import Store, group_files, is_store, open_store, read_root
 from .layout import root_attributes
@@ -26,7 +28,7 @@ from .metadata import bring_to
 from .schema import StoreSpec
 
 
-def migrate(path: str | os.PathLike[str]) -> Store:
+def migrate(path: str | os.PathLike[str] | Url) -> Store:
     """Bring a store to the current format, in place, and open it for writing; layers keep their codecs.
 
     No other process may write to it meanwhile. Raises InputError if the path holds no store that this vbnfault
@@ -35,7 +37,7 @@ def migrate(path: str | os.PathLike[str]) -> Store:
     store = open_store(path, "r+")
     spec = replace(store.spec, format_version=FORMAT_VERSION)
     with disk.explained(store.path, "migrating the store"):
-        disk.remove_partials(store.path)
+        store.files.remove_leftovers()
         bring_to(store, {**store.root_attributes, **root_attributes(spec, store.samples)})
     return open_store(path, "r+")
 
@@ -55,13 +57,12 @@ def migrate_copy(
     VbnfaultError
         If the source is damaged or the files cannot be written; the same call continues.
     """
-    target = Path(target).absolute()
-    check_target(source, target)
+    target = check_target(source, target).absolute()
     spec = replace(source.spec, format_version=FORMAT_VERSION, codecs={})
     hidden = target.with_name(f".{target.name}.migrate{disk.PARTIAL}")
     with disk.explained(target, "copying the store"):
         target.parent.mkdir(parents=True, exist_ok=True)
-        begun = read_root(hidden)
+        begun = read_root(files_of(hidden))
         if begun is None or begun.attributes != root_attributes(spec, source.samples):
             if hidden.exists():
                 disk.remove_tree(hidden)
@@ -78,20 +79,25 @@ def migrate_copy(
     return open_store(target)
 
 
-def check_target(source: Store, target: Path) -> None:
-    """Raise InputError if a store cannot be copied to a path."""
-    inside, outside = source.path.resolve(), target.resolve()
-    if inside == outside or inside in outside.parents:
-        raise InputError(f"{target}: lies in the store that is migrated; choose another --out")
-    if is_store(target) or (target.exists() and (not target.is_dir() or any(target.iterdir()))):
+def check_target(source: Store, target: str | os.PathLike[str]) -> Path:
+    """Return the path to which a store can be copied. Raises InputError for any other."""
+    path = located(target)
+    if isinstance(path, Url):
+        raise InputError(f"{path}: a copy is made on a disk; give a path, and copy its files to the object store")
+    if isinstance(source.path, Path):
+        inside, outside = source.path.resolve(), path.resolve()
+        if inside == outside or inside in outside.parents:
+            raise InputError(f"{target}: lies in the store that is migrated; choose another --out")
+    if is_store(path) or (path.exists() and (not path.is_dir() or any(path.iterdir()))):
         raise InputError(f"{target}: exists already, so it is left alone; choose another --out")
+    return path
 
 
 def _copy_shard(source: Store, spec: StoreSpec, number: int, hidden: Path) -> None:
     """Copy one shard into the hidden folder, unless it was copied before."""
     name = source.file_name("done", number)
     try:
-        done = disk.read(source.path / name)
+        done = source.files.read(name)
     except FileNotFoundError:
         return  # no sample of it is finished
     except OSError as error:
@@ -113,7 +119,7 @@ def _shard_files(source: Store, spec: StoreSpec, number: int) -> Iterator[tuple[
         file = source.file_name(name, number)
         try:
             is_same = source.spec.codecs.get(name) == spec.codecs.get(name)
-            yield file, disk.read(source.path / file) if is_same else _recoded(source, spec, name, number)
+            yield file, source.files.read(file) if is_same else _recoded(source, spec, name, number)
         except (FileNotFoundError, ValueError, disk.Misplaced) as error:
             raise _damaged(source, file, error) from error
 

@@ -24,7 +24,7 @@ from ...dataset.croissant import columns, croissant
 from ...dataset.lock import locked
 from ...dataset.progress import Progress
 from ...dataset.statistics import Statistics, statistics
-from ...store import SPLITS, STRATA, Store, disk, open_store
+from ...store import SPLITS, STRATA, Store, Url, disk, open_store
 from ..json_files import plain
 from .card import export_card
 from .contract import ExportPart, Finished, Format, formats
@@ -116,6 +116,8 @@ def export_store(
 
 def _check_place(store: Store, target: Path) -> None:
     """Refuse a folder within the store, or one that holds the store."""
+    if isinstance(store.path, Url):
+        return
     inside, outside = store.path.resolve(), target.resolve()
     if inside == outside or inside in outside.parents:
         raise InputError(f"{target}: lies in the store; choose another --out")
