@@ -25,7 +25,7 @@ from vbnfault.core.errors import InputError, VbnfaultError
 from vbnfault.core.quantities import Sample
 from vbnfault.dataset import build as bd
 from vbnfault.dataset import lock, progress, tasks
-from vbnfault.store import codec
+from vbnfault.store import codec, disk
 
 HERE = Path(__file__).resolve().parent
 
@@ -274,11 +274,11 @@ def test_too_little_room_is_said_before_the_first_sample(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     needed = make_spec().estimated_sample_bytes * SAMPLES
-    monkeypatch.setattr(bd, "_free_bytes", lambda path: needed // 2 - SAMPLES)
+    monkeypatch.setattr(disk.Disk, "free_bytes", lambda _: needed // 2 - SAMPLES)
     with pytest.raises(VbnfaultError, match=r"are needed, but only .*B are free there"):
         run(tmp_path / "s.zarr")
     assert not (tmp_path / "s.zarr").exists()
-    monkeypatch.setattr(bd, "_free_bytes", lambda path: needed - 1)
+    monkeypatch.setattr(disk.Disk, "free_bytes", lambda _: needed - 1)
     run(tmp_path / "s.zarr")
     assert "warning: " in capsys.readouterr().err
 

@@ -331,8 +331,8 @@ def test_a_reader_in_the_middle_of_a_change_of_the_attributes_sees_no_damage(
 
     changes = iter(("one", "two"))
 
-    def change_between(path: Path) -> Any:
-        found = document(path)
+    def change_between(*file: Any) -> Any:
+        found = document(*file)
         note = next(changes, None)
         if note is not None:
             with monkeypatch.context() as plain:

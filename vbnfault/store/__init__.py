@@ -1,12 +1,13 @@
 """Create, write, open and verify a dataset, which is one Zarr v3 group (the store).
 
-Only this package imports zarr. A sample has layers (arrays with one value or vector for each pixel) and scalars
-(everything else). These rules protect a store against kills, power loss and bad disks:
+Only this package imports zarr and obstore. A sample has layers (arrays with one value or vector for each pixel) and
+scalars (everything else). These rules protect a store against kills, power loss and bad disks:
 
 - This package encodes the chunk files itself. zarr would drop a chunk of zeros, and a missing chunk reads as zeros
   too; zarr would also compress the neighbours of a rebuilt sample again. Reads go through zarr, as a user's do.
-- A file is written under a temporary name in the same folder, flushed to the device, and renamed. So each file is
-  either the old or the new one, also after a loss of power (`disk`). `create` makes the whole group this way. A
+- `files` says where a store is: in a folder (`disk`) or in an object store (`bucket`). On a disk, a file is written
+  under a temporary name in the same folder, flushed to the device, and renamed. So each file is either the old or
+  the new one, also after a loss of power. `create` makes the whole group this way. A
   killed process leaves `*.partial` files, which `recover` removes.
 - The metadata follow from the root attributes alone (`layout`), so every difference can be detected and repaired.
   The root attributes hold a checksum. The group `spare` holds a copy of them and is written before the root.
