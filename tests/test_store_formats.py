@@ -83,7 +83,7 @@ def test_the_schema_still_describes_each_document_of_it(archived: Path) -> None:
     documents = array_documents(store.spec.members(store.samples))
     assert documents.keys() == {p.parent.name for p in archived.glob(f"*/{DOCUMENT}")} - {"spare"}
     for name, document in documents.items():
-        assert canonical(read_document(archived / name / DOCUMENT)) == canonical(document), name
+        assert canonical(read_document(store.files, f"{name}/{DOCUMENT}")) == canonical(document), name
 
 
 def test_a_store_of_the_format_before_is_completed_with_its_own_codec(old: Path) -> None:
