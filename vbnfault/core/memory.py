@@ -15,7 +15,7 @@ from pathlib import Path
 
 # Resident memory in bytes that a process reaches before it releases any. To take memory back from the system costs
 # a tenth of a sample's time where every stage does it, so memory is released only where a step would pass this.
-_MOST = 1280 << 20
+_MOST = 1260 << 20
 
 
 def release_unused(coming_bytes: int = 0, *, always: bool = False) -> None:

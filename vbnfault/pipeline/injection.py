@@ -15,6 +15,7 @@ from .spec import Draw, Injection, Pose, Rendering, SampleSpec, SceneExposure, s
 
 _DRAW_TRIES = 8
 _THREADS = 2  # for the effects of faults
+_TWINS_BYTES = 120 << 20  # that two images without a fault take while they are computed, for 1024×1024 pixels
 # If a step changes a pixel by this many DN, the change survives every later optical step within the paper's tables
 # (cos⁴ at 255 → 105 keeps 41 %). Such a fault counts as visible without a full comparison.
 _CLEARLY_VISIBLE_DN = 6.0
@@ -55,7 +56,7 @@ def inject_faults(
         draws = draw_faults(spec, development, commanded, {}, attempt)
         _prepare_signals(development, draws)
         clean.result()
-    release_unused()
+    release_unused(_TWINS_BYTES)
     while invisible := _invisible(development, draws, stored="mask_effect" in spec.scene.dataset.layers):
         draws = {name: draw for name, draw in draws.items() if name not in invisible}
         attempt += 1
@@ -127,7 +128,7 @@ def _invisible(development: Development, draws: Draws, *, stored: bool) -> list[
         # without a fault that informs others, their light is computed anew, with both cores and much memory
         alone = [name for name in draws if informs(draws[name].fault)]
         invisible = {name: is_invisible(name) for name in alone}
-        release_unused()
+        release_unused(_TWINS_BYTES)
         # numpy and OpenCV use one core for most steps of the others
         others = [name for name in draws if name not in invisible]
         with ThreadPoolExecutor(_THREADS) as pool:
