@@ -1,4 +1,4 @@
-"""Train on a dataset with PyTorch: `pip install 'vbnfault[torch]'`.
+"""Train on a dataset with PyTorch (`pip install 'vbnfault[torch]'`)::
 
     from vbnfault.torch import BatchDataset, Loader, SampleDataset
 
