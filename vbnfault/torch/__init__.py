@@ -1,4 +1,6 @@
-"""Train on a dataset with PyTorch (`pip install 'vbnfault[torch]'`)::
+"""Train on a dataset with PyTorch.
+
+It needs `pip install 'vbnfault[torch]'`::
 
     from vbnfault.torch import BatchDataset, Loader, SampleDataset
 
