@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 import pytest
 from browser import WHY_NOT, Page, found, opened
+from numcodecs import Blosc
 from synthetic import FAULTS, fake_sample, filled, flip, make_spec
 from test_cli import run
 
@@ -122,7 +123,7 @@ def test_the_page_takes_nothing_from_elsewhere(served: Served) -> None:
     assert headers["Content-Security-Policy"].startswith("default-src 'self'")
     assert headers["Cross-Origin-Resource-Policy"] == "same-origin"
     assert b"http" not in body
-    for name in ("view.js", "layers.js", "view.css", "zarrita.js"):
+    for name in ("view.js", "layers.js", "blosc.js", "view.css", "zarrita.js"):
         assert served.ask(f"/{name}")[0] == 200
 
 
@@ -319,9 +320,10 @@ def test_one_sample_by_mouse_and_by_keys(page: Page, served: Served) -> None:
     page.click(f'.tile[data-index="{index}"]')
     page.wait("performance.getEntriesByName('sample').length")
     page.wait(f"document.querySelector('#parameters').textContent.includes('{FAULTS[0].replace('_', ' ')}')")
-    # zarrita read masks from the files of the store, the server decoded the rest; the values are those of the store
+    # zarrita read image and mask from the files of the store, and the page holds their values
     read = page.evaluate("window.vbnfault.sources")
-    assert read["zarr"] >= 1
+    assert read["zarr"] >= 2
+    assert read["server"] == 0
     image = data.read("image", index, index + 1)[0]
     assert page.evaluate("[...window.vbnfault.view.pixels.data]") == image.ravel().tolist()
     masks = data.read("mask", index, index + 1)[0]
@@ -361,6 +363,26 @@ def test_one_sample_by_mouse_and_by_keys(page: Page, served: Served) -> None:
     assert all(
         u.startswith((served.viewer.url, "blob:", "data:", "about:")) for u in page.requests if "file:" not in u
     )
+
+
+@needs_browser
+def test_chunks_of_blosc_are_decoded_in_the_page(page: Page, served: Served) -> None:
+    rng, cases = np.random.default_rng(5), []
+    for shuffle in (Blosc.NOSHUFFLE, Blosc.SHUFFLE, Blosc.BITSHUFFLE):
+        for word in (1, 2, 6, 8):
+            for count in (5, 64, 4099):  # not a multiple of 8, and the end of the last block
+                for high in (1, 4, 256):  # zeros, what can be compressed, noise
+                    for block in (0, 512):
+                        data = rng.integers(0, high, count * word, dtype=np.uint8)
+                        coded = Blosc("zstd", 3, shuffle, block).encode(data.view(f"V{word}"))
+                        cases.append([list(bytes(coded)), data.tolist()])
+    ready(page, served)
+    script = """(async (cases) => {
+      const { decoded } = await import("/blosc.js");
+      return cases.map(([chunk, data]) => String(decoded(new Uint8Array(chunk))) === String(data));
+    })"""
+    assert all(page.evaluate(f"{script}({json.dumps(cases)})"))
+    assert len(cases) == 216
 
 
 @needs_browser

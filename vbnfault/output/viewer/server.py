@@ -35,6 +35,7 @@ _PAGE = {
     "": ("index.html", "text/html; charset=utf-8"),
     "view.js": ("view.js", "text/javascript; charset=utf-8"),
     "layers.js": ("layers.js", "text/javascript; charset=utf-8"),
+    "blosc.js": ("blosc.js", "text/javascript; charset=utf-8"),
     "zarrita.js": ("zarrita.js", "text/javascript; charset=utf-8"),
     "view.css": ("view.css", "text/css; charset=utf-8"),
 }

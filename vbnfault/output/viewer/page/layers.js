@@ -1,5 +1,8 @@
 // Read layers of a sample from the files of the store with zarrita.js, and paint them into canvases.
-import { FetchStore, get, open, root } from "/zarrita.js";
+import { Blosc } from "/blosc.js";
+import { FetchStore, get, open, registry, root } from "/zarrita.js";
+
+registry.set("blosc", () => Blosc);
 
 const SEMANTIC = [[24, 26, 32], [176, 164, 148], [240, 228, 66], [86, 200, 255]];
 // viridis (van der Walt and Smith 2015) at nine places, dark to bright
