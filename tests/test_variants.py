@@ -14,13 +14,17 @@ from synthetic import flip
 
 import vbnfault
 from vbnfault import store
+from vbnfault.camera import Camera
 from vbnfault.core.errors import InputError
-from vbnfault.dataset.identity import scene_identity
+from vbnfault.core.quantities import Radiance
+from vbnfault.dataset.identity import scene_identity, store_spec
 from vbnfault.pipeline import Session, stages
 from vbnfault.pipeline.exposure import exposure_factor
+from vbnfault.pipeline.record import to_sample
 from vbnfault.pipeline.spec import SampleSpec
 from vbnfault.scene import config, plan
 from vbnfault.scene.config import Scene
+from vbnfault.store import codec
 
 NEED_SUN = ["straylight"]
 
@@ -219,3 +223,39 @@ def test_rows_of_a_table_of_poses_are_seen_several_times() -> None:
     assert len(session.plan) == 4
     assert [session.trajectory.pose(k).camera_position_T_m[0] for k in range(4)] == [60e3, 60e3, 80e3, 80e3]
     assert [session.plan.first_of_view(k) for k in range(4)] == [0, 0, 2, 2]
+
+
+def test_what_the_samples_of_a_view_share_is_computed_and_compressed_once(
+    session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    exposed: list[Camera] = []
+    expose = Camera.expose
+
+    def counted(camera: Camera, radiance: Radiance, exposure_s: float) -> Any:
+        exposed.append(camera)
+        return expose(camera, radiance, exposure_s)
+
+    monkeypatch.setattr(Camera, "expose", counted)
+    samples = [to_sample(frame) for frame in map(session.frame, range(8, 12)) if frame.views == 1]
+    assert len(samples) > 1
+    assert len(exposed) <= 2  # one for each view that was rendered
+    compressed: list[int] = []
+    pack = codec._pack
+    monkeypatch.setattr(codec, "_pack", lambda array, name: compressed.append(id(array)) or pack(array, name))
+    spec, shared = store_spec(session, (16,)), codec.SharedChunks()
+    together = [codec.encode(spec, sample, shared) for sample in samples]
+    truth = {id(samples[0].layers[name]) for name in ("depth_m", "normal", "semantic")}
+    assert [compressed.count(key) for key in truth] == [1, 1, 1]
+    # a layer that differs is not taken for another one; whoever asks alone gets the same bytes
+    alone = [codec.encode(spec, sample) for sample in samples]
+    assert [one.digest for one in together] == [one.digest for one in alone]
+    assert [one.chunks for one in together] == [one.chunks for one in alone]
+    assert len({one.chunks["image"] for one in together}) == len(samples)
+    # nothing is kept for an array that is gone, or that may still change
+    own = np.zeros((80, 96), np.float32)
+    shared.packed({"own": (own, "zstd 1")})
+    assert not any(key == id(own) for key, _ in shared._known)
+    held = len(shared._known)
+    del samples
+    session._shared_views._kept.clear()
+    assert len(shared._known) < held

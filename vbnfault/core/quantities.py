@@ -251,6 +251,13 @@ class Truth:
     material: NDArray[np.int32] | None = None
     albedo_factor: NDArray[np.float32] | None = None
 
+    def frozen(self) -> Self:
+        """Return the same truth, whose arrays have become read-only: several samples share them."""
+        for array in vars(self).values():
+            if array is not None:
+                array.flags.writeable = False
+        return self
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Sample:

@@ -103,6 +103,7 @@ def work(simulate: Callable[[int], Sample], store: Store, task: Task, tick: Tick
     wanted = checked.wanted | task.unplanned
     samples = store.shard(task.shard)
     made: dict[int, Encoded] = {}
+    shared = store_module.SharedChunks()
     pending = set(wanted)
     lost: set[int] = set()
 
@@ -119,7 +120,7 @@ def work(simulate: Callable[[int], Sample], store: Store, task: Task, tick: Tick
             tick(i, "begun", "")
             try:
                 with activity.reported_to(functools.partial(tick, i, "stage")):
-                    encoded = store_module.encode(store.spec, simulate(i))
+                    encoded = store_module.encode(store.spec, simulate(i), shared)
             except Exception as error:
                 check()
                 tick(i, "failed", describe(error))

@@ -28,11 +28,26 @@ _AT_ZERO_PHASE = ((0.0, 0.0, 1.0), (0.0, 0.0, 1.0))
 
 def meter(spec: SampleSpec, rendering: Rendering) -> SceneExposure:
     """Set the exposure: fixed, or metered on the noise-free, fault-free frame. All twins share it."""
-    rate = spec.camera.expose(rendering.light.rendered, 1.0)
-    seconds = exposure_s(spec.scene, spec.camera, rendering.truth, rate.merged) * exposure_factor(spec)
+    metered_s, rate = _metered_light(spec, rendering)
+    seconds = metered_s * exposure_factor(spec)
     if spec.scene.camera.exposure_s == "auto":
         seconds = float(np.clip(seconds, spec.scene.camera.exposure_min_s, spec.scene.camera.exposure_max_s))
     return SceneExposure(camera=replace(spec.camera, exposure_s=seconds), light=rendering.light, rate=rate)
+
+
+def _metered_light(spec: SampleSpec, rendering: Rendering) -> tuple[float, Electrons]:
+    """Return the exposure in s, and the electrons expected after one second.
+
+    Both depend on the optics of the camera only, so the samples of a view with equal optics share them.
+    """
+    camera, known = spec.camera, rendering.metered
+    if camera.optics in known:
+        return known[camera.optics]
+    rate = camera.expose(rendering.light.rendered, 1.0)
+    metered = exposure_s(spec.scene, camera, rendering.truth, rate.merged), rate
+    if spec.plan.variants > 1:
+        known[camera.optics] = metered
+    return metered
 
 
 def exposure_factor(spec: SampleSpec) -> float:

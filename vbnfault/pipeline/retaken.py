@@ -252,7 +252,7 @@ def _rendering(spec: SampleSpec, pose: Pose, stored: StoredView) -> Rendering:
     return Rendering(
         scene=scene,
         light=SceneLight(lens=camera.lens, rendered=_radiance(spec, scene, stored)),
-        truth=truth,
+        truth=truth.frozen(),
         open_sky=open_sky,
         samples_per_pixel=float(stored.scalars["samples_per_pixel"]),
         noise_fraction_p99=float(stored.scalars["noise_fraction_p99"]),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -169,6 +169,11 @@ class Rendering:
     noise_fraction_p99: float = float("nan")
     surroundings: tuple[Radiance, ...] = ()
     far_sources: tuple[FarSource, ...] = ()
+
+    @cached_property
+    def metered(self) -> dict[Hashable, tuple[float, Electrons]]:
+        """Return the exposure in s and the electrons after one second, by the optics of the camera that metered."""
+        return {}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

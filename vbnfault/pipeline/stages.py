@@ -73,6 +73,7 @@ class SharedViews:
         pose = run(resolve, shared, first_try)
         taken = pose, run(render_view, shared.at(pose), pose)
         if spec.plan.variants > 1:
+            taken[1].truth.frozen()
             for older in [key for key in self._kept if key]:  # of the later views, the last one is enough
                 del self._kept[older]
             self._kept[first_try] = taken

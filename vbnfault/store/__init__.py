@@ -35,7 +35,7 @@ from .check import (
     unplanned_samples,
     verify,
 )
-from .codec import Encoded, encode, mask_union
+from .codec import Encoded, SharedChunks, encode, mask_union
 from .counts import FaultCounts
 from .files import Location, files_of, located
 from .formats import FORMAT_VERSION
@@ -69,6 +69,7 @@ __all__ = [
     "Report",
     "SampleDigests",
     "ShardReader",
+    "SharedChunks",
     "Store",
     "StoreSpec",
     "Url",

@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import struct
-from collections.abc import Iterable, Mapping
+import weakref
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -21,6 +22,9 @@ from .compressors import compressor
 from .schema import StoreSpec
 
 _ABSENT = 2**64 - 1  # marks a missing chunk in a shard's index (Zarr v3 specification)
+
+
+_Packed = tuple[bytes, int, bytes]  # chunk, CRC-32C and sha256 of an array
 
 
 def threads() -> int:
@@ -92,11 +96,50 @@ class Encoded:
     digest: bytes
 
 
-def encode(spec: StoreSpec, sample: Sample) -> Encoded:
+class SharedChunks:
+    """Keep the chunks of read-only arrays as long as the arrays exist.
+
+    Layers that are one array, in a sample or in the samples of a view, are then compressed once.
+    """
+
+    def __init__(self) -> None:
+        self._known: dict[tuple[int, str], tuple[weakref.ref[NDArray[Any]], _Packed]] = {}
+
+    def packed(self, layers: Mapping[str, tuple[NDArray[Any], str]]) -> dict[str, _Packed]:
+        """Return chunk, CRC-32C and sha256 of each layer, given its contiguous array and its codec."""
+        keys = {name: (id(array), codec) for name, (array, codec) in layers.items()}
+        arrays = {key: layers[name][0] for name, key in keys.items()}
+        done = {
+            key: self._known[key][1]
+            for key, array in arrays.items()
+            if key in self._known and self._known[key][0]() is array
+        }
+        left = {key: array for key, array in arrays.items() if key not in done}
+        with ThreadPoolExecutor(threads()) as pool:
+            done |= zip(left, pool.map(_pack, left.values(), (codec for _, codec in left)), strict=True)
+        for key, array in left.items():
+            if not array.flags.writeable:
+                self._known[key] = weakref.ref(array, self._forget(key)), done[key]
+        return {name: done[key] for name, key in keys.items()}
+
+    def _forget(self, key: tuple[int, str]) -> Callable[[object], None]:
+        """Return the function that is called when an array ceases to exist."""
+        known = self._known
+        return lambda _: known.pop(key, None) and None
+
+
+def _pack(array: NDArray[Any], codec: str) -> _Packed:
+    """Return chunk, CRC-32C and sha256 of an array."""
+    digest = hashlib.sha256(array.data if array.size else b"").digest()
+    return (compressor(codec).encode(array), crc32c(array), digest) if array.size else (b"", 0, digest)
+
+
+def encode(spec: StoreSpec, sample: Sample, shared: SharedChunks | None = None) -> Encoded:
     """Check a sample against the schema, compress its layers, compute its checksums.
 
-    `mask_any` is computed here if the sample lacks it. Raises ValueError, with the sample and the array, if an
-    array is missing, unknown, or of the wrong shape or dtype.
+    `shared` keeps the chunks of arrays that a later sample may have, too. `mask_any` is computed here if the sample
+    lacks it. Raises ValueError, with the sample and the array, if an array is missing, unknown, or of the wrong
+    shape or dtype.
     """
     layers = dict(sample.layers)
     if "mask" in layers and "mask_any" not in layers:
@@ -104,19 +147,16 @@ def encode(spec: StoreSpec, sample: Sample) -> Encoded:
     _same_names(sample.index, "layer", layers, spec.pixel_layers)
     _same_names(sample.index, "scalar", sample.scalars, SCALARS)
 
-    def pack(name: str) -> tuple[bytes, int, bytes]:
-        row, array = spec.pixel_layers[name], np.ascontiguousarray(layers[name])
+    arrays = {}
+    for name, row in spec.pixel_layers.items():
+        array = np.ascontiguousarray(layers[name])
+        arrays[name] = array, spec.codecs[name]
         if array.shape != spec.shape(row) or array.dtype != np.dtype(row.dtype):
             raise ValueError(
                 f"sample {sample.index}: {name} is {array.dtype}{list(array.shape)}, "
                 f"not {row.dtype}{list(spec.shape(row))}"
             )
-        digest = hashlib.sha256(array.data if array.size else b"").digest()
-        codec = compressor(spec.codecs[name])
-        return (codec.encode(array), crc32c(array), digest) if array.size else (b"", 0, digest)
-
-    with ThreadPoolExecutor(threads()) as pool:
-        packed = dict(zip(spec.pixel_layers, pool.map(pack, spec.pixel_layers), strict=True))
+    packed = (shared or SharedChunks()).packed(arrays)
     scalars = {name: _scalar(spec, sample.index, name, sample.scalars[name]) for name in SCALARS}
     crcs = [crc for _, crc, _ in packed.values()]
     return Encoded(
