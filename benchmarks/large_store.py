@@ -65,9 +65,9 @@ def made_up(spec: store.StoreSpec, index: int, injected: np.ndarray) -> Sample:
 
 
 def make(path: Path, samples: int) -> store.Store:
-    """Create the store."""
+    """Create the store, with 16 samples in a shard, the most that a store has."""
     size = {"camera.width_px": 16, "camera.height_px": 16, "dataset.samples": samples, "dataset.sites": 64}
-    session = pipeline.Session(config.load_scene("paper67p", size))
+    session = pipeline.Session(config.load_scene("paper67p", {**size, "dataset.shard_samples": 16}))
     spec = dataset.store_spec(session, (samples,))
     opened = store.create(path, spec, samples)
     commanded = stored_plan(spec.attributes, spec.faults)[1].injected
@@ -82,11 +82,11 @@ def make(path: Path, samples: int) -> store.Store:
     return opened
 
 
-def timed(action: Any) -> tuple[float, Any]:
-    """Return the duration of a call in s, and its result."""
-    start = time.perf_counter()
+def timed(action: Any) -> tuple[tuple[float, float], Any]:
+    """Return the duration of a call and the time that it computed, in s, and its result."""
+    start, computed = time.perf_counter(), time.process_time()
     result = action()
-    return time.perf_counter() - start, result
+    return (time.perf_counter() - start, time.process_time() - computed), result
 
 
 def resume(opened: store.Store) -> None:
@@ -109,15 +109,16 @@ def main() -> None:
     options = parser.parse_args()
     folder = Path(tempfile.mkdtemp(dir=options.folder, prefix="large-store-"))
     try:
-        seconds, opened = timed(lambda: make(folder / "large.zarr", options.samples))
+        (seconds, _), opened = timed(lambda: make(folder / "large.zarr", options.samples))
         print(f"{opened.samples} samples in {opened.shards} shards, made in {seconds:.0f} s")
         results = {}
         results["list"], finished = timed(lambda: store.open_store(opened.path).finished())
         results["stats"], numbers = timed(lambda: statistics(opened.path))
         results["resume"], _ = timed(lambda: resume(opened))
         assert numbers.finished == finished > 0
-        for name, duration in results.items():
-            print(f"{name:8s} {duration:6.2f} s   {'met' if duration < LIMIT_S else 'MISSED'}: under {LIMIT_S:g} s")
+        for name, (duration, computed) in results.items():
+            verdict = "met" if duration < LIMIT_S else "MISSED"
+            print(f"{name:8s} {duration:6.2f} s, computed {computed:6.2f} s   under {LIMIT_S:g} s: {verdict}")
         if options.json:
             Path(options.json).write_text(json.dumps(results, indent=1), encoding="utf-8")
     finally:

@@ -338,24 +338,28 @@ def _groups(store: Store) -> Iterator[tuple[list[int], dict[str, NDArray[Any]]]]
             yield samples, {name: np.concatenate(parts) for name, parts in columns.items()}
 
 
+_NUMBERS = frozenset((int, float))
+
+
 def _add_parameters(known: dict[str, _Parameter], drawn: Any, name: str = "") -> None:
     """Add the drawn parameters of one fault; entries of lists count as values of the list's name."""
-    if isinstance(drawn, Mapping):
+    kind = type(drawn)
+    if kind in _NUMBERS:
+        _parameter(known, name).pending.append(drawn)
+    elif kind is dict:
         for key, value in drawn.items():
-            _add_parameters(known, value, f"{name}.{key}" if name else str(key))
-    elif isinstance(drawn, list):
-        if drawn and all(type(value) in (int, float) for value in drawn):
+            _add_parameters(known, value, f"{name}.{key}" if name else key)
+    elif kind is list:
+        if drawn and _NUMBERS.issuperset(map(type, drawn)):
             _parameter(known, name).pending.extend(drawn)
         else:
             for value in drawn:
                 _add_parameters(known, value, name)
-    elif isinstance(drawn, str | bool):
+    elif drawn is not None:
         words = _parameter(known, name).words
-        word = str(drawn).lower() if isinstance(drawn, bool) else drawn
+        word = str(drawn).lower() if kind is bool else drawn
         if word in words or len(words) < _MOST_WORDS:
             words[word] += 1
-    elif drawn is not None:
-        _parameter(known, name).pending.append(drawn)
 
 
 def _parameter(known: dict[str, _Parameter], name: str) -> _Parameter:

@@ -70,13 +70,15 @@ def read(path: str | Path) -> bytes:
     InputError
         This user may not read the file.
     """
-    with _regular_file(path) as file:
+    file, size = _opened(path)
+    try:
         # os.read reserves what it may read; one byte more than the file has tells that nothing follows
-        size = os.fstat(file).st_size
         parts = [os.read(file, min(size + 1, 1 << 30))]
         if len(parts[0]) != size:
             while part := os.read(file, 1 << 30):
                 parts.append(part)
+    finally:
+        os.close(file)
     return parts[0] if len(parts) == 1 else b"".join(parts)
 
 
@@ -99,19 +101,22 @@ def read_parts(
     Misplaced, OSError, InputError
         As `read` does.
     """
-    with _regular_file(path) as file:
-        size = os.fstat(file).st_size
+    file, size = _opened(path)
+    try:
         ranges = choose(os.pread(file, tail, max(0, size - tail)))
         return [(start, os.pread(file, length, start)) for start, length in ranges]
+    finally:
+        os.close(file)
 
 
-@contextlib.contextmanager
-def _regular_file(path: str | Path) -> Iterator[int]:
-    """Open a regular file for reading in a `with` block. Raises what `read` says."""
-    # without O_NONBLOCK, opening a pipe would wait for a writer
-    flags = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+# without O_NONBLOCK, opening a pipe would wait for a writer
+_READING = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+
+
+def _opened(path: str | Path) -> tuple[int, int]:
+    """Open a regular file for reading, and return its handle and its size in bytes. Raises what `read` says."""
     try:
-        file = os.open(path, flags)
+        file = os.open(path, _READING)
     except PermissionError as error:
         raise denied(error, path) from error
     except OSError as error:
@@ -122,9 +127,10 @@ def _regular_file(path: str | Path) -> Iterator[int]:
         status = os.fstat(file)
         if not stat.S_ISREG(status.st_mode):
             raise Misplaced(errno.EISDIR, "it is not a regular file", str(path))
-        yield file
-    finally:
+    except BaseException:
         os.close(file)
+        raise
+    return file, status.st_size
 
 
 def expect_file(path: Path) -> None:
@@ -324,16 +330,17 @@ def remove_tree(folder: Path) -> None:
     os.rmdir(folder)
 
 
-def remove_partials(folder: Path) -> None:
+def remove_partials(folder: str | Path) -> None:
     """Remove the temporary files that a killed process left in a folder or below it."""
-    with os.scandir(folder) as entries:
-        inside = [(entry.path, entry.name, entry.is_dir(follow_symlinks=False)) for entry in entries]
-    for path, name, is_folder in inside:
-        if is_folder:
-            remove_partials(Path(path))
-        elif name.endswith(PARTIAL):
-            with contextlib.suppress(FileNotFoundError):
-                os.unlink(path)
+    folders = [os.fspath(folder)]  # text, because a large store has half a million folders
+    while folders:
+        with os.scandir(folders.pop()) as entries:
+            for entry in entries:
+                if entry.is_dir(follow_symlinks=False):
+                    folders.append(entry.path)
+                elif entry.name.endswith(PARTIAL):
+                    with contextlib.suppress(FileNotFoundError):
+                        os.unlink(entry.path)
 
 
 # --- one store ----------------------------------------------------------------------------------------------
