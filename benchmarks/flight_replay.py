@@ -110,7 +110,7 @@ SPOTS: dict[str, dict[str, Any]] = {
     "particles": {"model": "coma_grains", "density_per_m3": 6e-4},
 }
 # Random relief lowers the rank correlation: this is about the least with the texture within a factor of 2.
-RELIEF = 0.5
+RELIEF = 0.35
 HAZE = {"reference_au": 3.6, "sunlit_fraction": 0.4, "distance_exponent": 0.0}
 
 

@@ -112,7 +112,7 @@ class BodyTable(Table):
         description="'embedded', 'ellipsoid', or a shape file: OBJ, PLY, STL, GLB, PDS TAB, ICQ, WRL, BDS",
     )
     unit: Literal["auto", "m", "km"] = Field("auto", description="of the shape file; auto: from its size")
-    sharpen: Literal["auto"] | Annotated[float, Field(ge=0, le=2)] = Field(
+    sharpen: Literal["auto"] | Annotated[float, Field(ge=0, le=4)] = Field(
         0.0,
         description="restores the relief that a smoothed shape file has lost near its facets: the gain of its "
         "shortest wavelengths; 'auto': as far as its roughness at longer ones asks for; 0: the file as it is",
