@@ -306,3 +306,23 @@ def test_commands_take_urls(tmp_path: Path, built: str, digest: str, monkeypatch
     assert "8 samples as png" in call("export", built, "--format", "png", "--out", str(tmp_path / "e"))
     shown = CliRunner().invoke(cli.app, ["verify", "ftp://a/b"])
     assert "ftp:// is unknown" in str(shown.exception)
+
+
+def test_a_bucket_is_viewed_by_ranges_and_reported(built: str, tmp_path: Path) -> None:
+    from vbnfault.output.report import write_report
+    from vbnfault.output.viewer import Viewer
+
+    viewer = Viewer(st.open_store(built))
+    try:
+        name = viewer.store.file_name("mask", 0)
+        whole = viewer.store.files.read(name)
+        assert viewer.part(name, None)[0] == whole
+        assert viewer.part(name, "bytes=3-9") == (whole[3:10], "")
+        assert viewer.part(name, "bytes=-20") == (whole[-20:], "")
+        columns, faults = viewer.columns(), len(viewer.store.spec.faults)
+        assert len(columns) == viewer.store.samples * (3 + 4 * -(-faults // 32))
+        assert columns[-viewer.store.samples :] == bytes([1]) * viewer.store.samples
+        assert viewer.about["name"] == built.rpartition("/")[2]
+    finally:
+        viewer.server.server_close()
+    assert write_report(built, tmp_path / "r.html").stat().st_size > 100_000

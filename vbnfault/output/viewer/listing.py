@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...store import SPLITS, Store, disk
+from ...store import SPLITS, Store
 
 NOT_KNOWN = 255  # a split without a name, or a severity of a fault that is not injected or draws no number
 _BITS = 32
@@ -90,10 +90,12 @@ class Listing:
         if store.spec.empty(name):
             return
         last = store.shards - 1
-        for number in numbers:
+        contents = store.files.read_each([store.file_name(name, number) for number in numbers])
+        for number, content in zip(numbers, contents, strict=True):
+            if isinstance(content, OSError):
+                continue
+            values = decoded.get(content)
             try:
-                content = disk.read(store.path / store.file_name(name, number))
-                values = decoded.get(content)
                 if values is None or number == last:  # the last shard may hold fewer samples
                     values = store.column(name, number)
                     decoded[content] = values

@@ -20,6 +20,7 @@ from functools import cached_property, lru_cache
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import resources
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -27,7 +28,7 @@ from numpy.typing import NDArray
 
 from ...core import images
 from ...core.errors import InputError, VbnfaultError
-from ...store import SCALARS, SEMANTIC, SPLITS, STRATA, ShardReader, Store, disk
+from ...store import SCALARS, SEMANTIC, SPLITS, STRATA, ShardReader, Store
 from ..contact_sheet import COLOURS, abbreviations, overlay, resized, resized_mask
 from .listing import Listing
 
@@ -143,7 +144,7 @@ class Viewer:
         short = abbreviations(spec.faults)
         return {
             "title": str(store.attributes.get("title") or ""),
-            "name": str(store.path).rstrip("/").rpartition("/")[2],
+            "name": store.path.name,
             "samples": store.samples,
             "width": spec.width,
             "height": spec.height,
@@ -243,11 +244,11 @@ class Viewer:
             rgb = overlay(rgb, small, [bool(mask.any()) for mask in small], localised)
         return images.encoded(rgb, ".jpg", _JPEG_QUALITY)
 
-    def part(self, name: str, header: str | None) -> tuple[bytes, int, int, int]:
-        """Return a part of a file of the store, its start, its end and the size of the file.
+    def part(self, name: str, header: str | None) -> tuple[bytes, str]:
+        """Return a part of a file of the store, and which part it is as the header `Content-Range` says it.
 
-        `header`: the header `Range`, None for the whole file. Raises _Missing if there is no such file, ValueError
-        if the range is none.
+        `header`: the header `Range`, None for the whole file. The second value is "" for an object store, which
+        does not tell the size. Raises _Missing if there is no such file, ValueError if the range is none.
         """
         if not self._is_served(name):
             raise _Missing
@@ -255,20 +256,32 @@ class Viewer:
         if asked is None:
             raise ValueError(header)
         first, last, suffix = (int(group) if group else None for group in asked.groups())
-        try:
-            size = self._size(name)
-            start = max(0, size - suffix) if suffix is not None else first or 0
-            stop = size if last is None else min(last + 1, size)
-            if start >= stop and header is not None:
-                raise ValueError(header)
-            parts = disk.read_parts(self.store.path / name, 0, lambda _: [(start, stop - start)])
-        except (OSError, VbnfaultError) as error:
-            raise _Missing from error
-        return parts[0][1], start, stop, size
+        files, end = self.store.files, b""
 
-    def _size(self, name: str) -> int:
-        """Return the size of a file of the store in bytes."""
-        return (self.store.path / name).stat().st_size
+        def choose(tail: bytes) -> list[tuple[int, int]]:
+            nonlocal end
+            end = tail
+            return [] if suffix is not None else [(first or 0, (last or 0) - (first or 0) + 1)]
+
+        try:
+            if header is None or (suffix is None and last is None):
+                body = files.read(name)[first or 0 :]
+            elif suffix is None and (last or 0) < (first or 0):
+                raise ValueError(header)
+            else:
+                parts = files.read_parts(name, suffix or 1, choose)
+                body = parts[0][1] if parts else end
+            if header is not None and not body:
+                raise ValueError(header)
+            size = self._size(name)
+        except OSError as error:
+            raise _Missing from error
+        start = (size or 0) - len(body) if suffix is not None else first or 0
+        return body, "" if size is None else f"bytes {start}-{start + len(body) - 1}/{size}"
+
+    def _size(self, name: str) -> int | None:
+        """Return the size of a file of the store in bytes, None in an object store."""
+        return (self.store.path / name).stat().st_size if isinstance(self.store.path, Path) else None
 
     def _is_served(self, name: str) -> bool:
         """Return whether a name may belong to a file of the store: metadata or a chunk of one of its arrays."""
@@ -344,18 +357,14 @@ def _handler(viewer: Viewer) -> type[BaseHTTPRequestHandler]:
             """Return status, body and headers of a file of the store."""
             header = self.headers.get("Range")
             try:
-                body, start, stop, size = viewer.part(name, header)
+                body, which = viewer.part(name, header)
             except ValueError:
                 return HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE, b"", {}
             kind = "application/json" if name.endswith(".json") else "application/octet-stream"
             headers = {"Accept-Ranges": "bytes", "Content-Type": kind, "Cache-Control": "no-store"}
             if header is None:
                 return HTTPStatus.OK, body, headers
-            return (
-                HTTPStatus.PARTIAL_CONTENT,
-                body,
-                {**headers, "Content-Range": f"bytes {start}-{stop - 1}/{size}"},
-            )
+            return HTTPStatus.PARTIAL_CONTENT, body, {**headers, **({"Content-Range": which} if which else {})}
 
         def _reply(self, status: int, body: bytes, headers: dict[str, str]) -> None:
             """Send an answer."""
