@@ -102,7 +102,9 @@ def test_kernels_are_those_of_the_plan_also_where_a_meta_kernel_names_them(tmp_p
     pytest.importorskip("spiceypy")
     kernel, meta = tmp_path / "one.tpc", tmp_path / "meta.tm"
     kernel.write_text(KERNEL.format(1))
-    meta.write_text(f"KPL/MK\n\\begindata\nKERNELS_TO_LOAD = ( '{kernel}' )\n\\begintext\n")
+    # a string of a kernel has at most 80 characters
+    folder = f"PATH_VALUES = ( '{tmp_path}' )\nPATH_SYMBOLS = ( 'HERE' )"
+    meta.write_text(f"KPL/MK\n\\begindata\n{folder}\nKERNELS_TO_LOAD = ( '$HERE/one.tpc' )\n\\begintext\n")
     contents = file_contents.Contents()
     with contents.in_use(), spice.kernels(meta):
         pass

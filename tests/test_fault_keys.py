@@ -31,6 +31,7 @@ KEYS = [
 COMPANIONS: dict[tuple[str, str], dict[str, Any]] = {
     ("straylight", "baffle_length_mm"): {"baffle_radius_mm": 1.0},
     ("straylight", "baffle_radius_mm"): {"baffle_length_mm": 30.0},
+    ("straylight", "scene_diffraction"): {"sources": "scene"},
     ("dust_on_optics", "window_height_mm"): {"surface": -2},
     ("dust_on_optics", "mask_loss"): {"diameter_um": 20.0},
     ("broken_pixels", "clustered_share"): {"years": 20.0},
