@@ -14,7 +14,9 @@ from .app import app
 from .options import (
     MOST_PROCESSES,
     MOST_SAMPLES,
+    OutStoreOption,
     SceneArgument,
+    SceneOption,
     SceneOptions,
     SceneValues,
     StoreArgument,
@@ -64,7 +66,7 @@ class WorkOptions:
 @grouped
 def build(
     scene: SceneArgument,
-    out: Annotated[str, typer.Option(help="Path or URL of the Zarr store to make or to resume.")],
+    out: OutStoreOption,
     options: SceneOptions,
     work: WorkOptions,
     append: Annotated[
@@ -101,8 +103,8 @@ def merge(
 @grouped
 def retake(
     store: StoreArgument,
-    scene: Annotated[str, typer.Option(help="Path of a scene file, or name of a packaged scene.")],
-    out: Annotated[str, typer.Option(help="Path or URL of the new store, made or resumed.")],
+    scene: SceneOption,
+    out: OutStoreOption,
     options: SceneValues,
     work: WorkOptions,
 ) -> None:

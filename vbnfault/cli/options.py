@@ -24,7 +24,10 @@ MOST_SAMPLES = 10_000_000
 MOST_PROCESSES = 1024
 MOST_SEED = 2**63 - 1
 
-SceneArgument = Annotated[str, typer.Argument(help="Path of a scene file, or name of a packaged scene.")]
+_A_SCENE = "Path of a scene file, or name of a packaged scene."
+SceneArgument = Annotated[str, typer.Argument(help=_A_SCENE)]
+SceneOption = Annotated[str, typer.Option(help=_A_SCENE)]
+OutStoreOption = Annotated[str, typer.Option(help="Path or URL of the Zarr store to make or to resume.")]
 StoreArgument = Annotated[str, typer.Argument(help="Path or URL (s3://, gs://, az://, file://) of a Zarr store.")]
 PluginOption = Annotated[
     list[str] | None,

@@ -81,34 +81,54 @@ def scene_identity(session: pipeline.Session) -> dict[str, Any]:
         images = sorted(resources.data_dir(folder).glob("*.png"))
         data = b"".join(user_files.read_input(path, "texture") for path in images)
         scene[f"{folder}_sha256"] = user_files.sha256(data)
-    if session.scene.body.atmosphere is None:
-        del scene["body"]["atmosphere"]  # stores of scenes without one stay as they were
-    if (albedo_map := session.scene.body.albedo_map) and albedo_map.projection == "equirectangular":
-        del scene["body"]["albedo_map"]["projection"]
-    if session.scene.body.sharpen == 0:
-        del scene["body"]["sharpen"]
-    if session.scene.coma is None:
-        del scene["coma"]
-    if session.scene.camera.point_spread is None:
-        del scene["camera"]["point_spread"]
-    elif not session.scene.camera.point_spread.wing_fraction:
-        for key in ("wing_fraction", "wing_urad", "wing_index"):
-            del scene["camera"]["point_spread"][key]
-    if session.scene.patch.fractured is None:
-        del scene["patch"]["fractured"]
-    if not session.scene.sky.bodies:
-        del scene["sky"]["bodies"]
-    if session.scene.trajectory is None:
-        del scene["trajectory"]
-    else:
+    if session.scene.trajectory is not None:
         scene["trajectory"]["file"] = _digest(session.scene.trajectory.file, "trajectory")
-    if not session.scene.is_aimed:
+    _leave_out_unused(scene, session.scene)
+    _identify_plugins(scene, session)
+    del scene["dataset"]["samples"]
+    return scene
+
+
+def _leave_out_unused(identity: dict[str, Any], scene: Scene) -> None:
+    """Delete what a scene does not use, and keys at their defaults, so that earlier stores keep their identity."""
+    if scene.body.atmosphere is None:
+        del identity["body"]["atmosphere"]
+    if (albedo_map := scene.body.albedo_map) and albedo_map.projection == "equirectangular":
+        del identity["body"]["albedo_map"]["projection"]
+    if scene.body.sharpen == 0:
+        del identity["body"]["sharpen"]
+    if scene.coma is None:
+        del identity["coma"]
+    if scene.camera.point_spread is None:
+        del identity["camera"]["point_spread"]
+    elif not scene.camera.point_spread.wing_fraction:
+        for key in ("wing_fraction", "wing_urad", "wing_index"):
+            del identity["camera"]["point_spread"][key]
+    if scene.patch.fractured is None:
+        del identity["patch"]["fractured"]
+    if not scene.sky.bodies:
+        del identity["sky"]["bodies"]
+    if scene.trajectory is None:
+        del identity["trajectory"]
+    if not scene.is_aimed:
         for key in OF_AN_AIM:
-            del scene["geometry"][key]
-    del scene["plugins"]
+            del identity["geometry"][key]
+    for table, key in (
+        ("dataset", "variants_per_view"),
+        ("dataset", "radiance_dtype"),
+        ("camera", "exposure_stops"),
+    ):
+        values = getattr(scene, table)
+        if getattr(values, key) == type(values).model_fields[key].default:
+            del identity[table][key]
+
+
+def _identify_plugins(identity: dict[str, Any], session: pipeline.Session) -> None:
+    """Replace the names of plug-ins by the digests of their sources and the models that the scene has of them."""
+    del identity["plugins"]
     plugins = plugins_of(session.faults, session.scene.plugins)
     if plugins:
-        scene["plugins"] = {
+        identity["plugins"] = {
             plugin.name: {
                 "sha256": plugin.sha256,
                 "models": plugin.model_names,
@@ -116,16 +136,6 @@ def scene_identity(session: pipeline.Session) -> dict[str, Any]:
             }
             for plugin in plugins
         }
-    del scene["dataset"]["samples"]
-    for table, key in (
-        ("dataset", "variants_per_view"),
-        ("dataset", "radiance_dtype"),
-        ("camera", "exposure_stops"),
-    ):
-        values = getattr(session.scene, table)
-        if getattr(values, key) == type(values).model_fields[key].default:
-            del scene[table][key]  # stores of scenes without it stay as they were
-    return scene
 
 
 def _needs_sun(cls: type[Fault], faults: Mapping[str, Fault]) -> bool:

@@ -121,9 +121,17 @@ def retake(
         raise InputError(f"--out {target}: is the store itself; choose another path")
     if not options.dry_run:
         llvm.find()
+    factory, build_plan = _work(opened, scene, source, target, options)
+    return with_card(target, build.build(factory, build_plan, target, options))
+
+
+def _work(
+    opened: Store, scene: Scene, source: str, out: store.Location, options: build.BuildOptions
+) -> tuple[RetakeFactory, build.BuildPlan]:
+    """Return what makes the sessions of workers, and what they shall make."""
     contents = file_contents.Contents()
     with contents.in_use():
-        build_plan = _planned(opened, scene, source, target, options)
+        build_plan = _planned(opened, scene, source, out, options)
     contents.complete()
     factory = RetakeFactory(
         scene=scene,
@@ -133,7 +141,7 @@ def retake(
         threads=options.threads,
         contents=contents,
     )
-    return with_card(target, build.build(factory, build_plan, target, options))
+    return factory, build_plan
 
 
 def _planned(

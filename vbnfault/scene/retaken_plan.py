@@ -50,21 +50,18 @@ def make_retaken_plan(
     own = make_plan(scene, faults, blocks, need_sun=need_sun)
     earlier, repeats = views.plan, views.repeats
     stratum, split = np.repeat(earlier.stratum, repeats), np.repeat(earlier.split, repeats)
-    injected = own.injected.copy()
+    injected = own.injected
     if not scene.is_flown:  # a trajectory faces the Sun or not, whatever the faults are
+        names = [name for name in faults if name in need_sun]
         wanted = [name in need_sun for name in faults]
-        edges = np.cumsum([0, *blocks]).tolist()
-        for first, last in itertools.pairwise(edges):
+        injected = injected.copy()
+        for first, last in itertools.pairwise(np.cumsum([0, *blocks]).tolist()):
             rows = slice(first, last)
-            needs = np.any(injected[rows][:, wanted], axis=1, keepdims=False)
-            facing = np.asarray(stratum[rows] == SUN_FACING)
-            if needs.sum() > facing.sum():
-                names = " or ".join(name for name in faults if name in need_sun)
-                raise InputError(
-                    f"plan.faulty_fraction = {scene.plan.faulty_fraction:g}: {names} would be in {needs.sum()} of "
-                    f"{last - first} samples, but only {facing.sum()} of the stored views face the Sun; lower it, "
-                    "or build the store with a larger plan.sun_facing_nominal_fraction"
-                )
+            needs, facing = (
+                np.asarray(injected[rows][:, wanted].any(axis=1)),
+                np.asarray(stratum[rows] == SUN_FACING),
+            )
+            _check_enough(scene, names, int(needs.sum()), int(facing.sum()), last - first)
             injected[rows] = injected[rows][_exchanged(needs, facing, split[rows])]
     samples = np.arange(len(stratum), dtype=np.int64)
     return replace(
@@ -80,6 +77,16 @@ def make_retaken_plan(
         aim=None if earlier.aim is None else np.repeat(earlier.aim, repeats),
         views=views,
     )
+
+
+def _check_enough(scene: Scene, names: Sequence[str], needs: int, facing: int, samples: int) -> None:
+    """Raise InputError if more samples of a block need the Sun than views face it; `names`: of the faults."""
+    if needs > facing:
+        raise InputError(
+            f"plan.faulty_fraction = {scene.plan.faulty_fraction:g}: {' or '.join(names)} would be in {needs} of "
+            f"{samples} samples, but only {facing} of the stored views face the Sun; lower it, "
+            "or build the store with a larger plan.sun_facing_nominal_fraction"
+        )
 
 
 def _exchanged(needs: NDArray[np.bool_], facing: NDArray[np.bool_], split: NDArray[np.uint8]) -> NDArray[np.int64]:

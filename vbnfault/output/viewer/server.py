@@ -21,7 +21,7 @@ from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -317,65 +317,67 @@ def _json(value: Any) -> bytes:
     return json.dumps(value, separators=(",", ":"), allow_nan=False).encode()
 
 
-def _handler(viewer: Viewer) -> type[BaseHTTPRequestHandler]:
+class _Handler(BaseHTTPRequestHandler):
+    """Answer one connection to a viewer, which `_handler` sets."""
+
+    viewer: ClassVar[Viewer]
+
+    protocol_version = "HTTP/1.1"
+    server_version, sys_version = "vbnfault", ""
+    disable_nagle_algorithm = True
+
+    def do_GET(self) -> None:
+        """Answer a request."""
+        self._reply(*self._answered())
+
+    do_HEAD = do_GET
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Print nothing: a page asks for hundreds of files."""
+
+    def _answered(self) -> tuple[int, bytes, dict[str, str]]:
+        """Return status, body and headers."""
+        hosts = {f"{name}:{self.viewer.port}" for name in ("127.0.0.1", "localhost")}
+        if self.headers.get("Host", "") not in hosts:
+            return HTTPStatus.FORBIDDEN, b"this server answers this machine only", {}
+        path, _, query = self.path.partition("?")
+        try:
+            if path.startswith("/store/"):
+                return self._file(path.removeprefix("/store/"))
+            pairs = dict(pair.partition("=")[::2] for pair in query.split("&"))
+            body, kind, cache = self.viewer.answer(path.lstrip("/"), pairs)
+            return HTTPStatus.OK, body, {"Content-Type": kind, "Cache-Control": cache}
+        except _Missing:
+            return HTTPStatus.NOT_FOUND, b"not found", {}
+        except VbnfaultError as error:  # damaged, or not finished: the page shows the sentence
+            return HTTPStatus.UNPROCESSABLE_ENTITY, str(error).encode(), {"Content-Type": "text/plain"}
+
+    def _file(self, name: str) -> tuple[int, bytes, dict[str, str]]:
+        """Return status, body and headers of a file of the store."""
+        header = self.headers.get("Range")
+        try:
+            body, which = self.viewer.part(name, header)
+        except ValueError:
+            return HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE, b"", {}
+        kind = "application/json" if name.endswith(".json") else "application/octet-stream"
+        headers = {"Accept-Ranges": "bytes", "Content-Type": kind, "Cache-Control": "no-store"}
+        if header is None:
+            return HTTPStatus.OK, body, headers
+        return HTTPStatus.PARTIAL_CONTENT, body, {**headers, **({"Content-Range": which} if which else {})}
+
+    def _reply(self, status: int, body: bytes, headers: dict[str, str]) -> None:
+        """Send an answer."""
+        try:
+            self.send_response(status)
+            for name, value in {**_HEADERS, **headers, "Content-Length": str(len(body))}.items():
+                self.send_header(name, value)
+            self.end_headers()
+            if self.command != "HEAD":
+                self.wfile.write(body)
+        except (BrokenPipeError, ConnectionResetError):  # the page has scrolled on
+            self.close_connection = True
+
+
+def _handler(viewer: Viewer) -> type[_Handler]:
     """Return the class that answers the requests for a viewer."""
-
-    class Handler(BaseHTTPRequestHandler):
-        """Answer one connection."""
-
-        protocol_version = "HTTP/1.1"
-        server_version, sys_version = "vbnfault", ""
-        disable_nagle_algorithm = True
-
-        def do_GET(self) -> None:
-            """Answer a request."""
-            self._reply(*self._answered())
-
-        do_HEAD = do_GET
-
-        def log_message(self, format: str, *args: Any) -> None:
-            """Print nothing: a page asks for hundreds of files."""
-
-        def _answered(self) -> tuple[int, bytes, dict[str, str]]:
-            """Return status, body and headers."""
-            hosts = {f"{name}:{viewer.port}" for name in ("127.0.0.1", "localhost")}
-            if self.headers.get("Host", "") not in hosts:
-                return HTTPStatus.FORBIDDEN, b"this server answers this machine only", {}
-            path, _, query = self.path.partition("?")
-            try:
-                if path.startswith("/store/"):
-                    return self._file(path.removeprefix("/store/"))
-                pairs = dict(pair.partition("=")[::2] for pair in query.split("&"))
-                body, kind, cache = viewer.answer(path.lstrip("/"), pairs)
-                return HTTPStatus.OK, body, {"Content-Type": kind, "Cache-Control": cache}
-            except _Missing:
-                return HTTPStatus.NOT_FOUND, b"not found", {}
-            except VbnfaultError as error:  # damaged, or not finished: the page shows the sentence
-                return HTTPStatus.UNPROCESSABLE_ENTITY, str(error).encode(), {"Content-Type": "text/plain"}
-
-        def _file(self, name: str) -> tuple[int, bytes, dict[str, str]]:
-            """Return status, body and headers of a file of the store."""
-            header = self.headers.get("Range")
-            try:
-                body, which = viewer.part(name, header)
-            except ValueError:
-                return HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE, b"", {}
-            kind = "application/json" if name.endswith(".json") else "application/octet-stream"
-            headers = {"Accept-Ranges": "bytes", "Content-Type": kind, "Cache-Control": "no-store"}
-            if header is None:
-                return HTTPStatus.OK, body, headers
-            return HTTPStatus.PARTIAL_CONTENT, body, {**headers, **({"Content-Range": which} if which else {})}
-
-        def _reply(self, status: int, body: bytes, headers: dict[str, str]) -> None:
-            """Send an answer."""
-            try:
-                self.send_response(status)
-                for name, value in {**_HEADERS, **headers, "Content-Length": str(len(body))}.items():
-                    self.send_header(name, value)
-                self.end_headers()
-                if self.command != "HEAD":
-                    self.wfile.write(body)
-            except (BrokenPipeError, ConnectionResetError):  # the page has scrolled on
-                self.close_connection = True
-
-    return Handler
+    return type("_HandlerOfViewer", (_Handler,), {"viewer": viewer})
