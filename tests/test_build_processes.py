@@ -15,7 +15,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pytest
 import victim
 from synthetic import SAMPLES, Deadly, Session, make_spec, run
@@ -63,29 +62,6 @@ def build_elsewhere(
     return victim.run(["build", out, workers, samples], main=main, worker=worker)
 
 
-@pytest.mark.parametrize(("workers", "kills", "samples"), [(1, 4, SAMPLES), (2, 2, 40)])
-def test_kill_9_at_any_operation_then_resuming_makes_the_same_bits(
-    tmp_path: Path, workers: int, kills: int, samples: int
-) -> None:
-    out, progress = tmp_path / "s.zarr", [0]
-    for count in np.random.default_rng(workers).integers(1, 60, kills).tolist():
-        # after the first shard that is new, so that each kill finds a store further on
-        plan = [victim.step("write", text="done/c/", number="SIGCONT")]
-        plan += [victim.step("write", count=count, to="self" if workers == 1 else "parent", torn=True)]
-        done = build_elsewhere(out, workers, samples=samples, **{"main" if workers == 1 else "worker": plan})
-        assert done.returncode == -signal.SIGKILL, done.stderr
-        assert "Traceback" not in done.stderr
-        progress.append(st.open_store(out).finished())
-        assert progress[-1] >= progress[-2]
-    assert 0 < progress[-1] < samples, progress  # else the kills tested nothing
-    assert run(out, samples=samples).built == samples - progress[-1]
-    assert st.verify(out) == []
-    run(tmp_path / "whole.zarr", samples=samples)
-    assert st.digest(out) == st.digest(tmp_path / "whole.zarr")
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["s.zarr", "whole.zarr"]
-    assert not list(out.rglob("*.partial"))
-
-
 @pytest.mark.parametrize("before", ["unlink", "mkdir"])
 def test_a_folder_that_another_worker_makes_at_the_same_time_is_used(
     undisturbed: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, before: str
@@ -107,13 +83,6 @@ def test_a_folder_that_another_worker_makes_at_the_same_time_is_used(
     run(out)
     assert made
     assert st.digest(out) == undisturbed[1]
-
-
-def test_the_command_that_kills_builds_finds_none_that_fails() -> None:
-    command = [sys.executable, "-m", "tests.kills", "--count", "3", "--seed", "3"]
-    done = subprocess.run(command, cwd=HERE.parent, capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert re.search(r"[3-6] kills in \d rounds, rendering off, seed 3, .*: 0 failures", done.stdout), done.stdout
 
 
 @pytest.mark.parametrize(("workers", "number"), [(1, "SIGINT"), (1, "SIGTERM"), (2, "SIGHUP"), (2, "SIGINT")])

@@ -8,8 +8,6 @@ import importlib
 import json
 import os
 import shutil
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -359,15 +357,6 @@ def test_a_new_format_is_one_class(described_store: Path, tmp_path: Path) -> Non
 
 
 # --- interruptions and bad input ------------------------------------------------------------------------------
-
-
-def test_a_killed_export_resumes_to_the_same_files() -> None:
-    """Kill exports at drawn file operations, in forked processes of one other interpreter; see `export_kills`."""
-    script = Path(__file__).with_name("export_kills.py")
-    command = [sys.executable, str(script), "--count", "4", "--formats", "coco", "webdataset"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "4 kills, 0 failures" in done.stdout
 
 
 def test_a_full_disk_is_one_sentence_and_loses_nothing(

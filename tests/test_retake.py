@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import pickle
 import shutil
 from pathlib import Path
@@ -9,11 +10,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+import test_trajectory
 from conftest import ALL_FAULTS, small_scene
 
 import vbnfault
 from vbnfault import render, store
-from vbnfault.core.errors import InputError
+from vbnfault.core.errors import InputError, VbnfaultError
 from vbnfault.dataset import build
 from vbnfault.dataset.identity import plan_numbers, stored_plan
 from vbnfault.dataset.statistics import statistics
@@ -141,6 +143,54 @@ def test_a_radiance_in_float16_is_right_within_its_rounding(tmp_path: Path) -> N
             off = np.abs(a.layers[name].astype(int) - b.layers[name])
             assert off.max() <= 1
             assert off.mean() < 0.125
+
+
+def _of_a_table(folder: Path) -> dict[str, Any]:
+    """Return a scene of a sphere with a table of two poses."""
+    import trimesh
+
+    test_trajectory.write(folder / "poses.csv", test_trajectory.rows()[:2])
+    trimesh.creation.icosphere(subdivisions=4, radius=test_trajectory.RADIUS_M * 1.0008).export(folder / "s.obj")
+    own, body = test_trajectory.SMALL, {**test_trajectory.SMALL["body"], "shape": str(folder / "s.obj")}
+    return {**own, "body": body, "trajectory": {"file": str(folder / "poses.csv")}}
+
+
+def _of_spice(folder: Path) -> dict[str, Any]:
+    """Return a scene of a spacecraft whose kernels are written to a folder."""
+    test_spice = pytest.importorskip("test_spice")
+    return dict(test_spice.flown_scene(test_spice.write_kernels(folder)))
+
+
+def _aimed(folder: Path) -> dict[str, Any]:
+    """Return a scene of a sphere whose views aim at its middle and at its limb."""
+    table = _of_a_table(folder)
+    del table["trajectory"]
+    patch = {**table["patch"], "facet_m": 1.0, "radius_m": 5.0}
+    return {
+        **table,
+        "patch": patch,
+        "sun": {"distance_au": 2.0},
+        "geometry": {"aim": {"nadir": 1, "limb": 1}, "distance_m": [2e3, 9e3]},
+    }
+
+
+@pytest.mark.parametrize("kind", [_of_a_table, _of_spice, _aimed])
+def test_views_that_are_flown_or_aimed_are_taken_again_by_ranges(kind: Any, tmp_path: Path) -> None:
+    """Two commands, each with a shard of one sample, make the bits of the store."""
+    table = kind(tmp_path)
+    sampling = {"sites": 2, "shard_samples": 1, "layers": LAYERS}
+    if "trajectory" not in table:
+        sampling["samples"] = 2
+    scene = {**table, "dataset": {**table["dataset"], **sampling}, "faults": {"vignetting": {}, "broken_lines": {}}}
+    scene["camera"] = {**table["camera"], "width_px": 24, "height_px": 20}
+    old, new = tmp_path / "old.zarr", tmp_path / "new.zarr"
+    vbnfault.build(config.parse_scene(scene, source="test"), old, progress=False)
+    before = samples_of(old)
+    assert len(before) == 2
+    for k in range(2):
+        assert retake(old, config.parse_scene(scene, source="test"), new, shard_range=range(k, k + 1)).built == 1
+    assert [differing(a, b) for a, b in zip(before, samples_of(new), strict=True)] == [[], []]
+    assert vbnfault.verify(new).problems == []
 
 
 # --- other scenes ----------------------------------------------------------------------------------------------
@@ -355,6 +405,18 @@ def test_a_store_with_radiance_behind_a_lens_or_with_stars_says_which_layer_is_m
         store.create(old, vbnfault.dataset.store_spec(vbnfault.Session(scene), (1,)), 1)
         with pytest.raises(InputError, match=rf'its radiance is {said}.*layers = \["scene_radiance"\]'):
             retake(old, scene, tmp_path / "new.zarr")
+
+
+def test_a_view_that_its_plan_does_not_give_is_refused(source: Path, tmp_path: Path) -> None:
+    """As in a store that was planned by other code."""
+    scene = scene_with({"vignetting": {}}, dataset={"layers": ["clean"]})
+    other = store.open_store(shutil.copytree(source, tmp_path / "other.zarr"), "r+")
+    sample = other.read_sample(2)
+    turned = np.asarray(sample.scalars["camera_from_T"]) * [1, 1, 1, 1 + 1e-6]
+    scalars = {**sample.scalars, "camera_from_T": turned}
+    other.write_shard(0, {2: store.encode(other.spec, dataclasses.replace(sample, scalars=scalars))})
+    with pytest.raises(VbnfaultError, match=r"sample 2 .*: its stored attitude is not that of its plan"):
+        retake(other.path, scene, tmp_path / "new.zarr")
 
 
 def test_a_retake_that_began_with_other_data_is_not_continued(source: Path, tmp_path: Path) -> None:

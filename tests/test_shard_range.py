@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import victim
 from kills import forked
-from synthetic import SAMPLES, Session, fake_sample, make_spec, run
+from synthetic import SAMPLES, Session, fake_sample, flip, make_spec, run
 from typer.testing import CliRunner
 
 from vbnfault import cli
@@ -24,7 +24,8 @@ from vbnfault.core.errors import InputError, VbnfaultError
 from vbnfault.core.quantities import Sample
 from vbnfault.dataset import build as bd
 from vbnfault.dataset import lock
-from vbnfault.dataset.merge import MergeSummary, join_stores
+from vbnfault.dataset.merge import MergeSummary, join_stores, merge_stores
+from vbnfault.store import disk
 
 SHARDS = 5
 
@@ -216,6 +217,39 @@ def test_stores_of_another_dataset_are_refused(
     assert not (tmp_path / "m.zarr").exists()
 
 
+def test_stores_of_other_codecs_are_refused(tmp_path: Path, parts: list[Path]) -> None:
+    spec = st.open_store(parts[0]).spec
+    st.create(tmp_path / "c.zarr", dataclasses.replace(spec, format_version=2), SAMPLES)
+    with pytest.raises(
+        InputError, match=r"c\.zarr: has another format or other codecs than .*vbnfault migrate STORE"
+    ):
+        merge([*parts, tmp_path / "c.zarr"], tmp_path / "m.zarr")
+    assert not (tmp_path / "m.zarr").exists()
+
+
+def test_a_source_is_locked_only_if_its_shards_move(tmp_path: Path, parts: list[Path]) -> None:
+    with lock.locked(parts[1]):
+        with pytest.raises(VbnfaultError, match=r"b\.zarr: another command is writing to it"):
+            merge(parts, tmp_path / "m.zarr", move=True)
+        assert merge(parts, tmp_path / "n.zarr").finished == SAMPLES
+    assert [st.open_store(part).finished() for part in parts] == [8, 10]
+
+
+def test_a_store_by_another_name_is_the_same_store(tmp_path: Path, parts: list[Path]) -> None:
+    (tmp_path / "link").symlink_to(parts[0])
+    with pytest.raises(InputError, match="there is nothing to merge"):
+        merge([tmp_path / "link"], parts[0])
+
+
+def test_a_complete_store_gets_its_card(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, parts: list[Path]) -> None:
+    written: list[Path] = []
+    monkeypatch.setattr("vbnfault.dataset.card.write_card", written.append)
+    merge_stores(parts[:1], tmp_path / "m.zarr", progress=False)
+    assert written == []
+    merge_stores(parts, tmp_path / "m.zarr", progress=False)
+    assert written == [tmp_path / "m.zarr"]
+
+
 def test_a_sample_that_differs_between_stores_is_refused(tmp_path: Path, parts: list[Path]) -> None:
     merge(parts[:1], parts[1])
     remake(parts[1], 5, tries=3)
@@ -230,16 +264,25 @@ def test_a_damaged_sample_is_taken_from_another_store_or_reported(
     tmp_path: Path, parts: list[Path], whole: Path
 ) -> None:
     out = tmp_path / "m.zarr"
-    file = st.open_store(parts[0]).file("image", 1)
-    data = bytearray(file.read_bytes())
-    data[40] ^= 1
-    file.write_bytes(bytes(data))
+    flip(st.open_store(parts[0]).file("image", 1), 40)
     with pytest.raises(VbnfaultError, match=r"1 samples \(4\) are damaged in every .*a\.zarr: sample 4: im"):
         merge(parts, out, move=True)
     assert [i for i, done in st.open_store(parts[0]).done(1).items() if done] == [4, 5, 6, 7]  # nothing is lost
+    assert [i for i, done in st.open_store(out).done(1).items() if done] == [5, 6, 7]
     sound = tmp_path / "c.zarr"
     run(sound, shard_range=range(1, 2))
     assert merge([*parts, sound], out, move=True).digest == st.digest(whole)
+
+
+def test_a_sample_that_is_damaged_everywhere_does_not_count_as_done(tmp_path: Path, parts: list[Path]) -> None:
+    out = tmp_path / "m.zarr"
+    merge(parts[:1], out)
+    for path in (out, parts[0]):
+        flip(st.open_store(path).file("image", 1), 40)
+    st.open_store(out, "r+")._write_done(1, {4, 5, 6})
+    with pytest.raises(VbnfaultError, match=r"1 samples \(4\) are damaged in every"):
+        merge(parts[:1], out)
+    assert [i for i, done in st.open_store(out).done(1).items() if done] == [5, 6, 7]
 
 
 def test_versions_of_samples_are_joined(tmp_path: Path, parts: list[Path]) -> None:
@@ -272,6 +315,15 @@ def test_a_killed_merge_is_resumed(tmp_path: Path, parts: list[Path], whole: Pat
     assert -9 in ended
     assert merge(parts, out, move=move).digest == st.digest(whole)
     assert not [*out.rglob("*.partial"), *tmp_path.glob(".*")]
+
+
+def test_a_shard_that_is_linked_again_leaves_no_temporary_file(tmp_path: Path) -> None:
+    """As after a kill between the files of a shard and `done`: both names are already those of one file."""
+    (tmp_path / "a").write_bytes(b"data")
+    for _ in range(2):
+        disk.write(tmp_path, [("b", tmp_path / "a")])
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "b"]
+    assert (tmp_path / "a").samefile(tmp_path / "b")
 
 
 # --- processor cores --------------------------------------------------------------------------------------

@@ -84,7 +84,11 @@ POSITION_T_M = np.array([12_000.0, -34_000.0, 56_000.0])
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Text kernels, an SPK of the two-body comet and of a spacecraft at rest in T, a CK of a constant attitude."""
-    folder = tmp_path_factory.mktemp("kernels")
+    return write_kernels(tmp_path_factory.mktemp("kernels"))
+
+
+def write_kernels(folder: Path) -> Path:
+    """Write the kernels to a folder, and return it."""
     for name, text in (("a.tpc", PCK), ("a.tls", LSK), ("a.tf", FK), ("a.tsc", SCLK)):
         (folder / name).write_text(text)
 

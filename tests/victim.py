@@ -65,8 +65,13 @@ def run(arguments: Sequence[object], **more: Any) -> subprocess.CompletedProcess
     return subprocess.CompletedProcess(process.args, process.returncode, out, err)
 
 
-def follow(steps: Sequence[dict[str, Any]], count: Callable[[str, str], None] | None = None) -> None:
-    """Follow a plan in this process from now on; `count` is called with the kind and text of every event."""
+def follow(
+    steps: Sequence[dict[str, Any]], count: Callable[[str, str], None] | None = None
+) -> list[dict[str, Any]]:
+    """Follow a plan in this process from now on; `count` is called with the kind and text of every event.
+
+    Returns the steps that are left, a list that may be filled again.
+    """
     left = [dict(one) for one in steps]
     inside = [False]
     parent = os.getppid()
@@ -81,9 +86,9 @@ def follow(steps: Sequence[dict[str, Any]], count: Callable[[str, str], None] | 
             if left[0]["count"] <= 0:
                 inside[0] = True
                 now = left.pop(0)
-                if now.get("torn") and write_to:
-                    Path(write_to).write_bytes(b"half a file of nonsense")
                 if _is_first(now.get("once")):
+                    if now.get("torn") and write_to:
+                        Path(write_to).write_bytes(b"half a file of nonsense")
                     _send(getattr(signal, now["signal"]), now.get("to", "self"), parent)
                 inside[0] = False
 
@@ -115,6 +120,7 @@ def follow(steps: Sequence[dict[str, Any]], count: Callable[[str, str], None] | 
 
     os.fsync = counted_fsync
     multiprocessing.process.BaseProcess.start = counted_start  # type: ignore[method-assign]
+    return left
 
 
 def _is_first(path: str | None) -> bool:

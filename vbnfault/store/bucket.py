@@ -30,6 +30,8 @@ OWN = ".vbnfault"  # what is below this name is no part of the data
 _REPLACED = f"{OWN}/replaced"
 _READS_AT_ONCE = 16
 _WRITES_AT_ONCE = 4  # each holds one file of a shard in memory
+# Without credentials, obstore asks the cloud's own machines for some, which others do not reach.
+_METADATA_HOSTS = ("169.254.169.254", "169.254.170.2", "metadata.google.internal")
 _PART_BYTES = 16 << 20  # larger objects are sent in parts, so that a part needs no longer than a request may take
 # A request is repeated after 0.2 s, 0.4 s, ... for about a minute in all.
 RETRIES: Any = {
@@ -92,7 +94,10 @@ class Bucket:
 
     @contextlib.contextmanager
     def _translated(self, name: str) -> Iterator[None]:
-        """Turn errors of obstore in a `with` block into OSError: no such object, no right, or a failed request."""
+        """Turn errors of obstore in a `with` block into OSError: no such object, no right, or a failed request.
+
+        Raises InputError if there is no such bucket, or if no credentials were found.
+        """
         from obstore.exceptions import BaseError, PermissionDeniedError, UnauthenticatedError
 
         where = f"{self.path}/{name}"
@@ -100,12 +105,22 @@ class Bucket:
             yield
         except FileNotFoundError as error:
             if "NoSuchBucket" in str(error):
-                raise OSError(errno.EIO, _reason(error), where) from error
+                raise InputError(f"{self.path}: there is no such bucket; create it, or correct the URL") from error
             raise FileNotFoundError(errno.ENOENT, "no such object", where) from error
         except (PermissionDeniedError, UnauthenticatedError) as error:
             raise PermissionError(errno.EACCES, f"access is refused ({_reason(error)})", where) from error
         except (BaseError, OSError, ValueError) as error:
+            if any(f"http://{host}/" in str(error) for host in _METADATA_HOSTS):
+                raise InputError(f"{self.path}: no credentials were found; {self._how_to_sign_in}") from error
             raise OSError(errno.EIO, _reason(error), where) from error
+
+    @property
+    def _how_to_sign_in(self) -> str:
+        """Return which environment variables hold credentials, as a clause."""
+        if self.path.text.startswith("s3"):
+            return "set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_SKIP_SIGNATURE=true for a public bucket"
+        variables = "GOOGLE_SERVICE_ACCOUNT" if self.path.text.startswith("gs") else "AZURE_STORAGE_ACCOUNT_KEY"
+        return f"set {variables}"
 
     @contextlib.contextmanager
     def _reading(self, name: str) -> Iterator[None]:

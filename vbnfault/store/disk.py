@@ -179,6 +179,7 @@ def write(root: Path, files: Iterable[tuple[str, bytes | Path]]) -> None:
     written: list[tuple[Path, Path]] = []
     opened: list[int] = []
     changed: dict[Path, None] = {}  # folders, in order
+    linked: set[Path] = set()
     try:
         for name, content in files:
             target = root / name
@@ -189,6 +190,7 @@ def write(root: Path, files: Iterable[tuple[str, bytes | Path]]) -> None:
             if isinstance(content, Path):
                 try:
                     os.link(content, partial, follow_symlinks=False)
+                    linked.add(partial)
                     continue
                 except OSError:  # on another device, or a file system without links
                     content = read(content)
@@ -203,6 +205,8 @@ def write(root: Path, files: Iterable[tuple[str, bytes | Path]]) -> None:
         for partial, target in written:
             _make_way(target)
             os.replace(partial, target)
+            if partial in linked:  # two names of one file: replacing one by the other did nothing (POSIX)
+                partial.unlink(missing_ok=True)
         _at_once(flush_folder, changed)
     except BaseException:
         for file in opened:
