@@ -72,6 +72,17 @@ def test_a_missing_file_concerns_its_shard(whole: st.Store, name: str) -> None:
     repaired(whole, [4, 5, 6, 7], before)
 
 
+@pytest.mark.parametrize("name", ["image", "mask", "tries", "exposure_s", "parameters"])
+def test_a_missing_file_is_not_read_as_zeros(whole: st.Store, name: str) -> None:
+    whole.file(name, 1).unlink()
+    file = re.escape(whole.file_name(name, 1))
+    with pytest.raises(VbnfaultError, match=rf"{name} of samples 5-6 cannot be read: the file {file} is missing"):
+        whole.read(name, 5, 7)
+    whole.read(name, 0, 4)
+    whole.file("done", 1).unlink()  # now the samples are as if they had never been built
+    whole.read(name, 5, 7)
+
+
 @pytest.mark.parametrize("keep", [0, 1, 40, -1, -70])
 def test_a_truncated_shard_is_found_and_rebuilt(whole: st.Store, keep: int) -> None:
     before = st.digest(whole)

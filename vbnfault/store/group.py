@@ -117,13 +117,16 @@ class Store:
         return f"array {name} cannot be opened, {name}/{DOCUMENT} is damaged"
 
     def read(self, name: str, start: int = 0, stop: int | None = None) -> NDArray[Any]:
-        """Return samples `start` to `stop` - 1 of an array. Raises VbnfaultError if they cannot be decoded."""
+        """Return samples `start` to `stop` - 1 of an array; samples that are not built yet have the fill value.
+
+        Raises VbnfaultError if the samples cannot be decoded, or if the file of a finished one is missing.
+        """
         stop = self.samples if stop is None else stop
         try:
             if name in self.spec.arrays:
                 for number in range(start // self.spec.shard_samples, -(-stop // self.spec.shard_samples)):
                     self.files.expect_file(self.file_name(name, number))
-            values = self.array(name)[start:stop]
+            values = np.asarray(self.array(name)[start:stop])
         except VbnfaultError:
             raise
         except Exception as error:
@@ -134,7 +137,29 @@ class Store:
                 f"{self.path}: {name} of samples {start}-{stop - 1} cannot be read ({error}); "
                 f"the build command repairs it"
             ) from error
-        return np.asarray(values)
+        self._expect_written(name, start, values)
+        return values
+
+    def _expect_written(self, name: str, start: int, values: NDArray[Any]) -> None:
+        """Raise VbnfaultError if zarr read zeros because the file of finished samples, from `start` on, is missing.
+
+        Only values that are all zero ask whether their file exists, which costs a request to an object store.
+        """
+        if name not in self.spec.arrays or name == "done" or self.spec.empty(name):
+            return
+        fill = self.spec.arrays[name].fill
+        for number in range(start // self.spec.shard_samples, -(-(start + len(values)) // self.spec.shard_samples)):
+            samples, file = self.shard(number), self.file_name(name, number)
+            part = values[max(0, samples.start - start) : max(0, samples.stop - start)]
+            written = ~np.isnan(part) if isinstance(fill, float) else part != fill  # numbers: NaN
+            if written.any() or self.files.exists(file):
+                continue
+            lost = [i for i, done in self.done(number).items() if done and start <= i < start + len(values)]
+            if lost:
+                raise VbnfaultError(
+                    f"{self.path}: {name} of samples {lost[0]}-{lost[-1]} cannot be read: the file {file} is "
+                    "missing; the build command repairs it"
+                )
 
     def read_sample(self, index: int, layers: Collection[str] | None = None) -> Sample:
         """Return one sample, compared with its checksums; with `layers`, only these of its layers.
