@@ -1,6 +1,7 @@
 """Measure the bytes, and the time to encode and to decode, of each layer of a store with many codecs.
 
-    python benchmarks/codecs.py paper67p.zarr physical67p.zarr --samples 6 [--layer depth_m ...] [--json table.json]
+    python benchmarks/codecs.py paper67p.zarr physical67p.zarr --samples 6 [--layer depth_m ...] \
+        [--candidate "blosc zstd"] [--json table.json]
 
 Every layer of some finished samples is encoded with every candidate in one thread, and decoded again; the decoded
 bytes must be equal. The codecs in `vbnfault/store/arrays.py` were chosen from such tables. A candidate marked `*`
@@ -26,6 +27,8 @@ from numpy.typing import NDArray
 from vbnfault import store
 
 Bytes = bytes | bytearray | memoryview
+# 0: Blosc's own choice, 32 KiB for Zstd 1; each block has tables of its own, which are built before it is decoded
+BLOCKS_BYTES = (0, 2**17, 2**18, 2**19, 2**20)
 
 
 @dataclass(frozen=True)
@@ -42,12 +45,11 @@ def as_words(array: NDArray[Any], size: int) -> NDArray[Any]:
     return np.frombuffer(np.ascontiguousarray(array).tobytes(), dtype=f"V{size}")
 
 
-def blosc(library: str, level: int, shuffle: str, size: int) -> Candidate:
-    """Return Blosc with words of `size` bytes."""
-    codec = Blosc(cname=library, clevel=level, shuffle=getattr(Blosc, shuffle.upper()))
-    return Candidate(
-        f"blosc {library} {level} {shuffle} {size}", lambda a: codec.encode(as_words(a, size)), codec.decode
-    )
+def blosc(library: str, level: int, shuffle: str, size: int, block: int = 0) -> Candidate:
+    """Return Blosc with words of `size` bytes, in blocks of `block` bytes; 0: as Blosc chooses them."""
+    codec = Blosc(cname=library, clevel=level, shuffle=getattr(Blosc, shuffle.upper()), blocksize=block)
+    name = f"blosc {library} {level} {shuffle} {size}"
+    return Candidate(f"{name} {block}" if block else name, lambda a: codec.encode(as_words(a, size)), codec.decode)
 
 
 def candidates(array: NDArray[Any]) -> Iterator[Candidate]:
@@ -62,7 +64,8 @@ def candidates(array: NDArray[Any]) -> Iterator[Candidate]:
     for size in sorted(sizes):
         for shuffle in ("shuffle", "bitshuffle"):
             for library, level in (("lz4", 5), ("zstd", 1), ("zstd", 3), ("zstd", 5), ("zstd", 7)):
-                yield blosc(library, level, shuffle, size)
+                for block in BLOCKS_BYTES if library == "zstd" and level <= 3 else (0,):
+                    yield blosc(library, level, shuffle, size, block)
     if array.dtype == bool:
         bits, zstd = PackBits(), Zstd(level=1)
         yield Candidate(
@@ -96,10 +99,12 @@ def timed(action: Callable[[], Any], rounds: int) -> tuple[float, Any]:
     return min(seconds), result
 
 
-def measure(samples: list[NDArray[Any]], rounds: int) -> dict[str, dict[str, float]]:
+def measure(samples: list[NDArray[Any]], rounds: int, begins: str = "") -> dict[str, dict[str, float]]:
     """Return by candidate the mean bytes of a layer's samples, and the mean ms to encode and to decode."""
     table: dict[str, dict[str, float]] = {}
     for candidate in candidates(samples[0]):
+        if not candidate.name.startswith(begins):
+            continue
         totals = np.zeros(3)
         for array in samples:
             encoding, data = timed(functools.partial(candidate.encode, array), rounds)
@@ -119,6 +124,7 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=4, help="samples of each store, spread over it")
     parser.add_argument("--rounds", type=int, default=3, help="of each the fastest counts")
     parser.add_argument("--layer", action="append", help="only these layers")
+    parser.add_argument("--candidate", default="", help="only candidates whose name begins so")
     parser.add_argument("--json", help="also write the numbers to this file")
     options = parser.parse_args()
     results: dict[str, Any] = {}
@@ -128,7 +134,7 @@ def main() -> None:
         samples = [opened.read_sample(i).layers for i in chosen]
         print(f"{path}: {opened.spec.height} x {opened.spec.width} px, samples {chosen}")
         for layer in options.layer or opened.spec.pixel_layers:
-            table = measure([sample[layer] for sample in samples], options.rounds)
+            table = measure([sample[layer] for sample in samples], options.rounds, options.candidate)
             results.setdefault(str(path), {})[layer] = table
             print(f"\n{layer}, {samples[0][layer].nbytes} bytes uncompressed")
             print(f"{'codec':34s} {'bytes':>10s} {'encode ms':>10s} {'decode ms':>10s}")

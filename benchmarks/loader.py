@@ -6,11 +6,13 @@
 It needs PyTorch. Every arm reads image and masks of all samples in shuffled order, in batches, for some epochs,
 with the files in the system's cache. The arms take turns, round by round. The table gives for each arm the median
 of wall time and of processor time (of all processes) a sample, and how many times as long that is as for
-`vbnfault.torch`.
+`vbnfault.torch`. Before that, the arrays of all arms but PNG are compared: they are equal.
 
-- `xarray, one by one`: `data.isel(sample=i)["image"].values` and the same for `mask`, in this process.
-- `xarray, workers`: the same in a `DataLoader`.
-- `xarray as float32, workers`: the same, converted to float32 as the how-to of earlier versions did.
+- `naive xarray`: what its documentation suggests, in this process: `data = xarray.open_zarr(store)`, and for each
+  sample `data.image[i].values` and `data.mask[i].values`. Where Dask is installed, `open_zarr` makes Dask arrays.
+- `naive xarray without Dask`: the same with `chunks=None`, which is what `open_zarr` does where Dask is missing.
+- `naive xarray, mask by mask`: the first, but with `data.mask[i].sel(fault=name).values` for each fault class.
+- `xarray, workers`: the second in a `DataLoader`.
 - `PNG, workers`: what `vbnfault export --format png` wrote (R, G, B without I), read with OpenCV, in a
   `DataLoader`.
 - `vbnfault.torch`: `Loader`, with workers, and with threads instead.
@@ -34,6 +36,7 @@ from typing import Any
 import cv2
 import numpy as np
 import psutil
+import xarray
 from torch.utils.data import DataLoader
 
 import vbnfault
@@ -41,11 +44,12 @@ from vbnfault.torch import BatchDataset, Loader, SampleDataset
 
 
 class Naive:
-    """Read samples with xarray, one by one."""
+    """Read samples with xarray, one by one; `by_mask`: each fault class by itself."""
 
-    def __init__(self, path: str, *, as_float: bool = False) -> None:
-        self.path, self.as_float, self.data = path, as_float, None
-        with vbnfault.open_dataset(path) as data:
+    def __init__(self, path: str, *, dask: bool = True, by_mask: bool = False) -> None:
+        self.path, self.by_mask, self.data = path, by_mask, None
+        self.options: dict[str, Any] = {} if dask else {"chunks": None}
+        with xarray.open_zarr(path) as data:
             self.samples = data.sizes["sample"]
 
     def __len__(self) -> int:
@@ -53,12 +57,12 @@ class Naive:
 
     def __getitem__(self, i: int) -> tuple[np.ndarray, np.ndarray]:
         if self.data is None:
-            self.data = vbnfault.open_dataset(self.path)
-        sample = self.data.isel(sample=i)
-        if not self.as_float:
-            return sample["image"].values, sample["mask"].values
-        image = sample["image"].transpose("channel", "y", "x").values.astype(np.float32) / 255
-        return image, sample["mask"].values.astype(np.float32)
+            self.data = xarray.open_zarr(self.path, **self.options)
+        data = self.data
+        if not self.by_mask:
+            return data.image[i].values, data.mask[i].values
+        masks = [data.mask[i].sel(fault=name).values for name in data.fault.values]
+        return data.image[i].values, np.stack(masks)
 
 
 class Folder:
@@ -97,6 +101,15 @@ def one_by_one(data: Naive) -> Iterator[Any]:
         yield data[i]
 
 
+def compare(ours: SampleDataset, naive: Naive) -> None:
+    """Check that some samples are the same in both."""
+    for i in range(0, len(ours), max(1, len(ours) // 5)):
+        image, masks = naive[i]
+        sample = ours[i]
+        assert np.array_equal(np.moveaxis(sample["image"].numpy(), 0, -1), image)
+        assert np.array_equal(sample["masks"].numpy(), masks)
+
+
 def timed(epoch: Callable[[], Any], epochs: int, samples: int) -> tuple[float, float]:
     """Return wall and processor time a sample of some epochs, in ms."""
     wall, processor = time.perf_counter(), processor_s()
@@ -128,7 +141,6 @@ print(imported - begin, time.perf_counter() - imported)
 
 def arms(path: str, folder: Path, options: argparse.Namespace) -> dict[str, Callable[[], Any]]:
     """Return by name the functions that begin an epoch."""
-    naive = Naive(path)
     with vbnfault.open_dataset(path) as data:
         faults = data.sizes["fault"]
     vbnfault.export(path, folder, "png", progress=False)
@@ -142,12 +154,18 @@ def arms(path: str, folder: Path, options: argparse.Namespace) -> dict[str, Call
     loaders = {
         "vbnfault.torch, workers": Loader(batches[0], **how),
         "vbnfault.torch, threads": Loader(batches[1]),
-        "xarray, workers": plain(Naive(path)),
-        "xarray as float32, workers": plain(Naive(path, as_float=True)),
+        "xarray, workers": plain(Naive(path, dask=False)),
         "PNG, workers": plain(Folder(folder, faults)),
     }
+    naive = {
+        "naive xarray": Naive(path),
+        "naive xarray without Dask": Naive(path, dask=False),
+        "naive xarray, mask by mask": Naive(path, by_mask=True),
+    }
+    for data in naive.values():
+        compare(ours, data)
     return {
-        "xarray, one by one": lambda: one_by_one(naive),
+        **{name: (lambda data=data: one_by_one(data)) for name, data in naive.items()},
         **{name: (lambda loader=loader: iter(loader)) for name, loader in loaders.items()},
     }
 
@@ -160,7 +178,7 @@ def main() -> None:
     parser.add_argument("--batch", type=int, default=8)
     parser.add_argument("--start", choices=["fork", "spawn"], default="fork", help="how workers are started")
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--epochs", type=int, default=1, help="epochs of each arm in a round")
+    parser.add_argument("--epochs", type=int, default=4, help="epochs of each arm in a round")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         begin = arms(options.store, Path(folder) / "png", options)
@@ -168,7 +186,7 @@ def main() -> None:
         taken: dict[str, list[tuple[float, float]]] = {name: [] for name in begin}
         for k in range(options.rounds + 1):  # the first round starts the workers and fills the cache
             for name, epoch in begin.items():
-                times = timed(epoch, options.epochs if k else 1, samples)
+                times = timed(epoch, options.epochs, samples)
                 if k:
                     taken[name].append(times)
     median = {name: [statistics.median(t[c] for t in times) for c in (0, 1)] for name, times in taken.items()}

@@ -2,9 +2,9 @@
 
     python benchmarks/resident_size.py paper67p --samples 500 --after 50 --size 128 [--limit 0.05]
 
-The samples are simulated, encoded and written by this process alone, in the order of the store, so without the
-replacement of worker processes by which a build limits what libraries leave behind. The exit code is 1 if the
-resident size grows by more than the limit.
+The samples are made and written by this process alone, shard by shard as a worker of a build does it, but without
+the replacement of worker processes by which a build limits what libraries leave behind. The size is read when the
+shard with the sample is complete. The exit code is 1 if it grows by more than the limit.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from typing import Any
 import psutil
 
 from vbnfault import dataset, pipeline, store
+from vbnfault.dataset import tasks
 from vbnfault.scene import config
 
 
@@ -40,12 +41,14 @@ def measure(scene: str, samples: int, size: int, marks: list[int]) -> dict[int, 
     began = time.monotonic()
     with tempfile.TemporaryDirectory() as folder:
         opened = store.create(Path(folder) / "s.zarr", spec, samples)
-        for index in range(samples):
-            store.write_samples(opened, [session.simulate(index)])
-            if index + 1 in marks:
-                sizes[index + 1] = resident_mib()
+        for number in range(opened.shards):
+            shard = opened.shard(number)
+            task = tasks.Task(shard=number, sites=(0,) * len(shard))
+            tasks.work(session.simulate, opened, task, lambda index, kind, text: None)
+            for mark in (mark for mark in marks if shard.start < mark <= shard.stop):
+                sizes[mark] = resident_mib()
                 seconds = time.monotonic() - began
-                print(f"{index + 1:6d} samples  {sizes[index + 1]:8.1f} MiB  {seconds:6.0f} s", flush=True)
+                print(f"{shard.stop:6d} samples  {sizes[mark]:8.1f} MiB  {seconds:6.0f} s", flush=True)
     return sizes
 
 

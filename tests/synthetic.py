@@ -123,7 +123,8 @@ def of_a_scene(path: Path, samples: int = 6) -> st.Store:
     for i in range(samples):
         sample, planned = fake_sample(spec, i), expected(i, 1)
         injected = planned["injected"].tolist()
-        drawn = {f: {"model": "made_up", "x": [i, i + 0.5]} for f, on in zip(FAULTS, injected, strict=True) if on}
+        of_fault = {"model": "made_up", "noise_seed": 2**62 + i, "x": [i, i + 0.5]}
+        drawn = {f: of_fault for f, on in zip(FAULTS, injected, strict=True) if on}
         masks = np.stack([blobs(spec, i, k) & on for k, on in enumerate(injected)])
         layers = {**sample.layers, "mask": masks, "radiance": made_up_radiance(spec, i)}
         scalars = {**sample.scalars, **planned, "parameters": drawn, "exposure_s": 0.01 * (i + 1)}

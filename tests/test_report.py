@@ -66,6 +66,7 @@ def test_what_is_measured_is_what_the_layers_hold(described_store: Path) -> None
     drawn, read = read_drawn(data, scalars)
     assert read == 6
     counts = data.read("injected").astype(bool).sum(axis=0)
+    assert {d.name for d in drawn} == {"x"}  # no histogram of seeds
     assert {d.fault: len(d.values) for d in drawn} == {f: 2 * n for f, n in zip(FAULTS, counts, strict=True) if n}
 
 

@@ -58,6 +58,7 @@ def test_statistics_are_those_of_the_arrays(data: st.Store) -> None:
     assert numbers["ranges"]["exposure_s"]["val"]["min"] == 0.01 * (val[0] + 1)
     fault = data.spec.faults[0]
     with_fault = np.flatnonzero(injected[:, 0])
+    assert set(numbers["parameters"][fault]) == {"model", "x"}  # no seeds
     assert numbers["parameters"][fault]["x"]["max"] == with_fault[-1] + 0.5
     assert numbers["parameters"][fault]["x"]["count"] == 2 * len(with_fault)
     assert numbers["parameters"][fault]["model"] == {"values": {"made_up": len(with_fault)}}

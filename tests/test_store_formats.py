@@ -256,7 +256,10 @@ def test_the_command_says_what_it_did_and_refuses_in_one_sentence(
 # --- codecs -------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", [ZSTD, "zstd 9", "blosc zstd 1 bitshuffle 1", "blosc zstd 3 shuffle 6"])
+@pytest.mark.parametrize(
+    "name",
+    [ZSTD, "zstd 9", "blosc zstd 1 bitshuffle 1", "blosc zstd 3 shuffle 6", "blosc zstd 1 bitshuffle 1 1024"],
+)
 def test_a_codec_returns_what_it_was_given_and_notices_damage(name: str) -> None:
     data = np.random.default_rng(1).integers(0, 9, 6 * 500, dtype=np.uint8)
     codec = compressor(name)

@@ -28,6 +28,7 @@ torch = pytest.importorskip("torch", reason="PyTorch is not installed: pip insta
 from torch.utils.data import DataLoader  # noqa: E402
 
 from vbnfault.torch import BatchDataset, Loader, SampleDataset, ShardSampler  # noqa: E402
+from vbnfault.torch.slots import Slots  # noqa: E402
 
 TARGETS = ("masks", "classes", "pose", "depth")
 Rows = list[tuple[list[int], int, int]]
@@ -221,6 +222,18 @@ def test_a_slot_is_free_when_its_last_tensor_is_gone(finished_store: Path) -> No
         for batch in loader:
             del batch
     assert not slots._used
+
+
+def test_small_tensors_need_no_shared_memory_of_their_own() -> None:
+    slots = Slots(1, 1, 1024)
+    slot = slots.take(0)
+    assert slot is not None
+    batch = {**slot.tensors({"image": ((2, 8), np.dtype(np.uint8))}), "sample": torch.tensor([3, 1])}
+    batch["image"][:] = torch.arange(8, dtype=torch.uint8)
+    packed = slot.packed(batch)
+    assert not any(isinstance(value, torch.Tensor) for value in packed.values.values())
+    back = slots.unpacked(packed)
+    assert {name: value.tolist() for name, value in back.items()} == {n: v.tolist() for n, v in batch.items()}
 
 
 # --- what goes wrong ------------------------------------------------------------------------------------

@@ -341,8 +341,15 @@ def _groups(store: Store) -> Iterator[tuple[list[int], dict[str, NDArray[Any]]]]
 _NUMBERS = frozenset((int, float))
 
 
+def is_seed(name: str) -> bool:
+    """Return whether a drawn parameter is the seed of further random numbers, which has no distribution to show."""
+    return name.rpartition(".")[2].rpartition("_")[2] == "seed"
+
+
 def _add_parameters(known: dict[str, _Parameter], drawn: Any, name: str = "") -> None:
-    """Add the drawn parameters of one fault; entries of lists count as values of the list's name."""
+    """Add the drawn parameters of one fault but seeds; entries of lists count as values of the list's name."""
+    if is_seed(name):
+        return
     kind = type(drawn)
     if kind in _NUMBERS:
         _parameter(known, name).pending.append(drawn)

@@ -18,6 +18,7 @@ from .. import store as store_module
 from ..core import activity
 from ..core.errors import InputChanged, VbnfaultError
 from ..core.interrupts import check, finishing
+from ..core.memory import release_unused
 from ..core.quantities import Sample
 from ..store import Encoded, Location, Planned, SampleDigests, Store
 from .errors import BuildFailed
@@ -98,6 +99,9 @@ def work(simulate: Callable[[int], Sample], store: Store, task: Task, tick: Tick
 
     If an interrupt ends the task early, the finished samples are still written. If `tick` raises OSError, they are
     not: the build that started this worker has ended, and another build may have begun.
+
+    At the end, memory that is no longer used is returned to the system, so that a worker does not grow: what the C
+    library and drjit keep depends on the order of the samples and varies by a fifth of the process's size.
     """
     checked = store_module.examine_shard(store, task.shard, labels=True)
     wanted = checked.wanted | task.unplanned
@@ -136,6 +140,8 @@ def work(simulate: Callable[[int], Sample], store: Store, task: Task, tick: Tick
         with finishing():
             if made:
                 write(made)
+            made.clear()
+            release_unused(always=True)
     if lost:
         named = ", ".join(map(str, sorted(lost)))
         raise VbnfaultError(

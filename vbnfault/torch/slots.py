@@ -20,6 +20,8 @@ from torch import Tensor
 from ..core.errors import VbnfaultError
 
 _ALIGNMENT = 64
+# PyTorch passes a tensor in shared memory of its own, which costs as much as copying so many bytes
+_SMALL_BYTES = 1 << 16
 
 
 class Failure(NamedTuple):
@@ -39,7 +41,7 @@ class _View(NamedTuple):
 
 
 class Packed(NamedTuple):
-    """Hold a batch as it travels: the tensors in the slot as views of it, all others as they are."""
+    """Hold a batch as it travels: tensors in the slot as views of it, small ones as arrays, others as they are."""
 
     worker: int
     slot: int
@@ -72,6 +74,8 @@ class Slot:
             if isinstance(value, Tensor) and value.untyped_storage().data_ptr() == own:
                 offset = (value.data_ptr() - first) // value.element_size()
                 value = _View(offset, tuple(value.shape), value.stride(), value.dtype)
+            elif isinstance(value, Tensor) and value.nbytes <= _SMALL_BYTES:
+                value = value.numpy()
             values[name] = value
         return Packed(self.worker, self.number, values)
 
@@ -125,7 +129,7 @@ class Slots:
             if isinstance(value, _View):
                 out[name] = base.view(value.dtype).as_strided(value.shape, value.stride, value.offset)
             else:
-                out[name] = value
+                out[name] = torch.from_numpy(value) if isinstance(value, np.ndarray) else value
         return out
 
 

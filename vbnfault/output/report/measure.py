@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.errors import VbnfaultError
+from ...dataset.statistics import is_seed
 from ...store import SPLITS, STRATA, Store
 
 F64 = NDArray[np.float64]
@@ -149,7 +150,7 @@ class Drawn:
 
 
 def read_drawn(store: Store, scalars: Scalars) -> tuple[list[Drawn], int]:
-    """Return the drawn parameters of the faults, and from how many samples they were read."""
+    """Return the drawn parameters of the faults but seeds, and from how many samples they were read."""
     values: dict[tuple[str, str], list[F64]] = {}
     splits: dict[tuple[str, str], list[NDArray[np.int64]]] = {}
     chosen = spread(len(scalars.samples), _MOST_DRAWN)
@@ -163,6 +164,8 @@ def read_drawn(store: Store, scalars: Scalars) -> tuple[list[Drawn], int]:
             drawn = parsed(texts[scalars.samples[position] - number * size])
             for fault, parameters in drawn.items():
                 for name, numbers in _numbers(parameters):
+                    if is_seed(name):
+                        continue
                     values.setdefault((fault, name), []).append(numbers)
                     of_split = np.full(len(numbers), scalars.split[position])
                     splits.setdefault((fault, name), []).append(of_split)
