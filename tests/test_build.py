@@ -440,3 +440,22 @@ def test_a_store_without_room_for_its_first_file_leaves_nothing(tmp_path: Path) 
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_worker_returns_memory_after_every_shard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Once a shard, when its samples are written and no longer held; also after a shard that could not be made."""
+    opened = st.create(tmp_path / "s.zarr", make_spec(), 8)
+    events: list[str] = []
+    monkeypatch.setattr(tasks, "release_unused", lambda *, always: events.append(f"released {always}"))
+    monkeypatch.setattr(
+        st.Store, "write_shard", lambda self, number, given, damaged: events.append(f"wrote {number}") or set()
+    )
+
+    def simulate(index: int) -> Sample:
+        if index > 3:
+            raise VbnfaultError("no sample")
+        return fake_sample(opened.spec, index)
+
+    for number in range(2):
+        tasks.work(simulate, opened, tasks.Task(shard=number, sites=(0,) * 4), lambda *_: None)
+    assert events == ["wrote 0", "released True", "released True"]
