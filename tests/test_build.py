@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import errno
 import json
 import os
@@ -459,3 +460,44 @@ def test_a_worker_returns_memory_after_every_shard(tmp_path: Path, monkeypatch: 
     for number in range(2):
         tasks.work(simulate, opened, tasks.Task(shard=number, sites=(0,) * 4), lambda *_: None)
     assert events == ["wrote 0", "released True", "released True"]
+
+
+@pytest.mark.parametrize("careful", [False, True])
+def test_a_sample_is_encoded_while_the_next_one_is_simulated(tmp_path: Path, careful: bool) -> None:
+    spec = make_spec()
+    store = st.create(tmp_path / "a.zarr", spec, 4)
+    events: list[tuple[str, int]] = []
+
+    def simulate(index: int) -> Sample:
+        if index == 1:
+            raise ValueError("no such view")
+        sample = fake_sample(spec, index)
+        return dataclasses.replace(sample, layers={}) if index == 2 else sample  # fails when it is encoded
+
+    task = tasks.Task(shard=0, sites=(0,) * len(store.shard(0)), careful=careful)
+    tasks.work(simulate, store, task, lambda i, what, _: events.append((what, i)))
+    after = [("begun", 0), ("begun", 1), ("failed", 1), ("begun", 2), ("built", 0), ("begun", 3), ("failed", 2)]
+    at_once = [("begun", 0), ("built", 0), ("begun", 1), ("failed", 1), ("begun", 2), ("failed", 2), ("begun", 3)]
+    assert events == [*(at_once if careful else after), ("built", 3)]
+    assert store.done(0) == {0: True, 1: False, 2: False, 3: True}
+
+
+def test_an_interrupt_keeps_the_sample_that_is_being_encoded(tmp_path: Path) -> None:
+    spec = make_spec()
+    store = st.create(tmp_path / "a.zarr", spec, 4)
+    built: list[int] = []
+
+    def simulate(index: int) -> Sample:
+        if index == 2:
+            raise KeyboardInterrupt
+        return fake_sample(spec, index)
+
+    with pytest.raises(KeyboardInterrupt):
+        tasks.work(
+            simulate,
+            store,
+            tasks.Task(shard=0, sites=(0,) * len(store.shard(0))),
+            lambda i, what, _: built.append(i) if what == "built" else None,
+        )
+    assert built == [0]
+    assert store.done(0) == {0: True, 1: True, 2: False, 3: False}

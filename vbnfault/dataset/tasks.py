@@ -7,7 +7,8 @@ loads the terrain of a site once.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -106,48 +107,95 @@ def work(simulate: Callable[[int], Sample], store: Store, task: Task, tick: Tick
     checked = store_module.examine_shard(store, task.shard, labels=True)
     wanted = checked.wanted | task.unplanned
     samples = store.shard(task.shard)
-    made: dict[int, Encoded] = {}
-    shared = store_module.SharedChunks()
-    pending = set(wanted)
-    lost: set[int] = set()
-
-    def write(given: dict[int, Encoded]) -> None:
-        lost.update(store.write_shard(task.shard, given, damaged=pending - set(given)))
-        pending.difference_update(given)
-
-    try:
-        for i in samples:
-            if i not in wanted:
-                tick(i, "kept", checked.digests[i].hex())
-        for i in sorted(wanted - task.skip, key=lambda i: (task.sites[i - samples.start], i)):
-            check()
-            tick(i, "begun", "")
-            try:
-                with activity.reported_to(functools.partial(tick, i, "stage")):
-                    encoded = store_module.encode(store.spec, simulate(i), shared)
-            except Exception as error:
+    with ThreadPoolExecutor(1) as aside:
+        shard = _Shard(store, task, tick, wanted, aside)
+        try:
+            for i in samples:
+                if i not in wanted:
+                    tick(i, "kept", checked.digests[i].hex())
+            for i in sorted(wanted - task.skip, key=lambda i: (task.sites[i - samples.start], i)):
                 check()
-                tick(i, "failed", describe(error))
-                continue
-            made[i] = encoded
-            if task.careful:
-                write({i: made.pop(i)})
-            tick(i, "built", encoded.digest.hex())
-    except OSError:
-        made.clear()
-        raise
-    finally:
-        with finishing():
-            if made:
-                write(made)
-            made.clear()
-            release_unused(always=True)
-    if lost:
-        named = ", ".join(map(str, sorted(lost)))
+                tick(i, "begun", "")
+                try:
+                    with activity.reported_to(functools.partial(tick, i, "stage")):
+                        sample = simulate(i)
+                except Exception as error:
+                    check()
+                    tick(i, "failed", describe(error))
+                    continue
+                shard.add(sample, i)
+                del sample  # its layers are freed as soon as they are encoded
+            shard.collect()
+        except OSError:
+            shard.discard()
+            raise
+        finally:
+            with finishing():
+                shard.write_rest()
+                release_unused(always=True)
+    if shard.lost:
+        named = ", ".join(map(str, sorted(shard.lost)))
         raise VbnfaultError(
             f"{store.path}: the files of sample {named} were whole and no longer are; the same command builds "
             "what is lost again"
         )
+
+
+class _Shard:
+    """Encode the samples of a shard in the thread `aside` while the next ones are simulated, and write them.
+
+    `lost` are samples that were whole and are so no longer.
+    """
+
+    def __init__(
+        self, store: Store, task: Task, tick: Tick, wanted: Iterable[int], aside: ThreadPoolExecutor
+    ) -> None:
+        self._store, self._task, self._tick, self._aside = store, task, tick, aside
+        self._shared = store_module.SharedChunks()
+        self._pending = set(wanted)
+        self._made: dict[int, Encoded] = {}
+        self._coded: dict[int, Future[Encoded]] = {}  # at most one, to bound memory
+        self.lost: set[int] = set()
+
+    def add(self, sample: Sample, index: int) -> None:
+        """Begin to encode a sample, after the one before. A careful task waits until it is written."""
+        self.collect()
+        self._coded[index] = self._aside.submit(store_module.encode, self._store.spec, sample, self._shared)
+        if self._task.careful:
+            self.collect()
+
+    def collect(self) -> None:
+        """Wait until the last sample is encoded, and report it."""
+        while self._coded:
+            i, future = self._coded.popitem()
+            try:
+                encoded = self._made[i] = future.result()
+            except Exception as error:
+                check()
+                self._tick(i, "failed", describe(error))
+                continue
+            if self._task.careful:
+                self._write({i: self._made.pop(i)})
+            self._tick(i, "built", encoded.digest.hex())
+
+    def discard(self) -> None:
+        """Forget all samples that are not written."""
+        self._made.clear()
+        self._coded.clear()
+
+    def write_rest(self) -> None:
+        """Write the samples that are not written yet, also one that was not reported before an interrupt."""
+        for i, future in self._coded.items():
+            if future.exception() is None:
+                self._made[i] = future.result()
+        if self._made:
+            self._write(self._made)
+        self.discard()
+
+    def _write(self, given: dict[int, Encoded]) -> None:
+        """Write samples into the shard."""
+        self.lost.update(self._store.write_shard(self._task.shard, given, damaged=self._pending - set(given)))
+        self._pending.difference_update(given)
 
 
 class Run:

@@ -109,11 +109,11 @@ class SharedChunks:
         """Return chunk, CRC-32C and sha256 of each layer, given its contiguous array and its codec."""
         keys = {name: (id(array), codec) for name, (array, codec) in layers.items()}
         arrays = {key: layers[name][0] for name, key in keys.items()}
-        done = {
-            key: self._known[key][1]
-            for key, array in arrays.items()
-            if key in self._known and self._known[key][0]() is array
-        }
+        done = {}
+        for key, array in arrays.items():
+            known = self._known.get(key)  # another thread may drop the array that it was made of
+            if known is not None and known[0]() is array:
+                done[key] = known[1]
         left = {key: array for key, array in arrays.items() if key not in done}
         with ThreadPoolExecutor(threads()) as pool:
             done |= zip(left, pool.map(_pack, left.values(), (codec for _, codec in left)), strict=True)
