@@ -9,10 +9,19 @@ import sys
 import numpy as np
 import pytest
 from scipy import stats
+from scipy.special import ndtri
 
 from vbnfault.core import spectra
 from vbnfault.core.quantities import Electrons, Irradiance, RawDN
-from vbnfault.detector import EXACT_POISSON_BELOW_E, Noise, ThreeColourDetector, blocks, poisson, poisson_quantile
+from vbnfault.detector import (
+    EXACT_POISSON_BELOW_E,
+    Noise,
+    ThreeColourDetector,
+    blocks,
+    poisson,
+    poisson_quantile,
+)
+from vbnfault.detector.noise import normal_field
 
 SHORT_S = 1e-3
 NODES = spectra.band_nodes_nm(400, 700, 8)
@@ -28,6 +37,23 @@ def draw(seed: int, shape: tuple[int, int] = (64, 64)) -> Noise:
 
 
 # ------------------------------------------------------------------------------------------------------ noise
+
+
+@pytest.mark.parametrize("kind", [np.random.SFC64, np.random.PCG64, np.random.Philox, np.random.MT19937])
+@pytest.mark.parametrize("size", [4 * 50_001, 4 * 50_001 + 2])
+def test_noise_comes_from_the_bytes_of_the_generator(kind: type, size: int) -> None:
+    """Whatever is quicker must give the numbers of `Generator.bytes`, and leave the generator where that does."""
+    for earlier in (0, 1):  # words of 32 bits taken before: half a word of 64 bits may be left
+        found, expected = np.random.Generator(kind(8)), np.random.Generator(kind(8))
+        for rng in (found, expected):
+            rng.integers(0, 2**32, earlier, dtype=np.uint32)
+        field = normal_field((size,), found)
+        code = np.frombuffer(expected.bytes(2 * size), dtype=np.uint16)
+        middle = (code > 0) & (code < 65535)
+        np.testing.assert_array_equal(field[middle], ndtri((code[middle] + 0.5) / 65536).astype(np.float32))
+        tail = ndtri((1 - expected.random(size - middle.sum())) / 65536)
+        np.testing.assert_array_equal(np.abs(field[~middle]), -tail.astype(np.float32))
+        assert found.random() == expected.random()
 
 
 def test_noise_fields_are_standard_normal_and_unrelated() -> None:

@@ -6,6 +6,7 @@ Two exposures of twins therefore differ only where their signals differ.
 from __future__ import annotations
 
 import math
+import sys
 from functools import lru_cache
 
 import numpy as np
@@ -28,6 +29,12 @@ _ALL_TERMS_BELOW_E = 1000.0
 # Above this mean, counting steps takes longer than the general quantile.
 _MANY_STEPS_E = 30.0
 
+# Numbers that are looked up together: numpy makes indices of 8 bytes of them, which stay in the cache.
+_CODES_AT_ONCE = 1 << 17
+
+# Means whose distributions are summed together, so that their five arrays of 8 bytes stay in the cache.
+_SUMMED_AT_ONCE = 1 << 15
+
 
 def normal_field(shape: tuple[int, ...], rng: np.random.Generator) -> F32:
     """Draw standard normal variates by the inverse distribution function of 16 bit uniform numbers.
@@ -36,12 +43,24 @@ def normal_field(shape: tuple[int, ...], rng: np.random.Generator) -> F32:
     drawn again within the bin, so the tails are complete.
     """
     size = math.prod(shape)
-    code = np.frombuffer(rng.bytes(2 * size), dtype=np.uint16)
-    out = np.take(_normal_table(), code, mode="clip")
+    code, table = _codes(size, rng), _normal_table()
+    out = np.empty(size, dtype=np.float32)
+    for start in range(0, size, _CODES_AT_ONCE):
+        part = slice(start, start + _CODES_AT_ONCE)
+        np.take(table, code[part], mode="clip", out=out[part])
     tail = np.flatnonzero(code + np.uint16(1) <= 1)  # the first and the last code
     sign = np.where(code[tail] == 0, 1.0, -1.0)
     out[tail] = sign * ndtri((1.0 - rng.random(len(tail))) / 65536)
     return out.reshape(shape)
+
+
+def _codes(size: int, rng: np.random.Generator) -> NDArray[np.uint16]:
+    """Return 16 bit uniform numbers, uint16[size]: those of `rng.bytes`, in a quarter of its time if possible."""
+    # `bytes` takes words of 32 bits, of which a generator of 64 bits yields the low one first and keeps the other
+    whole = size % 4 == 0 and rng.bit_generator.state.get("has_uint32") == 0 and sys.byteorder == "little"
+    if not whole:
+        return np.frombuffer(rng.bytes(2 * size), dtype=np.uint16)
+    return rng.integers(0, 2**64 - 1, size // 4, dtype=np.uint64, endpoint=True).view(np.uint16)
 
 
 @lru_cache(maxsize=1)
@@ -60,21 +79,27 @@ def poisson_quantile(mean: F32, normal: F32) -> F32:
     out = z * z
     out *= np.float32(1 / 6)
     out += np.float32(1 / 3)
-    out += root * z
+    root *= z
+    out += root
     out += mean
     # the later terms move a count by less than 0.01 where the mean is above this
     few = np.flatnonzero(mean < _ALL_TERMS_BELOW_E)
     if len(few):
-        m, z = mean.ravel()[few], normal.ravel()[few]
+        m, z = mean.ravel(), normal.ravel()
+        if len(few) < m.size:
+            m, z = m[few], z[few]
         safe = np.maximum(m, np.float32(1))
         zz = z * z
         terms = (np.float32(-8 / 405) + zz * (np.float32(7 / 810) + np.float32(1 / 270) * zz)) / safe
         terms -= z * (np.float32(1 / 36) + np.float32(1 / 72) * zz) / np.sqrt(safe)
-        out.ravel()[few] += terms
+        if len(few) < out.size:
+            out.ravel()[few] += terms
+        else:
+            out.ravel()[:] += terms
     np.floor(out, out=out)
     np.maximum(out, 0, out=out)
     if len(few):
-        low = m < EXACT_POISSON_BELOW_E
+        low = np.flatnonzero(m < EXACT_POISSON_BELOW_E)
         out.ravel()[few[low]] = _poisson_exact(m[low], z[low])
     return out
 
@@ -92,23 +117,25 @@ def poisson_on_dark(signal: F32, dark: np.float32, normal: F32) -> F32:
 
 
 def _poisson_exact(mean: F32, normal: F32) -> F32:
-    """Return the Poisson count at the quantile Φ(normal) by summing the distribution."""
-    u = ndtr(normal.astype(np.float64))
-    m = mean.astype(np.float64)
-    term = np.exp(-m)
-    total = term.copy()
-    out = np.zeros(len(m), dtype=np.float32)
-    left = np.flatnonzero(u > total)
-    u, m, term, total = u[left], m[left], term[left], total[left]
-    count = 0
-    while len(left):
-        count += 1
-        term = term * m / count
-        total += term
-        # past 1 - 1e-15 the sum no longer changes in float64: stop there
-        more = (u > total) & (total < 1 - 1e-15)
-        out[left[~more]] = count
-        left, m, u, term, total = left[more], m[more], u[more], term[more], total[more]
+    """Return the Poisson count, float32[n], at the quantile Φ(normal) by summing the distribution."""
+    out = np.zeros(len(mean), dtype=np.float32)
+    for start in range(0, len(mean), _SUMMED_AT_ONCE):
+        part = slice(start, start + _SUMMED_AT_ONCE)
+        counts, m, u = out[part], mean[part].astype(np.float64), ndtr(normal[part].astype(np.float64))
+        term = np.exp(-m)
+        total = term.copy()
+        left = np.flatnonzero(u > total)
+        u, m, term, total = u[left], m[left], term[left], total[left]
+        count = 0
+        while len(left):
+            count += 1
+            term *= m
+            term /= count
+            total += term
+            counts[left] = count  # those that go on are written again
+            # past 1 - 1e-15 the sum no longer changes in float64: stop there
+            more = np.flatnonzero((u > total) & (total < 1 - 1e-15))
+            left, m, u, term, total = left[more], m[more], u[more], term[more], total[more]
     return out
 
 

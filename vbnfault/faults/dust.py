@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 from .context import FaultContext, Params
 from .contract import Fault
 from .fields import Interval, Severity, bounds, flag, number
+from .planes import times
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,11 +117,8 @@ class GaussianDust(Fault):
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
         """Return the expected electrons times the transmission of all grains."""
-        at, factor = context.once("dust.grains", params, lambda: _grains(_transmission_once(params, context)))
-        out = quantity.array.copy()
-        pixels = out.reshape(-1, out.shape[2])
-        pixels[at] *= factor
-        return quantity.with_array(out)
+        # outside the grains the factor is exactly 1; to choose the pixels of the grains takes four times as long
+        return quantity.with_array(times(quantity.array, _transmission_once(params, context)))
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
         """Return the pixels that a grain darkens by more than `mask_level_dn`, bool[y, x]."""
@@ -129,12 +127,6 @@ class GaussianDust(Fault):
     def soft(self, params: Params, context: FaultContext) -> NDArray[np.float32]:
         """Return the fraction of the light that the grains remove, float32[y, x]."""
         return np.float32(1) - _transmission_once(params, context)
-
-
-def _grains(factor: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Return the flat indices of pixels under grains and their transmission, float32[n, 1]."""
-    at = np.flatnonzero(factor < 1)
-    return at, factor.ravel()[at, None]
 
 
 def _transmission_once(params: Params, context: FaultContext) -> NDArray[np.float32]:

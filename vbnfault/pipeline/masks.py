@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Mapping
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -68,6 +69,8 @@ def mask_layers(
     Classes that are not in `drawn` have empty masks. `effects` holds the effect masks, bool[y, x], of the classes
     that need them.
     """
+    if not drawn:
+        return no_masks((len(faults), *context.shape))
     out = np.zeros((len(faults), *context.shape), dtype=bool)
     for k, (name, fault) in enumerate(faults.items()):
         if name not in drawn:
@@ -77,6 +80,14 @@ def mask_layers(
             mask = mask | effects[name]
         if mask is not None:
             out[k] = mask
+    return out
+
+
+@lru_cache(maxsize=1)
+def no_masks(shape: tuple[int, ...]) -> Mask:
+    """Return empty masks, bool[fault, y, x], read-only, since samples without faults share them."""
+    out = np.zeros(shape, dtype=bool)
+    out.flags.writeable = False
     return out
 
 

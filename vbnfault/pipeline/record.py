@@ -41,10 +41,7 @@ def _layers(frame: Frame) -> dict[str, NDArray[Any]]:
         if name.startswith("without_"):
             layers[name] = images.without[name.removeprefix("without_")].array
         elif name == "mask_effect":
-            layers[name] = np.zeros_like(labels.masks)  # of a scene without faults, too
-            for k, fault in enumerate(names):
-                if fault in labels.effects:
-                    layers[name][k] = labels.effects[fault]
+            layers[name] = _effects(frame)
         elif name in labels.strengths:
             layers[name] = labels.strengths[name]
         elif name in ("raw", "defects"):
@@ -61,6 +58,18 @@ def _layers(frame: Frame) -> dict[str, NDArray[Any]]:
         elif name in _TRUTH_LAYERS:
             layers[name] = getattr(frame.rendering.truth, name)
     return layers
+
+
+def _effects(frame: Frame) -> NDArray[np.bool_]:
+    """Return the effects of the classes of the scene, bool[fault, y, x], empty where a class is not injected."""
+    effects, shape = frame.labels.effects, frame.labels.masks.shape
+    if not effects:
+        return masks.no_masks(shape)
+    out = np.zeros(shape, dtype=bool)
+    for k, fault in enumerate(frame.spec.faults):
+        if fault in effects:
+            out[k] = effects[fault]
+    return out
 
 
 def _as_stored(radiance: NDArray[np.float32], scene: Scene) -> NDArray[Any]:
