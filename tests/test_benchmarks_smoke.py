@@ -35,3 +35,17 @@ def test_benchmarks_print_every_stage_and_ratio(tmp_path: Path) -> None:
         "at most 0.25",
     ):
         assert line in printed
+
+
+def test_the_cost_of_variants_is_measured_on_equal_faults(tmp_path: Path) -> None:
+    from variants_cost import STAGES, measure, table
+
+    small = {"camera.width_px": 64, "camera.height_px": 64, "patch.max_triangles": 50_000}
+    alone, shared = measure("paper67p", 4, 2, tmp_path, settings=small)
+    for build in (alone, shared):
+        assert build.store.finished() == 4
+        # the stages are all that a build does, so their times add up to its time
+        assert set(build.wall_s) == {*STAGES, "sum"}
+    assert alone.calls["faulty"] == shared.calls["faulty"] == 2
+    assert shared.calls["render_view"] < alone.calls["render_view"]
+    assert "K=2 over K=1: " in table(alone, shared)

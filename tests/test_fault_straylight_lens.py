@@ -11,10 +11,12 @@ from test_faults_kit import flat_electrons, make_context
 
 from vbnfault.core import llvm, spectra
 from vbnfault.core.errors import InputError, VbnfaultError
+from vbnfault.core.shared_results import SharedResults
 from vbnfault.faults import FaultContext, from_dict, registry
 from vbnfault.lens import load_lens, paraxial_properties, scaled_to_focal_length
 from vbnfault.lens.coating import mean_reflectance
 from vbnfault.lens.rays import ghost
+from vbnfault.lens.straylight.irradiance import FlareModel
 from vbnfault.lens.straylight.paraxial import transmittance
 
 try:
@@ -193,3 +195,29 @@ def test_worn_coatings_raise_ghosts(model: str) -> None:
     # of the Sun's light near the axis, told at normal incidence
     assert np.median(gains) == pytest.approx(1, abs=0.02)
     assert coated.sum() < half.sum()
+
+
+def test_samples_of_a_view_share_the_ghosts_of_whole_coatings(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each sample has its own roughness, dust and veil, and the same bits as alone."""
+    drawn: list[float] = []
+    image = FlareModel.image
+
+    def counted(model: FlareModel, *sun: float) -> Any:
+        drawn.append(sun[0])
+        return image(model, *sun)
+
+    monkeypatch.setattr(FlareModel, "image", counted)
+    keys = [{"roughness_nm": 0.5, "veil_fraction": 0.01}, {}, {"cleanliness_level": 90}, {"coating": "none"}]
+    keys = [{"coating": "bbar"} | own for own in keys]
+    losses = [0.0, 0.4, 0.0, 0.0]
+    of_view = SharedResults(kept=True)
+    together = [
+        light("paraxial", context(coating_loss=loss, of_view=of_view), **own)
+        for loss, own in zip(losses, keys, strict=True)
+    ]
+    assert len(drawn) == 3  # whole coatings, worn coatings, other coatings
+    alone = [light("paraxial", context(coating_loss=loss), **own) for loss, own in zip(losses, keys, strict=True)]
+    assert len(drawn) == 3 + 4
+    for (added, params), (added_alone, params_alone) in zip(together, alone, strict=True):
+        np.testing.assert_array_equal(added, added_alone)
+        assert params == params_alone

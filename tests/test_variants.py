@@ -17,7 +17,9 @@ from vbnfault import store
 from vbnfault.camera import Camera
 from vbnfault.core.errors import InputError
 from vbnfault.core.quantities import Radiance
+from vbnfault.core.shared_results import SharedResults
 from vbnfault.dataset.identity import scene_identity, store_spec
+from vbnfault.detector import MosaicDetector
 from vbnfault.pipeline import Session, stages
 from vbnfault.pipeline.exposure import exposure_factor
 from vbnfault.pipeline.record import to_sample
@@ -25,6 +27,7 @@ from vbnfault.pipeline.spec import SampleSpec
 from vbnfault.scene import config, plan
 from vbnfault.scene.config import Scene
 from vbnfault.store import codec
+from vbnfault.world import assemble
 
 NEED_SUN = ["straylight"]
 
@@ -259,3 +262,43 @@ def test_what_the_samples_of_a_view_share_is_computed_and_compressed_once(
     del samples
     session._shared_views._kept.clear()
     assert len(shared._known) < held
+
+
+def test_shared_results_are_the_last_of_their_name() -> None:
+    made: list[int] = []
+
+    def make() -> int:
+        made.append(len(made))
+        return made[-1]
+
+    shared = SharedResults(kept=True)
+    assert [shared.once("a", 1, make), shared.once("a", 1, make), shared.once("b", 1, make)] == [0, 0, 1]
+    assert [shared.once("a", 2, make), shared.once("a", 1, make), shared.once("b", 1, make)] == [2, 3, 1]
+    assert [SharedResults().once("a", 1, make) for _ in range(2)] == [4, 5]
+
+
+def test_stars_and_raw_numbers_are_computed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = small_scene(
+        dataset={"samples": 4, "sites": 1, "variants_per_view": 4, "shard_samples": 4, "layers": ["clean", "raw"]},
+        camera={"detector": "cmv4000"},
+        sky={"stars": "on"},
+        plan={"faulty_fraction": 0.0},
+    )
+    starred: list[float] = []
+    visible_stars = assemble.visible_stars
+    monkeypatch.setattr(
+        assemble, "visible_stars", lambda *of: starred.append(of[2].exposure_s) or visible_stars(*of)
+    )
+    developed: list[float] = []
+    raw = MosaicDetector.raw
+    monkeypatch.setattr(MosaicDetector, "raw", lambda detector, *of: developed.append(of[1]) or raw(detector, *of))
+    own = Session(config.parse_scene(scene, source="test"))
+    frames = [own.frame(k) for k in range(4)]
+    assert len(starred) == frames[0].views == 1
+    assert len(developed) == 4  # the raw numbers of an image are those that are stored
+    assert all(frame.images.raw is not None for frame in frames)
+    assert len({frame.images.raw.tobytes() for frame in frames}) == 4
+    rates = [frame.exposure.rate.array for frame in frames]
+    alone = Session(config.parse_scene(scene, source="test")).frame(3)
+    np.testing.assert_array_equal(rates[3], alone.exposure.rate.array)
+    np.testing.assert_array_equal(frames[3].images.raw, alone.images.raw)

@@ -118,7 +118,11 @@ class MosaicDetector:
 
     def develop(self, expected: Electrons, exposure_s: float, noise: Any, acts: Acts | None = None) -> RGBI:
         """Return the 8 bit image of the expected photo-electrons. Arguments are as in `raw`."""
-        return self.device.rgbi(self.raw(expected, exposure_s, noise, acts), exposure_s)
+        return self.rgbi(self.raw(expected, exposure_s, noise, acts), exposure_s)
+
+    def rgbi(self, raw: NDArray[np.uint16], exposure_s: float) -> RGBI:
+        """Return the 8 bit image of a raw mosaic uint16[y, x]."""
+        return self.device.rgbi(raw, exposure_s)
 
     @property
     def step_e(self) -> float:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ..camera import Camera
 from ..core.quantities import FarSource, Radiance
+from ..core.shared_results import SharedResults
 from ..lens.footprint import ImageFrame
 
 Params = dict[str, Any]
@@ -55,6 +56,9 @@ class FaultContext:
     coating_loss
         Fraction of the coatings' area that another fault of the sample has removed, in [0, 1]. Only a model with
         `Fault.informed` gets it; for the others it is 0.
+    of_view
+        Results that all samples of the view share (`dataset.variants_per_view`). What is kept here may depend on
+        the camera's lens and on the light of the view; everything else belongs to the key.
     """
 
     camera: Camera
@@ -70,6 +74,7 @@ class FaultContext:
     surroundings: tuple[Radiance, ...] = ()
     far_sources: tuple[FarSource, ...] = ()
     coating_loss: float = 0.0
+    of_view: SharedResults = field(default_factory=SharedResults, repr=False)
     # `init=False`, because `dataclasses.replace` must not copy results of one frame to another
     _memo: dict[Any, Any] = field(default_factory=dict, init=False, repr=False)
 

@@ -34,11 +34,12 @@ from numpy.typing import NDArray
 
 from ..core import spectra
 from ..core.quantities import Irradiance, Radiance
+from ..core.shared_results import SharedResults
 from ..lens.straylight.scatter import CLEANLINESS_LIMITS, ROUGHNESS_NM_LIMITS, Cleanliness
 from ..lens.straylight.scene import PointSources, RenderGrid, SceneInLens, surrounding_grids
 from ..lens.straylight.scene_diffraction import starburst_of_source, wing_fraction
 from ..lens.straylight.settings import Baffle, DirectPath, GhostSettings, SensorGrid, StraylightSettings, SunSource
-from ..lens.straylight.total import SunlightInLens, scene_veil_fraction, veil_of
+from ..lens.straylight.total import ClearLight, SunlightInLens, scene_veil_fraction, veil_of
 from .context import FaultContext, Params
 from .contract import LensFault
 from .fields import Interval, Severity, bounds, choice, flag, number
@@ -239,7 +240,7 @@ class _LensStraylight(LensFault):
             lost = self.scene_lost(params, context)
             return _Light(added=scene, direct_left=1 - lost, scene_lost=lost, scene_added=True)
         camera, light = context.camera, source.light
-        combined, direct_fraction = light.combined()
+        combined, direct_fraction = light.combined(_clear_light(light, context))
         combined *= source.irradiance_W_m2_nm.astype(np.float32)[:, None, None]
         on_sensor = Irradiance(array=combined, wavelength_nm=light.nodes_nm)
         added = camera.detector.electrons_expected(on_sensor, camera.exposure_s).array
@@ -351,16 +352,19 @@ class _LensStraylight(LensFault):
         camera = context.camera
         sensor = _sensor_grid(context)
         pitch_mm = sensor.pitch_mm
-        made = flare_model(
+        key = (
             context.frame.prescription(params["lens"], params["coating"]),
             tuple(float(v) for v in _sunlight(context)[0]),
             sensor,
             _sun_radius_rad(context),
             GhostSettings(model=self.model, reflections=params["reflections"]),
         )
-        ghosts = sorted(made.worn(context.coating_loss).ghosts(*sun), key=lambda g: -g.peak_irradiance_fraction)[
-            :_MOST_GHOSTS
-        ]
+        made = flare_model(*key).worn(context.coating_loss)
+        shared = _shared_while_new(context)
+        by_peak = sorted(
+            shared.once("ghosts", (*key, sun), lambda: made.ghosts(*sun)),
+            key=lambda g: -g.peak_irradiance_fraction,
+        )
         return [
             {
                 "pair": list(g.pair),
@@ -370,8 +374,22 @@ class _LensStraylight(LensFault):
                 "y_px": g.centroid_mm[1] / pitch_mm + camera.height_px / 2,
                 "rms_radius_px": g.rms_radius_mm / pitch_mm,
             }
-            for g in ghosts
+            for g in by_peak[:_MOST_GHOSTS]
         ]
+
+
+def _shared_while_new(context: FaultContext) -> SharedResults:
+    """Return where results of coatings that are whole are kept; each sample has its own loss of coatings."""
+    return SharedResults() if context.coating_loss else context.of_view
+
+
+def _clear_light(light: SunlightInLens, context: FaultContext) -> ClearLight:
+    """Return ghosts and starburst of the Sun, which the samples of a view share."""
+    shared = _shared_while_new(context)
+    clear = shared.once("ghosts and starburst", light.clear_key, light.clear_light)
+    if shared.kept:
+        clear.array.flags.writeable = False
+    return clear
 
 
 def _diffracts(params: Params, context: FaultContext) -> bool:

@@ -71,6 +71,7 @@ class Development:
         self._contexts: dict[Keys, FaultContext] = {(): context}
         self._signals: dict[Any, Electrons] = {}
         self._images: dict[Any, RGBI] = {}
+        self._raws: dict[Any, NDArray[np.uint16]] = {}
         self._effects: dict[Any, Mask] = {}
 
     @cached_property
@@ -143,7 +144,9 @@ class Development:
         camera = self.camera_with(draws)
         if self._instrument(draws):
             return camera.expose(self.exposure.light.rendered, camera.exposure_s)
-        return self.exposure.rate.scaled(camera.exposure_s)
+        rate, exposure_s = self.exposure.rate, camera.exposure_s
+        # the rate itself is the key, so that it exists as long as what was made of it
+        return self.context.of_view.once("clean signal", (rate, exposure_s), lambda: rate.scaled(exposure_s))
 
     # --- images ----------------------------------------------------------------------------------------------
 
@@ -171,7 +174,12 @@ class Development:
             camera = self.camera_with(draws)
             signal = self.signal(draws, acting_at(draws, "electrons"), keep=keep_signals).merged
             noise = self.noise if noisy else None
-            self._images[key] = camera.detector.develop(signal, camera.exposure_s, noise, self._acts(draws))
+            if noisy and camera.detector.mosaic is not None:
+                raw = camera.mosaic.raw(signal, camera.exposure_s, noise, self._acts(draws))
+                self._raws[key] = raw  # a fifth of the memory of the image, and needed by `raw`
+                self._images[key] = camera.mosaic.rgbi(raw, camera.exposure_s)
+            else:
+                self._images[key] = camera.detector.develop(signal, camera.exposure_s, noise, self._acts(draws))
         return self._images[key]
 
     def _read_out(self, image: RGBI, draws: Draws) -> RGBI:
@@ -193,9 +201,8 @@ class Development:
 
     def raw(self, draws: Draws) -> NDArray[np.uint16]:
         """Return the raw mosaic of the image, uint16[y, x], before the faults that act on the finished image."""
-        camera = self.camera_with(draws)
-        signal = self.signal(draws, acting_at(draws, "electrons")).merged
-        return camera.mosaic.raw(signal, camera.exposure_s, self.noise, self._acts(draws))
+        self._before_readout(draws, noisy=True)
+        return self._raws[(*self._image_key(draws, True), ())]
 
     def defects(self, draws: Draws) -> NDArray[np.uint8]:
         """Return the defects of the mosaic's pixels, uint8[y, x]: those of the device and those of the faults."""
@@ -222,7 +229,8 @@ class Development:
     def _effect(self, draws: Draws, name: str, least_dn: float) -> Mask:
         """Return `effect`, computed anew."""
         others = without(draws, name)
-        if not self.is_local(draws, name):
+        # to choose the pixels of a fault that changes nearly all of them takes longer than to develop all
+        if not self.is_local(draws, name) or not draws[name].fault.localised:
             with_it = self.image(draws, noisy=False).array
             lacking = self.image(others, noisy=False, keep_signals=name in self._twins).array
             return masks.effect(with_it, lacking, least_dn)
@@ -235,15 +243,16 @@ class Development:
         if not len(changed):
             return np.zeros(self.context.shape, dtype=bool)
         with_it = self.image(draws, noisy=False).array
-        array = self._before_readout(draws, False).array.copy()
+        image = self._before_readout(draws, False).array.copy()
         # arrange these pixels as the rows of an image, and fill up the last row
         width = self.context.shape[1]
         filled = np.resize(changed, (-(-len(changed) // width), width))
-        pixels = part.array.reshape(-1, part.array.shape[2])[filled]
+        pixels = np.take(part.array.reshape(-1, part.array.shape[2]), filled, axis=0)
         camera = self.exposure.camera
         developed = camera.detector.develop(part.with_array(pixels), camera.exposure_s, None).array
-        array.reshape(-1, 4)[changed] = developed.reshape(-1, 4)[: len(changed)]
-        return masks.effect(with_it, self._read_out(RGBI(array=array), others).array, least_dn)
+        # each pixel, four channels of 8 bits, moves as one word
+        image.view(np.uint32).reshape(-1)[changed] = developed.view(np.uint32).reshape(-1)[: len(changed)]
+        return masks.effect(with_it, self._read_out(RGBI(array=image), others).array, least_dn)
 
     def is_local(self, draws: Draws, name: str) -> bool:
         """Return whether a drawn fault changes only those pixels whose expected electrons it changes."""

@@ -40,14 +40,13 @@ def _metered_light(spec: SampleSpec, rendering: Rendering) -> tuple[float, Elect
 
     Both depend on the optics of the camera only, so the samples of a view with equal optics share them.
     """
-    camera, known = spec.camera, rendering.metered
-    if camera.optics in known:
-        return known[camera.optics]
-    rate = camera.expose(rendering.light.rendered, 1.0)
-    metered = exposure_s(spec.scene, camera, rendering.truth, rate.merged), rate
-    if spec.plan.variants > 1:
-        known[camera.optics] = metered
-    return metered
+    camera = spec.camera
+
+    def metered() -> tuple[float, Electrons]:
+        rate = camera.expose(rendering.light.rendered, 1.0)
+        return exposure_s(spec.scene, camera, rendering.truth, rate.merged), rate
+
+    return rendering.shared.once("metered light", camera.optics, metered)
 
 
 def exposure_factor(spec: SampleSpec) -> float:

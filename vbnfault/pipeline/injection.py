@@ -83,6 +83,7 @@ def fault_context(pose: Pose, rendering: Rendering, exposure: SceneExposure) -> 
         radiance=exposure.light.rendered,
         surroundings=rendering.surroundings,
         far_sources=rendering.far_sources,
+        of_view=rendering.shared,
     )
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ..body import Body, Site
 from ..camera import Camera
 from ..core.quantities import RGBI, Electrons, FarSource, Radiance, Truth
+from ..core.shared_results import SharedResults
 from ..faults import Fault, FaultContext, Params
 from ..lens import Lens
 from ..render.description import RenderInput
@@ -159,6 +160,8 @@ class Rendering:
         Radiance around the render, for the faults that need it; empty if the scene has none.
     far_sources
         Light of bright bodies beside the target, for the same faults.
+    shared
+        Results of later stages that the samples of the view share.
     """
 
     scene: RenderInput
@@ -169,11 +172,7 @@ class Rendering:
     noise_fraction_p99: float = float("nan")
     surroundings: tuple[Radiance, ...] = ()
     far_sources: tuple[FarSource, ...] = ()
-
-    @cached_property
-    def metered(self) -> dict[Hashable, tuple[float, Electrons]]:
-        """Return the exposure in s and the electrons after one second, by the optics of the camera that metered."""
-        return {}
+    shared: SharedResults = field(default_factory=SharedResults)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -15,6 +15,7 @@ from typing import ParamSpec, Protocol, TypeVar
 
 from ..core.errors import VbnfaultError
 from ..core.quantities import Radiance
+from ..core.shared_results import SharedResults
 from .exposure import meter
 from .images import take_images
 from .injection import inject_faults
@@ -71,13 +72,14 @@ class SharedViews:
         if first_try in self._kept:
             return self._kept[first_try]
         pose = run(resolve, shared, first_try)
-        taken = pose, run(render_view, shared.at(pose), pose)
+        rendering = run(render_view, shared.at(pose), pose)
         if spec.plan.variants > 1:
-            taken[1].truth.frozen()
+            rendering.truth.frozen()
+            rendering = replace(rendering, shared=SharedResults(kept=True))
             for older in [key for key in self._kept if key]:  # of the later views, the last one is enough
                 del self._kept[older]
-            self._kept[first_try] = taken
-        return taken
+            self._kept[first_try] = pose, rendering
+        return pose, rendering
 
 
 def simulate_frame(spec: SampleSpec, run: StageRunner = run_stage, shared: SharedViews | None = None) -> Frame:

@@ -17,17 +17,22 @@ def add_stars(spec: SampleSpec, pose: Pose, rendering: Rendering, exposure: Scen
     """Add the stars that the exposure can show. They are added after metering, so they do not affect it."""
     if rendering.open_sky is None:
         return exposure
-    T_from_L = spec.terrain.site.T_from_L
-    T_from_J = assemble.target_attitude(spec.scene, T_from_L @ pose.sun_L)
-    J_from_C = T_from_J.T @ T_from_L @ pose.L_from_C
-    starless = exposure.light.rendered
-    stars = assemble.visible_stars(
-        spec.scene, starless, exposure.camera, J_from_C, rendering.open_sky, rendering.scene.view
-    )
-    if stars is None:
-        return exposure
-    light = SceneLight(lens=exposure.light.lens, rendered=stars.added_to(starless))
-    return replace(exposure, light=light, rate=_rate_with(stars, exposure, light.rendered))
+    camera, open_sky = exposure.camera, rendering.open_sky
+
+    def starry() -> tuple[SceneLight, Electrons]:
+        T_from_L = spec.terrain.site.T_from_L
+        T_from_J = assemble.target_attitude(spec.scene, T_from_L @ pose.sun_L)
+        J_from_C = T_from_J.T @ T_from_L @ pose.L_from_C
+        starless = exposure.light.rendered
+        stars = assemble.visible_stars(spec.scene, starless, camera, J_from_C, open_sky, rendering.scene.view)
+        if stars is None:
+            return exposure.light, exposure.rate
+        light = SceneLight(lens=exposure.light.lens, rendered=stars.added_to(starless))
+        return light, _rate_with(stars, exposure, light.rendered)
+
+    # read noise and exposure decide which stars are faint enough to be left out
+    light, rate = rendering.shared.once("stars", (camera.optics, camera.detector.read_noise_e_rms), starry)
+    return replace(exposure, light=light, rate=rate)
 
 
 def _rate_with(stars: StarRadiance, exposure: SceneExposure, starry: Radiance) -> Electrons:

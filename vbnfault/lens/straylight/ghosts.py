@@ -101,8 +101,8 @@ def boxes(
     arrivals = Arrivals.none(count)
     edges = np.full(len(made.rows), _SHARP) if width is None else width
     last = len(made.wavelength_nm) - 1
-    for ends in ((last // 2,), (0, last)):
-        box, disc, arrivals = _narrowed(made, route, ends, box, direction, edges, reach_mm if arrive else None)
+    for ends, counts in (((last // 2,), False), ((0, last), arrive)):  # only the last arrivals count
+        box, disc, arrivals = _narrowed(made, route, ends, box, direction, edges, reach_mm if counts else None)
         route = np.flatnonzero(np.isfinite(box[:, 0]))
         box, disc = box[route], disc[route]
         if not len(route):

@@ -84,6 +84,26 @@ class Straylight:
         return np.asarray(self.ghosts + self.starburst + self.glare + self.veil)
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ClearLight:
+    """Hold the straylight of a lens without scatter: its ghosts and its starburst.
+
+    Attributes
+    ----------
+    array
+        Sum of both, irradiance on the sensor over the Sun's at the entrance, float32[band, y, x].
+    ghosts_mm2, starburst_mm2
+        float64[band]: flux of each in the frame.
+    beyond_mm2
+        float64[band]: flux of the starburst outside the frame.
+    """
+
+    array: F32
+    ghosts_mm2: F64
+    starburst_mm2: F64
+    beyond_mm2: F64
+
+
 def _lit_fraction(lens: Prescription, baffle: Baffle, sun_deg: float) -> float:
     """Return the fraction of the lens's entrance that the Sun lights through a baffle."""
     if baffle.length_mm <= 0:
@@ -200,26 +220,42 @@ class SunlightInLens:
             beyond_mm2=beyond,
         )
 
-    def combined(self) -> tuple[F32, F64]:
+    def combined(self, clear: ClearLight | None = None) -> tuple[F32, F64]:
         """Return the sum of all straylight, float32[band, y, x], and `Straylight.direct_fraction`.
 
         The values are those of `total`, but the parts are not kept: each takes 34 MB for 1024 pixels and 8 bands.
+        `clear` is the result of `clear_light`, if it is known; its array is used up unless it is read-only.
         """
         pitch_mm = self.sensor.pitch_mm
-        frame_bytes = 4 * len(self.nodes_nm) * self.sensor.shape[0] * self.sensor.shape[1]
-        release_unused(9 * frame_bytes)  # the sums of all levels take 90 MB, the cells 200 MB
-        combined = self._ghosts()
-        release_unused()
-        ghosts_mm2 = _flux_mm2(combined, pitch_mm)
-        fluxes, outside = [], []
-        for part in (self.starburst, self.glare, self.veil):
+        clear = self.clear_light() if clear is None else clear
+        combined = clear.array if clear.array.flags.writeable else clear.array.copy()
+        fluxes, outside = [clear.starburst_mm2], [clear.beyond_mm2]
+        for part in (self.glare, self.veil):
             layer, beyond = part()
             fluxes.append(_flux_mm2(layer, pitch_mm))
             outside.append(beyond)
             combined += layer
             del layer  # before the next one is made
         taken = np.sum(fluxes, axis=0) + np.sum(outside, axis=0)
-        return combined, self.direct_fraction(ghosts_mm2, taken)
+        return combined, self.direct_fraction(clear.ghosts_mm2, taken)
+
+    @property
+    def clear_key(self) -> tuple[Any, ...]:
+        """Return all that `clear_light` depends on."""
+        passed = tuple(self.passed.tolist()), self.past_baffle, self.lit, self.beam_fraction, self.pupil_mm2
+        return *self.ghost_key, self._sun_xy_mm, *passed
+
+    def clear_light(self) -> ClearLight:
+        """Return ghosts and starburst, which roughness, dust and veil do not change."""
+        frame_bytes = 4 * len(self.nodes_nm) * self.sensor.shape[0] * self.sensor.shape[1]
+        release_unused(9 * frame_bytes)  # the sums of all levels take 90 MB, the cells 200 MB
+        array = self._ghosts()
+        release_unused()
+        ghosts_mm2 = _flux_mm2(array, self.sensor.pitch_mm)
+        layer, beyond = self.starburst()
+        starburst_mm2 = _flux_mm2(layer, self.sensor.pitch_mm)
+        array += layer
+        return ClearLight(array=array, ghosts_mm2=ghosts_mm2, starburst_mm2=starburst_mm2, beyond_mm2=beyond)
 
     @property
     def lit(self) -> float:
