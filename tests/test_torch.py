@@ -17,11 +17,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from s3_server import BUCKET, S3Server, in_environment
 from synthetic import FAULTS, fake_sample, flip
 
 import vbnfault
 from vbnfault import store as st
 from vbnfault.core.errors import InputError, VbnfaultError
+from vbnfault.dataset.merge import join_stores
 
 torch = pytest.importorskip("torch", reason="PyTorch is not installed: pip install '.[torch]'")
 
@@ -42,11 +44,11 @@ def _few_cores() -> Iterator[None]:
         yield
 
 
-def data(path: Path, **changes: Any) -> SampleDataset:
+def data(path: Path | str, **changes: Any) -> SampleDataset:
     return SampleDataset(path, targets=TARGETS, **changes)
 
 
-def batches(path: Path, **changes: Any) -> BatchDataset:
+def batches(path: Path | str, **changes: Any) -> BatchDataset:
     return BatchDataset(data(path), **{"batch_size": 2, "seed": 3, "buffer": 4, **changes})
 
 
@@ -109,6 +111,21 @@ def test_every_number_of_workers_gives_the_same_batches(finished_store: Path, wo
         assert rows(loader) == given
         assert [samples for samples, _, _ in given] == expected(finished_store, epoch)
         assert loader.epoch == alone.epoch == epoch + 1
+
+
+def test_stores_in_a_bucket_give_the_same_batches(finished_store: Path, s3_server: S3Server) -> None:
+    """With threads and with spawned workers; forked ones, which would wait for ever, are refused in a sentence."""
+    with in_environment(s3_server):
+        url = f"s3://{BUCKET}/trained.zarr"
+        join_stores([finished_store], url, progress=False)
+        for workers in (0, 1):
+            loader = Loader(batches(url), num_workers=workers)
+            assert rows(loader) == rows(Loader(batches(finished_store)))
+        with pytest.raises(InputError, match="'fork': forked workers cannot read an object store"):
+            Loader(batches(url), num_workers=1, multiprocessing_context="fork")
+        plain = DataLoader(batches(url), batch_size=None, num_workers=1, multiprocessing_context="fork")
+        with pytest.raises(InputError, match="a forked process cannot read an object store"):
+            next(iter(plain))
 
 
 def test_plain_loaders_give_the_same_batches(finished_store: Path) -> None:

@@ -41,6 +41,20 @@ RETRIES: Any = {
 }
 
 
+_served: list[int] = []  # the process in which obstore has started the threads that serve its requests
+
+
+def _expect_threads(url: Url) -> None:
+    """Raise InputError in a forked process: it has no such threads, and a request would wait for ever."""
+    if not _served:
+        _served.append(os.getpid())
+    if _served[0] != os.getpid():
+        raise InputError(
+            f"{url}: a forked process cannot read an object store that its parent has read; start worker processes "
+            "with multiprocessing_context='spawn'"
+        )
+
+
 @dataclass(frozen=True)
 class Url:
     """Hold the URL of a store in an object store; it has those methods of a path that messages need."""
@@ -100,6 +114,7 @@ class Bucket:
         """
         from obstore.exceptions import BaseError, PermissionDeniedError, UnauthenticatedError
 
+        _expect_threads(self.path)
         where = f"{self.path}/{name}"
         try:
             yield

@@ -9,7 +9,7 @@ import hashlib
 import os
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import numpy as np
 import torch
@@ -29,6 +29,22 @@ Transform = Callable[[Batch], Batch]
 MOST_THREADS = 8
 
 
+class _OptionsOfOneRank(TypedDict, total=False):
+    """Name the options of an order but the ranks; what is not given has the default of `Order`."""
+
+    batch_size: int
+    seed: int
+    shuffle: bool
+    buffer: int
+    drop_last: bool | None
+
+
+class OrderOptions(_OptionsOfOneRank, total=False):
+    """Name the options of an order, which `BatchDataset` describes."""
+
+    ranks: tuple[int, int] | None
+
+
 class SampleDataset(Dataset[Batch]):
     """Read samples of a store as dictionaries of tensors, in any order: a map-style dataset.
 
@@ -38,7 +54,7 @@ class SampleDataset(Dataset[Batch]):
     Parameters
     ----------
     store
-        Path of a store.
+        Path or URL of a store.
     split
         `train`, `val` or `test`; None: all samples.
     targets
@@ -192,7 +208,7 @@ class ShardSampler(Sampler[list[int]]):
     The parameters are those of `BatchDataset`. Call `set_epoch` before each epoch.
     """
 
-    def __init__(self, data: SampleDataset, **order: Any) -> None:
+    def __init__(self, data: SampleDataset, **order: Unpack[OrderOptions]) -> None:
         self.data = data
         self.order = _order(data, **order)
         self.epoch = self._start = 0
@@ -236,14 +252,14 @@ class BatchDataset(IterableDataset[Batch]):
     data
         The samples, their targets and their transform.
     batch_size
-        Samples a batch. The last one of an epoch may be smaller, see `drop_last`.
+        Samples a batch, 8 by default. The last one of an epoch may be smaller, see `drop_last`.
     seed
-        The order depends on seed and epoch alone.
+        The order depends on seed, 0 by default, and epoch alone.
     shuffle
         False: in the order of the store.
     buffer
-        Size of the shuffle buffer in samples: how far apart samples are that are read together. A loader holds
-        their compressed layers, at most 256 MiB in each worker.
+        Size of the shuffle buffer in samples, 256 by default: how far apart samples are that are read together. A
+        loader holds their compressed layers, at most 256 MiB in each worker.
     drop_last
         Leave out the last, smaller batch. By default only if there are several ranks, and then all of them get the
         same number of batches.
@@ -252,19 +268,9 @@ class BatchDataset(IterableDataset[Batch]):
         All ranks together read the batches that one rank would read, in turns.
     """
 
-    def __init__(
-        self,
-        data: SampleDataset,
-        *,
-        batch_size: int = 8,
-        seed: int = 0,
-        shuffle: bool = True,
-        buffer: int = 256,
-        drop_last: bool | None = None,
-        ranks: tuple[int, int] | None = None,
-    ) -> None:
+    def __init__(self, data: SampleDataset, **order: Unpack[OrderOptions]) -> None:
         self.data = data
-        self.order = _order(data, batch_size, seed, shuffle, buffer, drop_last, ranks)
+        self.order = _order(data, **order)
         self.slots: Slots | None = None  # where a `Loader` wants the batches of workers
         self._position = _shared_numbers(2)  # epoch and first batch; workers that live on see a change
 
@@ -320,13 +326,7 @@ class BatchDataset(IterableDataset[Batch]):
 
 
 def _order(
-    data: SampleDataset,
-    batch_size: int = 8,
-    seed: int = 0,
-    shuffle: bool = True,
-    buffer: int = 256,
-    drop_last: bool | None = None,
-    ranks: tuple[int, int] | None = None,
+    data: SampleDataset, *, ranks: tuple[int, int] | None = None, **order: Unpack[_OptionsOfOneRank]
 ) -> Order:
     """Return the order of a dataset's samples; the parameters are those of `BatchDataset`."""
     if ranks is None:
@@ -336,13 +336,9 @@ def _order(
     return Order(
         samples=data.samples,
         shard_samples=data.targets.spec.shard_samples,
-        batch_size=batch_size,
-        seed=seed,
-        shuffle=shuffle,
-        buffer=buffer,
-        drop_last=drop_last,
         rank=ranks[0],
         ranks=ranks[1],
+        **order,
     )
 
 

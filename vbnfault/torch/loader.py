@@ -8,6 +8,7 @@ import threading
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from multiprocessing.process import BaseProcess
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -43,8 +44,9 @@ class Loader:
     pin_memory
         Whether to copy the batches into pinned memory, for a GPU.
     options
-        Any other option of `torch.utils.data.DataLoader`, such as `prefetch_factor`, `multiprocessing_context`,
-        `worker_init_fn` or `persistent_workers` (True here, unlike there).
+        Any other option of `torch.utils.data.DataLoader`, such as `prefetch_factor`, `multiprocessing_context`
+        ("spawn" by default for a store in an object store), `worker_init_fn` or `persistent_workers` (True here,
+        unlike there).
 
     Attributes
     ----------
@@ -60,6 +62,13 @@ class Loader:
                 raise InputError(f"{name}: a Loader takes it from its BatchDataset; give it there")
         if type(num_workers) is not int or num_workers < 0:
             raise InputError(f"num_workers = {shown(num_workers)}: must be a whole number of at least 0")
+        if num_workers and not isinstance(batches.data.path, Path):  # threads of obstore do not survive a fork
+            start = options.setdefault("multiprocessing_context", "spawn")
+            if "fork" in (start, getattr(start, "_name", None)):
+                raise InputError(
+                    "multiprocessing_context = 'fork': forked workers cannot read an object store; must be 'spawn' "
+                    f"or 'forkserver' for {batches.data.path}"
+                )
         self.batches = batches
         self.epoch = 0
         self._next = 0  # batch of this epoch that the loop gets next
