@@ -218,6 +218,7 @@ def test_boxes_show_the_quantiles_on_a_logarithmic_axis() -> None:
 
 def test_numbers_and_ticks_are_short() -> None:
     assert [number(v) for v in (0, -1.5, 1e-6, 2.5e8)] == ["0", "−1.5", "10⁻⁶", "2.5·10⁸"]
+    assert [number(v) for v in (999.6, 1000, -1024, 99_990, 1e5)] == ["1000", "1000", "−1020", "10⁵", "10⁵"]
     assert ticks(0, 360) == [0, 100, 200, 300]
     assert ticks(3, 3) == [3]
 

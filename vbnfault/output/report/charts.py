@@ -35,6 +35,8 @@ def number(value: float) -> str:
     if value == 0:
         return "0"
     text = f"{value:.3g}"
+    if 1000 <= abs(float(text)) < 100_000:
+        text = f"{float(text):.0f}"  # beside ticks such as 500, 1000 is easier to read than a power of ten
     if "e" in text:
         mantissa, _, power = text.partition("e")
         raised = str(int(power)).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))

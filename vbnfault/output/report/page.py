@@ -294,8 +294,10 @@ def _parameters(
             groups = [(n, one.values[one.split == k]) for k, n in enumerate(scalars.split_names)]
             groups = [(name, values[np.isfinite(values)]) for name, values in groups]
             pair = key_bounds(bounds, one)
-            if all((values == one.values[0]).all() for _, values in groups) and pair is None:
-                continue  # a constant that no bounds describe
+            if all((values == one.values[0]).all() for _, values in groups) and (
+                pair is None or pair[0] == pair[1]
+            ):
+                continue  # a constant
             histograms.append(_histogram(one.name, groups, pair))
         if histograms:
             short = "".join(histogram.markup() for histogram in histograms)
