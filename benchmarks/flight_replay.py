@@ -7,17 +7,20 @@
 FOLDER holds `poses.csv` (the columns of `[trajectory]`) and for each row an 8-bit image NAME.png. The camera is
 that of the scene, by default `navcam67p` with its detector; of faults it has `SPOTS` alone. It renders `BINNING`
 times the size of the frames, which are half native size, and the raw image is developed as they were
-(`developed`): the square root of the digital numbers over the bias in 8 bits, then halved. The labels
+(`developed`): the square root of the digital numbers over the bias, halved, in 8 bits. The labels
 of flight images are some pixels off, so every image is aligned first, by a shift of whole native pixels, which
 leaves its noise as it is.
 
 The stretch of the frames is not documented. That it is the square root of the 12 bits shows in their noise: it
 falls from 0.92 at a sky of 2.5 to 0.52 at 14, by the same curve in all frames. Of 255 (DN/4095)^g the exponent 0.5
 fits it best, and the sunlit body, compared with the rendered one percentile by percentile, asks for 0.52 to 0.58.
-Where a frame is overexposed, it reaches 255. The exposure is metered so that the rendered body is as bright as the
-frame's. Brightness is compared as (image - background) / (bright - background): `background` is the median of the
-sky, `bright` the 99th percentile of the body, all after the stretch. Printed are, over all frames, the median and
-the worst 5 % of:
+Where a frame is overexposed, it reaches 255. The frames were halved before they were rounded to 8 bits: the
+variance of their sky falls evenly, from 0.69 at 4.5 to 0.31 at 11, where rounding first would give a trough at 6.5
+and a peak at 9.5. Three frames in a row have 1.9 times the noise of the others at the same brightness: the camera
+has two gains, and a frame is rendered with the one that its noise asks for. The exposure is metered so that the
+rendered body is as bright as the frame's. Brightness is compared as (image - background) / (bright - background):
+`background` is the median of the sky, `bright` the 99th percentile of the body, all after the stretch. Printed are,
+over all frames, the median and the worst 5 % of:
 
 - `iou`: lit silhouettes, intersection over union. Lit is a brightness above 0.12.
 - `limb_px`: median distance between the bright limbs, both ways.
@@ -31,10 +34,11 @@ the worst 5 % of:
 
 Of the spots in the sky of a real frame, 10 in the median, 2 of them of 2 px or more, stay where they are over at
 least three frames: warm pixels. The others, 20 and 14 of 2 px or more, lie where hardly another frame has one.
-Their number, sizes and brightness are those of tracks of protons in the exposure and the readout of 4.2 s, some of
-which are long; at the 4.65 e/DN of the sensor they fit fast protons, which leave the least charge; the catalogue of
-stars has nine brighter than magnitude 7 in such a field, of which about four show. `SPOTS` gives the rendered
-frames the same tracks, and the grains of the coma at 3.6 au. Stars and warm pixels come from scene and sensor.
+Their number and sizes are those of tracks of protons in the exposure and the readout of 4.2 s, some of which are
+long. Their charge spreads over three decades: at the 4.65 e/DN of the sensor a quarter fits protons that cross the
+layer, the others are fainter, as of electrons from the housing that end there. The catalogue of stars has nine
+brighter than magnitude 7 in such a field, of which about four show. `SPOTS` gives the rendered frames the same
+tracks, and the grains of the coma at 3.6 au. Stars and warm pixels come from scene and sensor.
 
 A shape file is sharpened as far as its own roughness asks for (`body.sharpen`). The random relief below its facets
 has the amplitude `RELIEF`: 1 agrees best with the texture of the frames but lowers `rank`, since it is not that
@@ -73,7 +77,8 @@ from scipy import ndimage, stats
 
 import vbnfault
 from vbnfault.cli import options
-from vbnfault.core import user_files
+from vbnfault.core import resources, user_files
+from vbnfault.detector.sensor import load_sensor
 from vbnfault.scene.trajectory import Trajectory, load_trajectory
 
 F32 = NDArray[np.float32]
@@ -95,17 +100,21 @@ BINNING = 2  # the frames have half the native size
 # Weights of native pixels in each axis of the halving: noise of neighbours in the frames correlates by 0.07
 _HALVING = (0.035, 0.465, 0.465, 0.035)
 _STRETCH = 255 / 4095**0.5  # of a root of DN
-_BLACK_DN = -0.5  # over the bias of the sensor, shown as 0: the mean background of 31 frames is 0.35 over it
+# Variance of the sky by its level s, both after stretch and halving: of the rounding, of photons, and dark / s²
+_SKY_VARIANCE = (0.08, 0.16, 8.0)
+_NOISY = 1.45  # times this variance: 28 frames have 0.88 to 1.17, three in a row 1.7 to 2.0
+HIGH_GAIN = 1.4  # over the low one: what noise of 1.9 times the variance asks for; 1.7 in visnav
 AFRHO_CM = 50.0  # chosen beside halo and wings of the point spread for the sky of 31 frames
-# What leaves spots and tracks in the sky. Protons: flux, depth and diffusion fitted to the spots of 11 frames,
-# least energy assumed (spacecraft and solar wind keep out slower ones); in quiet time CREME96 has 4.67 at the
+# What leaves spots and tracks in the sky. Protons: flux, energies, depth and `ending_fraction` fitted to the peaks,
+# sums and sizes of the spots of 28 frames, diffusion to those of 11; in quiet time CREME96 has 4.67 at the
 # Sun-Earth point L2. Grains: the density at 100 km in August 2014, see `vbnfault.faults.particles`.
 SPOTS: dict[str, dict[str, Any]] = {
     "cosmic_rays": {
         "model": "tracks",
-        "flux_per_cm2_s": 7.0,
-        "energy_MeV": [300.0, 5000.0],
-        "thickness_um": 15.0,
+        "flux_per_cm2_s": 17.0,
+        "energy_MeV": [60.0, 5000.0],
+        "ending_fraction": 0.9,
+        "thickness_um": 9.0,
         "diffusion_um": 4.0,
     },
     "particles": {"model": "coma_grains", "density_per_m3": 6e-4},
@@ -197,8 +206,8 @@ def shifted(image: NDArray[Any], shift_xy: tuple[int, int]) -> NDArray[Any]:
 
 def developed(raw_dn: NDArray[Any], bias_dn: float) -> NDArray[np.uint8]:
     """Return a raw image as the frames show it: stretched by a root in 8 bits, then halved, uint8[y, x]."""
-    over_black = np.clip(np.asarray(raw_dn, dtype=np.float32) - np.float32(bias_dn + _BLACK_DN), 0, None)
-    shown = np.minimum(np.round(_STRETCH * np.sqrt(over_black)), 255)
+    over_black = np.clip(np.asarray(raw_dn, dtype=np.float32) - np.float32(bias_dn), 0, None)
+    shown = np.minimum(np.float32(_STRETCH) * np.sqrt(over_black), 255)
     for axis in (0, 1):
         size = shown.shape[axis]
         shown = np.pad(shown, [(1, 1) if k == axis else (0, 0) for k in (0, 1)], mode="symmetric")
@@ -344,17 +353,48 @@ def replay_scene(name: str, size_px: tuple[int, int], overrides: Mapping[str, An
     return scene.model_copy(update={"faults": dict(SPOTS), "plan": plan, "dataset": dataset})
 
 
-def exposed_as(scene: vbnfault.Scene, real: Look) -> vbnfault.Scene:
-    """Return a scene whose exposure is metered so that the body is as bright as in a real frame."""
+def noise_excess(real: Look) -> float:
+    """Return the noise variance of a real frame's sky over what `_SKY_VARIANCE` expects; NaN without sky."""
+    calm = real.sky & (np.abs(real.image - ndimage.median_filter(real.image, 9)) < 4)
+    calm[1:] &= calm[:-1]  # along columns, whose pattern and smear are no noise
+    calm[0] = False
+    if real.clipped or calm.sum() < 1000:
+        return float("nan")
+    variance = np.diff(real.image, axis=0, prepend=0)[calm].var() / 2
+    rounding, photons, dark = _SKY_VARIANCE
+    return float((variance - rounding) / (photons + dark / real.image[calm].mean() ** 2))
+
+
+def write_high_gain(detector: str, folder: Path) -> Path:
+    """Write the sensor file `detector` with a gain `HIGH_GAIN` times as high, and return its path."""
+    path = resources.find("scenes/detectors", detector)
+    gain = load_sensor(path).readout.system_gain_dn_per_e * HIGH_GAIN
+    text = path.read_text(encoding="utf-8").replace("[readout]\n", f"[readout]\ngain_dn_per_e = {gain:.6g}\n")
+    text = text.replace("[sources]\n", '[sources]\n"readout.gain_dn_per_e" = "benchmarks/flight_replay.py"\n')
+    folder.mkdir(parents=True, exist_ok=True)
+    high = folder / f"{path.stem}_high_gain.toml"
+    high.write_text(text, encoding="utf-8")
+    return high
+
+
+def exposed_as(scene: vbnfault.Scene, real: Look, detectors: Sequence[str]) -> vbnfault.Scene:
+    """Return a scene whose exposure is metered so that the body is as bright as in a real frame.
+
+    Its sensor is the first of `detectors`, or the second, of a higher gain, where the frame's noise asks for it.
+    """
     level = min((real.bright / 255) ** 2, 1.0)
-    return scene.model_copy(update={"camera": scene.camera.model_copy(update={"metering_level": level})})
+    detector = detectors[noise_excess(real) > _NOISY]
+    camera = scene.camera.model_copy(update={"metering_level": level, "detector": detector})
+    return scene.model_copy(update={"camera": camera})
 
 
-def replay(session: vbnfault.Session, trajectory: Trajectory, row: int, frame: NDArray[np.uint8]) -> Pair:
-    """Render a row, align it with its real frame, and compare the two."""
+def replay(
+    session: vbnfault.Session, trajectory: Trajectory, row: int, frame: NDArray[np.uint8], detectors: Sequence[str]
+) -> Pair:
+    """Render a row with one of the sensor files, align it with its real frame, and compare the two."""
     start = time.perf_counter()
     real = look(frame)
-    session.scene = exposed_as(session.scene, real)
+    session.scene = exposed_as(session.scene, real, detectors)
     raw_dn = session.simulate(row).layers["raw"]
     seconds = time.perf_counter() - start
     bias_dn = float(session.base_camera.detector.description["bias_dn"])
@@ -461,9 +501,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         overrides = {"coma": {**HAZE, "afrho_cm": given.afrho_cm}, **overrides}
     scene = replay_scene(given.scene, (width, height), overrides)
     session = vbnfault.Session(scene, threads=given.threads, poses=trajectory)
+    detectors = [scene.camera.detector, str(write_high_gain(scene.camera.detector, given.out).resolve())]
     pairs = []
     for row in rows:
-        pair = replay(session, trajectory, row, frames[row])
+        pair = replay(session, trajectory, row, frames[row], detectors)
         f = pair.figures
         print(
             f"{pair.name}: IoU {f['iou']:.4f}, rank {f['rank']:.3f}, limb {f['limb_px']:.2f} px, shift "

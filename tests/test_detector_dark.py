@@ -437,6 +437,15 @@ def test_rows_columns_and_slow_parts_of_the_gain() -> None:
     assert offsets[:, 0].std() == pytest.approx(2.0, rel=4 / math.sqrt(600))
 
 
+def test_offsets_with_heavy_tails_follow_students_t() -> None:
+    spec = IndividualSpec(dsnu_e=2.0, dsnu_freedom=3.0)
+    offsets = sensor(spec, shape=(200, 200)).dsnu_e.astype(np.float64).ravel()
+    # t of ν degrees of freedom has the deviation √(ν / (ν - 2)): scaled, it keeps that of the spec
+    assert stats.kstest(offsets / 2.0 * math.sqrt(3.0), stats.t(3).cdf).pvalue > 1e-3
+    with pytest.raises(InputError, match="dsnu_freedom"):
+        IndividualSpec(dsnu_freedom=2.0)
+
+
 def test_same_seed_same_device_other_seed_another() -> None:
     a, b, c = sensor(BUSY, 3), sensor(BUSY, 3), sensor(BUSY, 4)
     for name in ("gain", "dsnu_e", "dark_e_s", "damage_e_s"):

@@ -247,7 +247,7 @@ def test_figures_are_small() -> None:
 _DIMENSIONLESS = """
     adc_bits antiblooming apron asymmetry axis bands bits blade_rounding blades boulder_index bounces
     camera_axes classes_per_sample coefficients coherent_amplitude coherent_width conic dark_nonuniformity
-    dead_share default_material distance_exponent dust_contrast eccentricity exposure_stops f_number
+    dead_share default_material distance_exponent dsnu_freedom dust_contrast eccentricity exposure_stops f_number
     faulty_fraction fill_power grain_albedo halo_index hot_clustered_share hot_offset_share hurst individuals
     internal_transmittance_10mm iso iso_power joints k leak limb log10_scale max_samples_per_pixel max_triangles
     max_tries max_views metering_level min_lit_fraction missing_codes n nadir nd neutral node_gains

@@ -86,6 +86,25 @@ def test_slower_protons_leave_more_charge() -> None:
     assert np.mean(electrons / length / expected) == pytest.approx(1, abs=4 * 0.136 / np.sqrt(len(tracks)))
 
 
+def test_tracks_that_end_leave_a_part_of_their_charge_and_length() -> None:
+    c = context(size=256)
+    bounds = {"flux_per_cm2_s": 3e6, "energy_MeV": [50, 1000]}
+    whole, some = (
+        make("cosmic_rays", **bounds, ending_fraction=part).draw(c, rng(3))["tracks"] for part in (0, 0.6)
+    )
+    assert len(whole) == len(some) > 1000
+    parts = np.array(
+        [[b[key] / a[key] for key in ("electrons", "length_um")] for a, b in zip(whole, some, strict=True)]
+    )
+    # lengths are rounded to 0.001 µm; those of the whole tracks are at least a micrometre but at the edge
+    long = np.array([track["length_um"] for track in whole]) > 1
+    np.testing.assert_allclose(parts[long, 0], parts[long, 1], atol=1e-3)
+    ended = parts[:, 0] < 1 - 1e-3
+    # u³ is above 1 - 1e-3 in 0.03 % of them; four standard deviations
+    assert ended.mean() == pytest.approx(0.6, abs=4 * np.sqrt(0.24 / len(parts)) + 0.001)
+    assert stats.kstest(parts[ended, 0], lambda part: np.cbrt(part)).pvalue > 1e-3
+
+
 def test_poisson_above_0() -> None:
     generator = rng(4)
     for mean in (1e-12, 0.3, 2.0, 1e5):

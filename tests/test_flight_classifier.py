@@ -34,7 +34,7 @@ def pairs(*, blur_px: float) -> list[tuple[str, np.ndarray, np.ndarray]]:
 
 def examined(place: str, *, blur_px: float) -> dict[str, tuple[float, float, float]]:
     patches = flight_classifier.patches_of(pairs(blur_px=blur_px), place, SIZE, 8, 1)
-    return flight_classifier.examine(patches, 2, 1)[0]
+    return flight_classifier.examine(patches, place, 2, 1)[0]
 
 
 def test_patches_lie_where_their_place_says() -> None:
@@ -57,6 +57,15 @@ def test_equal_noise_is_not_told_apart_and_blurred_noise_is() -> None:
     assert same["blurred"][0] > 0.95
     assert blurred["all features"][0] > 0.95
     assert blurred["noise"][0] > 0.9
+    assert {"without noise", "without tracks"} <= set(same)
+
+
+def test_tracks_and_dark_pixels_are_taken_out_and_noise_is_not() -> None:
+    patch = np.full((1, SIZE, SIZE), 8, dtype=np.uint8)
+    patch[0, 3, 3:6] = 8 + flight_classifier._SPOT  # noise at most
+    expected = patch.copy()
+    patch[0, 8, 2:7], patch[0, 12, 12] = 40, 2
+    np.testing.assert_array_equal(flight_classifier.without_spots(patch), expected)
 
 
 def test_frames_never_train_and_test_at_once() -> None:

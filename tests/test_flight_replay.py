@@ -10,6 +10,7 @@ import pytest
 from scipy import ndimage
 
 import vbnfault
+from vbnfault.detector.sensor import load_sensor
 from vbnfault.scene.trajectory import load_trajectory
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
@@ -62,10 +63,13 @@ def test_an_image_moves_by_whole_pixels_and_continues_as_its_mirror_image() -> N
 def test_raw_images_are_stretched_by_a_root_and_halved() -> None:
     raw = np.full((12, 12), 4200, dtype=np.uint16)  # above the top code over black
     raw[6:] = 104
-    # over a black of 99.5 DN: 255 and 3.985 √4.5 = 8 in 8 bits; next to the edge a neighbour weighs 0.035
-    column = [255, 255, round(0.965 * 255 + 0.035 * 8), round(0.965 * 8 + 0.035 * 255), 8, 8]
+    # over the bias: 255 and 3.985 √4 = 7.97, not yet in whole numbers; next to the edge a neighbour weighs 0.035
+    column = [255, 255, round(0.965 * 255 + 0.035 * 7.97), round(0.965 * 7.97 + 0.035 * 255), 8, 8]
     assert flight_replay.developed(raw, 100.0).tolist() == [[value] * 6 for value in column]
     assert flight_replay.developed(raw.T, 100.0).T.tolist() == [[value] * 6 for value in column]
+    # 3.985 √2 = 5.64 and 3.985 √3 = 6.90 have the mean 6.27; rounded first, 6 and 7 would give 7
+    raw[0::2], raw[1::2] = 102, 103
+    assert flight_replay.developed(raw, 100.0)[2:-2].tolist() == [[6] * 6] * 2
 
 
 def test_a_larger_body_has_a_smaller_overlap_and_a_limb_farther_out() -> None:
@@ -91,6 +95,24 @@ def test_the_sky_tells_background_glow_columns_and_tracks() -> None:
     assert figures["column"] * scale == pytest.approx(0.8, rel=0.35)
     assert figures["noise"] * scale == pytest.approx(1.0, rel=0.25)
     assert figures["tracks"] == 2
+
+
+def test_a_noisy_frame_is_rendered_with_the_higher_gain(tmp_path: Path) -> None:
+    scene = vbnfault.load_scene("navcam67p")
+    high = flight_replay.write_high_gain(scene.camera.detector, tmp_path)
+    gains = [load_sensor(name).readout.system_gain_dn_per_e for name in (scene.camera.detector, high)]
+    assert gains[1] / gains[0] == pytest.approx(flight_replay.HIGH_GAIN, rel=1e-5)
+    rounding, photons, dark = flight_replay._SKY_VARIANCE
+    body = disc(80, 80)
+    for excess in (1.0, 2.0):
+        noise = np.random.default_rng(3).normal(size=body.shape)
+        sky = 8 + np.sqrt(rounding + excess * (photons + dark / 8**2)) * noise
+        sky += np.arange(len(sky)) % 3 - 1  # a pattern of columns is no noise
+        real = flight_replay.look(np.where(body > 40, body, sky))
+        # of 19,000 differences, each with two neighbours, the variance has a deviation of 1.3 %; the excess, 1.6 %
+        assert flight_replay.noise_excess(real) == pytest.approx(excess, rel=4 * 0.016)
+        chosen = flight_replay.exposed_as(scene, real, ("low", "high")).camera.detector
+        assert chosen == ("low" if excess == 1 else "high")
 
 
 def test_centre_and_limb_of_the_body_lie_where_the_table_says(frames: Path, real_shape: Path) -> None:
@@ -122,9 +144,10 @@ def test_a_replay_of_real_frames_agrees(frames: Path, real_shape: Path) -> None:
     values = {"body.shape": str(real_shape), "patch.max_triangles": 100_000}
     scene = flight_replay.replay_scene("navcam67p", (128, 128), values)
     session = vbnfault.Session(scene, poses=table)
+    detectors = [scene.camera.detector] * 2
     for row in (12, 20):
         frame = flight_replay.reduced(flight_replay.read_frame(frames, table.name[row]), 128)
-        figures = flight_replay.replay(session, table, row, frame).figures
+        figures = flight_replay.replay(session, table, row, frame, detectors).figures
         assert figures["iou"] > 0.87
         assert figures["rank"] > 0.65
         assert figures["limb_px"] < 2

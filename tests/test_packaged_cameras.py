@@ -92,15 +92,17 @@ def test_every_lens_and_detector_makes_a_store(number: int, tmp_path: Path) -> N
 @pytest.mark.parametrize("name", DETECTORS)
 def test_noise_hides_the_steps_of_the_converter(name: str) -> None:
     """The mean of many pixels follows levels between two codes."""
-    spec = load_sensor(name).readout
+    sensor = load_sensor(name)
+    spec = sensor.readout
     sigma = spec.noise_e_rms * spec.system_gain_dn_per_e
-    assert sigma >= 0.5
+    # the offsets of pixels hide the steps as well: those of rosetta_navcam exceed its read noise
+    assert math.hypot(sigma, sensor.individual.dsnu_e * spec.system_gain_dn_per_e) >= 0.5
     shape = (256, 512)
     noise = ReadoutNoise.draw(shape, np.random.default_rng([7, 1]), np.random.default_rng([7, 2]))
     noise = ReadoutNoise(read=noise.read, row=np.zeros_like(noise.row))
     # a Gaussian of σ steps before a rounding leaves exp(-2 π² σ²) / π of a sine over the step in the mean
-    # (Widrow & Kollár 2008, Quantization Noise, 4.3), 0.2 % of a step at σ = 0.5; and five standard errors of the
-    # mean, of noise and of the rounding's own 1/12
+    # (Widrow & Kollár 2008, Quantization Noise, 4.3), 0.2 % of a step at σ = 0.5, 3 % at 0.35; and five
+    # standard errors of the mean, of noise and of the rounding's own 1/12
     chance = math.sqrt((sigma**2 + 1 / 12) / math.prod(shape))
     allowed = math.exp(-2 * math.pi**2 * sigma**2) / math.pi + 5 * chance
     for part in np.linspace(0, 1, 11):

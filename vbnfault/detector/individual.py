@@ -62,6 +62,13 @@ class IndividualSpec:
     prnu_column: float = Field(default=0.0, ge=0, le=0.5, description="of the gain of columns")
     prnu_low: float = Field(default=0.0, ge=0, le=0.5, description="of the slow variation of the gain")
     dsnu_e: float = Field(default=2.0, ge=0, le=1e5, description="standard deviation of the offset, per pixel*")
+    dsnu_freedom: float | None = Field(
+        default=None,
+        ge=2.1,
+        le=1000,
+        description="degrees of freedom of Student's t, whose heavy tails the pixels' offsets then have; default: "
+        "they are normal",
+    )
     dsnu_row_e: float = Field(default=0.0, ge=0, le=1e5, description="of the offset of rows")
     dsnu_column_e: float = Field(default=0.0, ge=0, le=1e5, description="of the offset of columns")
     dark_current_e_s: float = Field(
@@ -287,7 +294,9 @@ def make_individual(
         seed=seed,
         pixel_pitch_um=pixel_pitch_um,
         gain=gain,
-        dsnu_e=_pattern(seed, "dsnu", shape, spec.dsnu_e, spec.dsnu_row_e, spec.dsnu_column_e),
+        dsnu_e=_pattern(
+            seed, "dsnu", shape, spec.dsnu_e, spec.dsnu_row_e, spec.dsnu_column_e, freedom=spec.dsnu_freedom
+        ),
         dark_e_s=dark,
         **_defects(spec, shape, pixel_pitch_um, seed),
     )
@@ -380,12 +389,27 @@ def stream(seed: int, name: str) -> np.random.Generator:
 
 
 def _pattern(
-    seed: int, name: str, shape: tuple[int, int], pixel: float, row: float = 0.0, column: float = 0.0
+    seed: int,
+    name: str,
+    shape: tuple[int, int],
+    pixel: float,
+    row: float = 0.0,
+    column: float = 0.0,
+    *,
+    freedom: float | None = None,
 ) -> F32:
-    """Draw normal variates of mean 0 per pixel, plus others that are constant along a row or a column."""
+    """Draw normal variates of mean 0 per pixel, plus others that are constant along a row or a column.
+
+    With `freedom`, above 2, those of the pixels follow Student's t with so many degrees of freedom instead. `pixel`
+    stays their standard deviation.
+    """
     if pixel > 0:
         out = stream(seed, name).standard_normal(shape, dtype=np.float32)
         out *= np.float32(pixel)
+        if freedom is not None:
+            # t = normal / √(χ² / ν), of variance ν / (ν - 2); χ² is twice a gamma variate of shape ν/2
+            half_chi2 = stream(seed, f"{name} tails").standard_gamma(freedom / 2, shape, dtype=np.float32)
+            out *= np.sqrt(np.float32(freedom / 2 - 1) / half_chi2)
     else:
         out = np.zeros(shape, dtype=np.float32)
     if row > 0:
