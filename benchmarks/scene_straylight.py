@@ -3,8 +3,9 @@
     python benchmarks/scene_straylight.py [--size 1024] [--figure FIGURE.png] [--every-pixel SIZE]
 
 A half-lit 67P stands left of the middle, behind `nikkor_28_f2p8_camera` without coatings. The command prints how
-long a render and the straylight of the scene take, the median of three rounds each, and how long the first image of
-a lens takes, for which its response is traced, and the first of another process, which reads it from disk.
+long a render and the straylight of the scene take, the median of three rounds each, also by CPU time and with
+`scene_diffraction`, and how long the first image of a lens takes, for which its response is traced, and the first
+of another process, which reads it from disk.
 `--figure` draws the image without and with straylight, on a logarithmic scale of four decades.
 
 `--every-pixel` instead compares the ghosts of a half-lit disc in a frame of this many pixels with those of every
@@ -80,6 +81,13 @@ def timed(call: Any, *inputs: Any) -> tuple[float, Any]:
     return time.perf_counter() - start, result
 
 
+def cpu_of(call: Any, *inputs: Any) -> float:
+    """Return the CPU time of a call in s, of all threads: it depends on other load less than the duration does."""
+    start = time.process_time()
+    call(*inputs)
+    return time.process_time() - start
+
+
 def measure(size: int, figure: Path | None) -> None:
     """Print the times, and draw the figure."""
     session = Session(scene_of(size), poses=POSE)
@@ -98,6 +106,16 @@ def measure(size: int, figure: Path | None) -> None:
     own, other = statistics.median(straylight), statistics.median(renders)
     print(f"{size} px: render {other:.2f} s, straylight of the scene {own:.2f} s ({own / other:.2f} of the render)")
     print(f"the first image of a lens: {firsts[0]:.1f} s, with its response from disk: {firsts[1]:.1f} s")
+    light, params = draw.fault.scene_light, {**draw.params, "scene_diffraction": True}  # type: ignore[attr-defined]
+    first, rounds = cpu_of(light, params, frame.context), []
+    for _ in range(3):
+        times = cpu_of(render_view, spec, frame.pose), cpu_of(light, draw.params, frame.context)
+        rounds.append((*times, cpu_of(light, params, frame.context)))
+    render, plain, diffracted = (statistics.median(column) for column in zip(*rounds, strict=True))
+    print(
+        f"by CPU: render {render:.2f} s, straylight of the scene {plain:.2f} s ({plain / render:.2f} of it), with"
+    )
+    print(f"scene_diffraction {diffracted:.2f} s ({diffracted / render:.2f}), the first time {first:.2f} s")
     if figure is not None:
         development, draws = frame.injection.development, frame.injection.draws
         panels = []
