@@ -23,10 +23,11 @@ except VbnfaultError as error:
     pytest.skip(f"no usable LLVM: {error}", allow_module_level=True)
 
 from vbnfault.core.llvm import backend
-from vbnfault.lens.straylight.bundles import Rays, Tracer, name_of, routes
+from vbnfault.lens.straylight import irradiance
+from vbnfault.lens.straylight.bundles import Rays, Spots, Tracer, name_of, routes
 from vbnfault.lens.straylight.ghosts import boxes, lit_cells, traced_ghosts
 from vbnfault.lens.straylight.irradiance import FlareModel, disc_samples
-from vbnfault.lens.straylight.raster import _EDGE_NODES, EDGE_HIGH, EDGE_LOW, edge_profiles
+from vbnfault.lens.straylight.raster import _EDGE_NODES, EDGE_HIGH, EDGE_LOW, Sums, edge_profiles
 from vbnfault.lens.straylight.settings import GhostSettings, SensorGrid
 
 LENSES = (
@@ -353,6 +354,26 @@ def test_threads_do_not_change_a_bit() -> None:
     finally:
         dr.set_thread_count(threads)
     assert len(set(pictures)) == 1
+
+
+def test_parts_do_not_change_a_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ghosts are drawn in parts to bound memory; each part has lattices of all sizes, as their sum would round."""
+    made = model(load_lens("nikkor_35_f2p8"), wavelength_nm=np.linspace(400, 700, 2))
+    draw, sizes, pictures = Sums.draw, [], []
+
+    def counted(self: Sums, spots: Spots, *more: Any) -> None:
+        sizes[-1].append(len(np.unique(spots.across)))
+        draw(self, spots, *more)
+
+    monkeypatch.setattr(Sums, "draw", counted)
+    for rays in (1 << 40, 1 << 14):
+        monkeypatch.setattr(irradiance, "_RAYS_AT_ONCE", rays)
+        sizes.append([])
+        pictures.append(made.image(7.0, 20.0).tobytes())
+    assert sizes[0] == [2]
+    assert len(sizes[1]) > 2
+    assert set(sizes[1]) == {2}
+    assert pictures[0] == pictures[1]
 
 
 def test_bands_differ_by_colour_alone() -> None:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from ...core.errors import InputError
 from ...core.llvm import backend
+from ...core.memory import release_unused
 from ..prescription import Prescription
 from .bundles import Rays, Spots, TraceOptions, Tracer, name_of
 from .ghosts import Arrivals, boxes, fluxes_mm2, named, traced
@@ -32,6 +33,7 @@ F64 = NDArray[np.float64]
 
 MODELS = ("traced", "paraxial")
 _UNEVEN = 0.3  # uneven fraction of a ghost above which twice as many rays are traced
+_RAYS_AT_ONCE = 1 << 18  # of the wavelengths that are always traced, to bound memory
 _ACROSS_FOCUSED = 25  # rays across a ghost for each sample of the Sun's disc
 _SUBDIVISIONS = 8  # of the interval between two nodes, where colours separate
 _APART_PX = 2.0  # pixels of a ghost's level: colours farther apart than this need more wavelengths
@@ -311,7 +313,10 @@ class FlareModel:
         InputError
             The angle is 90° or more.
         """
-        return self._drawn(sun_deg, azimuth_deg, only).irradiance()
+        sums = self._drawn(sun_deg, azimuth_deg, only)
+        # the rays and cells; the sum of the levels takes the frame and, on each thread, some levels of a band
+        release_unused(8 * int(np.prod(self.canvas.shape)) * self.canvas.bands)
+        return sums.irradiance()
 
     def levels(self, sun_deg: float, azimuth_deg: float = 0.0) -> Pyramid:
         """Return the irradiance of `image` before its levels are added."""
@@ -332,16 +337,18 @@ class FlareModel:
         cosine = float(np.cos(np.radians(sun_deg)))
         across = np.where(arrivals.uneven > _UNEVEN, 2 * self._across - 1, self._across)
         sampled = self._sampled[rays.route]
-        for chosen in (~sampled, sampled):
-            if not chosen.any():
-                continue
-            each, bundles, drawn = self._coloured(rays.take(chosen), arrivals.take(chosen), detail)
-            strength, side = np.full(len(bundles), cosine), across[chosen][each]
-            if chosen is sampled:
-                each, bundles, strength = self._over_disc(bundles, sun_deg)
-                drawn, side = drawn.of(each), np.full(len(bundles), _ACROSS_FOCUSED)
-            spots = made.trace(bundles, side, detail.width)
-            sums.draw(spots, self._place(detail, bundles, drawn, strength), turn)
+        for of_disc in (False, True):
+            group = np.flatnonzero(sampled == of_disc)
+            # one half of the lattices mirrors the other only if it does for all of them, in whatever part
+            halved = not (rays.direction[group, 1].any() or rays.box_mm[group, 1].any())
+            for part in _parts(group, across[group], self.canvas.bands):
+                each, bundles, drawn = self._coloured(rays.take(part), arrivals.take(part), detail)
+                strength, side = np.full(len(bundles), cosine), across[part][each]
+                if of_disc:
+                    each, bundles, strength = self._over_disc(bundles, sun_deg)
+                    drawn, side = drawn.of(each), np.full(len(bundles), _ACROSS_FOCUSED)
+                spots = made.trace(bundles, side, detail.width, halved=halved)
+                sums.draw(spots, self._place(detail, bundles, drawn, strength), turn)
         return sums
 
     def _boxes(self, sun_deg: float, turn: float) -> tuple[Tracer, Rays, Arrivals]:
@@ -470,6 +477,20 @@ class FlareModel:
             inner_level=detail.inner_level[route],
             part=drawn.part,
         )
+
+
+def _parts(ghosts: NDArray[np.int64], across: NDArray[np.int64], bands: int) -> list[NDArray[np.int64]]:
+    """Return ghosts in parts that take about `_RAYS_AT_ONCE` rays each, given the rays across each ghost.
+
+    Each part has lattices of all sizes: those of one size are drawn by another kernel, which rounds differently. So
+    the sum of the parts is that of all ghosts at once, bit for bit.
+    """
+    if not len(ghosts):
+        return []
+    _, number = np.unique(across, return_counts=True)
+    count = min(-(-bands * int((across**2).sum()) // _RAYS_AT_ONCE), int(number.min()))
+    by_size = ghosts[np.argsort(across, kind="stable")]
+    return [by_size[k::count] for k in range(count)]
 
 
 def disc_samples(rings: int) -> F64:

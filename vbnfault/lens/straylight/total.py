@@ -250,7 +250,8 @@ class SunlightInLens:
         frame_bytes = 4 * len(self.nodes_nm) * self.sensor.shape[0] * self.sensor.shape[1]
         release_unused(9 * frame_bytes)  # the sums of all levels take 90 MB, the cells 200 MB
         array = self._ghosts()
-        release_unused()
+        # what the drawing took, before the other parts and the signals of the sample's faults take as much
+        release_unused(9 * frame_bytes)
         ghosts_mm2 = _flux_mm2(array, self.sensor.pitch_mm)
         layer, beyond = self.starburst()
         starburst_mm2 = _flux_mm2(layer, self.sensor.pitch_mm)
