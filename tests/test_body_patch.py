@@ -10,7 +10,7 @@ import pytest
 import trimesh
 from scipy import stats
 
-from vbnfault.body import Body, Patch, PatchSpec, Site, build_patch, choose_sites, load_body
+from vbnfault.body import Body, Patch, PatchSpec, Site, boulders, build_patch, choose_sites, load_body
 from vbnfault.body.boulders import PER_KM2, SizeLaw, scatter, smallest_at
 from vbnfault.body.shape import check_mesh, signed_volume
 from vbnfault.core.errors import InputError
@@ -154,6 +154,20 @@ def test_relief_is_a_few_percent_of_its_wavelength(body: Body, site: Site) -> No
     # Far away, where facets are coarser than half of every wavelength, nothing moves.
     far = np.linalg.norm(smooth.vertices_L_m, axis=1) > 2500.0
     assert moved[far].max() == 0.0
+
+
+def test_rocks_are_cut_in_blocks_as_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(4)
+    drawn = rng.normal(size=(42, 3)), rng.normal(size=(7, 5, 3))
+    sphere, planes = (v / np.linalg.norm(v, axis=-1, keepdims=True) for v in drawn)
+    depth = rng.uniform(0.45, 0.8, (7, 5))
+    radius = np.minimum(1, (depth[..., None] / np.maximum(planes @ sphere.T, 0.05)).min(axis=1))
+    for corners in (1 << 20, 100, 1):
+        monkeypatch.setattr(boulders, "_CORNERS_AT_ONCE", corners)
+        # the product rounds twice more than the sum of three terms, in float64
+        np.testing.assert_allclose(
+            boulders._cut(sphere, planes, depth), radius / radius.max(axis=1, keepdims=True), rtol=1e-13
+        )
 
 
 def test_boulder_sizes_and_numbers_follow_the_published_law() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -9,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
+from ..core.llvm import backend
 from .fields import GRADIENT_STD, Points
 from .noise import noise_key
 from .refine import split
@@ -34,6 +36,7 @@ _COARSER = (1.0, 1.2, 1.45, 1.75, 2.1)  # factors on the edge length, tried unti
 _FLAT_LEVELS = 2  # up to this level, triangles are the rock's fracture planes and are shaded flat
 _RING = 12  # directions in which the ground around a rock is sampled
 _LOWEST_CORNERS = 8
+_CORNERS_AT_ONCE = 1 << 14  # of rocks that a thread cuts; the temporaries then fit the processor's cache
 _BURIED = (0.10, 0.40)  # fraction of a rock's height that lies below the lowest ground around it
 
 
@@ -311,11 +314,7 @@ def _rocks(
     # Joints in rock are parallel or perpendicular: plane 1 is opposite to plane 0, plane 2 perpendicular to it.
     planes[:, 1] = _unit(-planes[:, 0] + 0.15 * rng.normal(size=(count, 3)))
     planes[:, 2] = _unit(np.cross(planes[:, 0], planes[:, 3]) + 0.1 * rng.normal(size=(count, 3)))
-    radius = np.ones((count, len(sphere)))
-    for k in range(_PLANES):  # one plane at a time, because all at once would take a gigabyte
-        cosine = np.einsum("ni,vi->nv", planes[:, k], sphere)
-        radius = np.minimum(radius, depth[:, k, None] / np.maximum(cosine, 0.05))
-    radius /= radius.max(axis=1, keepdims=True)
+    radius = _cut(sphere, planes, depth)
     if level >= 2:
         radius *= _weathered(sphere, level, count, rng)
     semi = (
@@ -340,17 +339,44 @@ def _rocks(
         corners = rock + centre[:, None, :]
         lowest_few = np.argsort(-corners[..., 2], axis=1, kind="stable")[:, :_LOWEST_CORNERS]
         corners = np.take_along_axis(corners, lowest_few[..., None], axis=1)
-        beside = ground[tree.query(corners.reshape(-1, 3))[1]].reshape(corners.shape)
+        beside = _nearest(ground, tree, corners)
         gap = np.einsum("nvi,ni->nv", corners - beside, normal).max(axis=1)
         centre = centre - np.maximum(gap + 0.08 * (high - low), 0.0)[:, None] * normal
     return rock + centre[:, None, :], faces, centre
+
+
+def _cut(sphere: Float64, planes: Float64, depth: Float64) -> Float64:
+    """Return the radii, float64[k, v] with a maximum of 1, of unit spheres that planes cut at depths float64[k, p].
+
+    `planes` are the unit normals of each sphere's planes, float64[k, p, 3].
+    """
+    radius = np.ones((len(planes), len(sphere)))
+
+    def cut(start: int) -> None:
+        rows = slice(start, start + step)
+        out = radius[rows]
+        for k in range(planes.shape[1]):
+            cosine = np.einsum("ni,vi->nv", planes[rows, k], sphere)
+            np.maximum(cosine, 0.05, out=cosine)
+            np.minimum(out, np.divide(depth[rows, k, None], cosine, out=cosine), out=out)
+        out /= out.max(axis=1, keepdims=True)
+
+    step = max(1, _CORNERS_AT_ONCE // len(sphere))
+    with ThreadPoolExecutor(backend().dr.thread_count()) as pool:
+        list(pool.map(cut, range(0, len(planes), step)))
+    return radius
+
+
+def _nearest(ground: Float64, tree: cKDTree, position: Float64) -> Float64:
+    """Return the point of the ground, float64[..., 3], that is nearest to each position float64[..., 3]."""
+    return np.asarray(ground[tree.query(position, workers=backend().dr.thread_count())[1]])
 
 
 def _ground_normal(position: Float64, normal: Float64, radius: Float64, ground: Float64, tree: cKDTree) -> Float64:
     """Return the ground's unit normal at the scale of a rock, float64[n, 3], from a ring of points."""
     across, other = _tangents(normal)
     ring = [
-        ground[tree.query(position + radius[:, None] * (np.cos(turn) * across + np.sin(turn) * other))[1]]
+        _nearest(ground, tree, position + radius[:, None] * (np.cos(turn) * across + np.sin(turn) * other))
         - position
         for turn in np.linspace(0, 2 * np.pi, _RING, endpoint=False)
     ]
@@ -388,7 +414,7 @@ def _lowest_ground(position: Float64, normal: Float64, radius: Float64, ground: 
     for reach in (0.5, 1.0):
         for turn in np.linspace(0, 2 * np.pi, _RING, endpoint=False):
             ring = position + reach * radius[:, None] * (np.cos(turn) * across + np.sin(turn) * other)
-            near = ground[tree.query(ring)[1]] - position
+            near = _nearest(ground, tree, ring) - position
             height = np.einsum("ni,ni->n", near, normal)
             aside = np.sqrt(np.maximum(np.einsum("ni,ni->n", near, near) - height**2, 0.0))
             lowest = np.minimum(lowest, np.where(aside < 1.3 * radius, height, 0.0))

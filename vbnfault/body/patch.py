@@ -14,6 +14,7 @@ ground.
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING
@@ -96,10 +97,14 @@ def build_patch(body: Body, site: Site, spec: PatchSpec) -> Patch:
             f"max_triangles = {spec.max_triangles}: must be at least twice the model's {len(body.faces)} faces"
         )
     model = (body.vertices_m - site.position_T_m, vertex_normals(body.vertices_m, body.faces), body.faces)
-    limit = affordable(EdgeLimit(spec.facet_m, spec.radius_m), model, int(_GROUND_FRACTION * spec.max_triangles))
-    points, normals, faces = refine(*model, limit)
+    with ThreadPoolExecutor(1) as aside:  # to measure a body for its first patch takes nearly a second
+        measured = aside.submit(_roughness, body)
+        limit = affordable(
+            EdgeLimit(spec.facet_m, spec.radius_m), model, int(_GROUND_FRACTION * spec.max_triangles)
+        )
+        points, normals, faces = refine(*model, limit)
+        law, edge = measured.result()
     facet = limit.facet_at(points)
-    law, edge = _roughness(body)
     if spec.hurst is not None:
         law = replace(law, hurst=spec.hurst)
     ground = add_relief(
