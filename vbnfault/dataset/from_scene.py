@@ -39,11 +39,11 @@ class SessionFactory:
     def __call__(self) -> build.SampleMaker:
         threads = self.threads or environment.whole_number("VBNFAULT_THREADS", environment.MOST_THREADS) or None
         with self.contents.in_use():
-            return _Session(pipeline.Session(self.scene, blocks=self.blocks, threads=threads), self.contents)
+            return _CheckedSession(pipeline.Session(self.scene, blocks=self.blocks, threads=threads), self.contents)
 
 
 @dataclasses.dataclass(frozen=True)
-class _Session:
+class _CheckedSession:
     """Make samples as a session does, but fail if an input file changed after the build was planned."""
 
     session: pipeline.Session

@@ -358,12 +358,12 @@ class RetakeFactory:
         threads = self.threads or environment.whole_number("VBNFAULT_THREADS", environment.MOST_THREADS) or None
         with self.contents.in_use():
             scene = with_rows(self.scene)
-            return _Session(
+            return _CheckedRetake(
                 session=RetakeSession(
                     scene,
                     _retaken_plan(scene, self.attributes, pipeline.configure_faults(scene)),
                     blocks_of_plan(self.attributes[RETAKE]["source"]),
-                    _Reader(store.open_store(self.path), self.attributes["scene"]["camera"]),
+                    _StoredViews(store.open_store(self.path), self.attributes["scene"]["camera"]),
                     threads=threads,
                 ),
                 numbers=plan_numbers(self.attributes),
@@ -372,7 +372,7 @@ class RetakeFactory:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Session:
+class _CheckedRetake:
     """Make the samples of a new store from those of its plan; fail if an input file changed."""
 
     session: RetakeSession
@@ -386,7 +386,7 @@ class _Session:
         return dataclasses.replace(sample, index=index)
 
 
-class _Reader:
+class _StoredViews:
     """Read the stored view of a sample of the earlier plan."""
 
     def __init__(self, opened: Store, camera: Mapping[str, Any]) -> None:

@@ -76,8 +76,7 @@ def sample_to_noise(
     """
     from .. import render
 
-    camera = spec.camera
-    electron_rate = green_per_second(spec)
+    camera, electron_rate = spec.camera, green_per_second(spec)
     release_unused(_RENDER_BYTES)  # what the sample before took
     sampled = render.direct_by_sample(spec.terrain.surface, scene, electron_rate)
     indirect = None

@@ -32,7 +32,7 @@ def sample(results: StudyResults, kind: str) -> str:
 
 
 @dataclass(frozen=True)
-class Section:
+class FigureText:
     """Hold the title of a kind of figure, and a function that returns how to read it, in two sentences."""
 
     title: str
@@ -171,16 +171,16 @@ def _morris(_: StudyResults) -> str:
     )
 
 
-SECTIONS: dict[str, Section] = {
-    "ranking": Section("Cost of each fault", _ranking),
-    "overview": Section("Which factor drives which metric", _overview),
-    "indices": Section("Indices with intervals", _indices),
-    "morris": Section("Strength and bending of effects", _morris),
-    "models": Section("Model form beside parametric variance", _models),
-    "tornado": Section("Tornado", _tornado),
-    "responses": Section("Response curves", _responses),
-    "interactions": Section("Interactions", _interactions),
-    "seeds": Section("Spread over seeds", _seeds),
+SECTIONS: dict[str, FigureText] = {
+    "ranking": FigureText("Cost of each fault", _ranking),
+    "overview": FigureText("Which factor drives which metric", _overview),
+    "indices": FigureText("Indices with intervals", _indices),
+    "morris": FigureText("Strength and bending of effects", _morris),
+    "models": FigureText("Model form beside parametric variance", _models),
+    "tornado": FigureText("Tornado", _tornado),
+    "responses": FigureText("Response curves", _responses),
+    "interactions": FigureText("Interactions", _interactions),
+    "seeds": FigureText("Spread over seeds", _seeds),
 }
 
 

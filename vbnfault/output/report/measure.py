@@ -245,7 +245,7 @@ def _pair(value: Any) -> tuple[float, float] | None:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Pixels:
+class PixelResults:
     """Hold what was computed from the pixels of some samples.
 
     Attributes
@@ -268,7 +268,7 @@ class Pixels:
     unreadable: int
 
 
-def read_pixels(store: Store, scalars: Scalars, most: int) -> Pixels:
+def read_pixels(store: Store, scalars: Scalars, most: int) -> PixelResults:
     """Return what the pixels of up to `most` finished samples, evenly spaced, say."""
     images = [name for name in ("image", "clean") if name in store.spec.pixel_layers]
     masks = [name for name in ("mask", "mask_effect") if name in store.spec.pixel_layers and store.spec.faults]
@@ -286,7 +286,7 @@ def read_pixels(store: Store, scalars: Scalars, most: int) -> Pixels:
         for mask in masks:
             rows[mask].append(layers[mask].mean(axis=(1, 2)))
     of_images = {name: np.array(rows[name], dtype=np.float64).reshape(-1, 2) for name in images}
-    return Pixels(
+    return PixelResults(
         positions=np.array(positions, dtype=np.int64),
         saturated={name: values[:, 0] for name, values in of_images.items()},
         mean_dn={name: values[:, 1] for name, values in of_images.items()},

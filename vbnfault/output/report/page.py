@@ -18,7 +18,16 @@ from ...store import STRATA, Store, open_store
 from ..contact_sheet import COLOURS, abbreviations
 from . import charts
 from .gallery import gallery
-from .measure import Drawn, Pixels, Scalars, geometry_bounds, key_bounds, read_drawn, read_pixels, read_scalars
+from .measure import (
+    Drawn,
+    PixelResults,
+    Scalars,
+    geometry_bounds,
+    key_bounds,
+    read_drawn,
+    read_pixels,
+    read_scalars,
+)
 from .sphere import sphere
 
 F64 = NDArray[np.float64]
@@ -317,7 +326,7 @@ def _histogram(
     return charts.Histogram(title=title or name, unit=unit, groups=groups, bounds=bounds, logarithmic=wide)
 
 
-def _exposure(store: Store, scalars: Scalars, pixels: Pixels) -> Section:
+def _exposure(store: Store, scalars: Scalars, pixels: PixelResults) -> Section:
     """Return exposure times, and the saturated fraction and mean level of the images."""
     exposure = scalars.by_split(scalars.columns["exposure_s"])
     histograms = [_histogram("", exposure, None, "exposure time", "s")]
@@ -337,13 +346,13 @@ def _exposure(store: Store, scalars: Scalars, pixels: Pixels) -> Section:
     return Section("exposure", "Exposure and saturation", _how(how) + _charts(scalars, histograms))
 
 
-def _of_pixels(scalars: Scalars, pixels: Pixels) -> str:
+def _of_pixels(scalars: Scalars, pixels: PixelResults) -> str:
     """Return from which samples the pixels are."""
     read, total = len(pixels.positions), len(scalars.samples)
     return "of all finished samples" if read == total else f"of {grouped_digits(read)} samples, evenly spaced"
 
 
-def _areas(store: Store, scalars: Scalars, pixels: Pixels) -> Section:
+def _areas(store: Store, scalars: Scalars, pixels: PixelResults) -> Section:
     """Return the distributions of the masks' areas."""
     titles = {"mask": "Footprints", "mask_effect": "Effects"}
     about = {
@@ -369,7 +378,7 @@ def _areas(store: Store, scalars: Scalars, pixels: Pixels) -> Section:
     return Section("areas", "Areas of the masks", _how(how) + "".join(parts))
 
 
-def _about(store: Store, scalars: Scalars, pixels: Pixels) -> Section:
+def _about(store: Store, scalars: Scalars, pixels: PixelResults) -> Section:
     """Return what identifies the store, and what the report could not read."""
     attributes = store.attributes
     rows = [
