@@ -25,7 +25,7 @@ over all frames, the median and the worst 5 % of:
 - `iou`: lit silhouettes, intersection over union. Lit is a brightness above 0.12.
 - `limb_px`: median distance between the bright limbs, both ways.
 - `rank`: Spearman's correlation of brightness where both are lit.
-- `power_4_8` to `power_32_64`: rendered over real variance of brightness at wavelengths of that many pixels.
+- `power_2_4` to `power_32_64`: rendered over real variance of brightness at wavelengths of that many pixels.
 - `sky`, `glow_0.5` to `glow_3`: background level, and brightness of the sky at distances of so many nucleus radii,
   as fractions of `bright`; rendered and real. Frames whose sky is clipped to 0 are left out.
 - `noise`, `column`: deviation of the sky from its local median, and of its columns' medians from a smooth curve, as
@@ -87,7 +87,7 @@ Mask = NDArray[np.bool_]
 LIT = 0.12
 _BRIGHT_PERCENTILE = 99.0
 _BODY_LEVEL = 0.3  # of the brightest pixels: surely the body, to begin with
-_OCTAVES_PX = ((4, 8), (8, 16), (16, 32), (32, 64))
+_OCTAVES_PX = ((2, 4), (4, 8), (8, 16), (16, 32), (32, 64))
 _GLOW_RADII = ((0.05, 0.5), (0.5, 1.0), (1.0, 2.0), (2.0, 3.0))
 _TRACK_SIGMAS = 6.0
 # Lit parts belong to the body if they have this fraction of all lit pixels, or lie as near to the largest part as

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from . import Body
 
 PATCHES = ArrayFiles(kind="patch", content="terrain")
-_GROUND = ("fields", "noise", "octaves", "relief", "fractured", "roughness")
+_GROUND = ("fields", "noise", "octaves", "relief", "fractured", "roughness", "scarps", "sharpen")
 _SOURCES = (*_GROUND, "refine", "boulders", "patch", "gravity", "shape")
 _ARRAYS = tuple(name for name in Patch.__dataclass_fields__ if name != "site")
 

@@ -23,12 +23,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import InputError
+from . import scarps
 from .boulders import GroundMesh, add_boulders
 from .noise import Float32
-from .refine import EdgeLimit, affordable, refine
+from .refine import GROWTH_POWER, EdgeLimit, affordable, refine
 from .relief import LONGEST_EDGES, add_relief
 from .roughness import Roughness, mean_edge_m
-from .shape import Int32, vertex_normals
+from .shape import Float64, Int32, vertex_normals
 from .sites import Site
 from .spec import PatchSpec
 
@@ -37,6 +38,8 @@ if TYPE_CHECKING:
 
 _GROUND_FRACTION = 0.66  # fraction of the triangles; the rest is left to the boulders
 _BOULDER_STREAM = 0xB0D
+
+Surface = tuple[Float64, Float64, Int32]  # points, unit normals, faces
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -102,7 +105,7 @@ def build_patch(body: Body, site: Site, spec: PatchSpec) -> Patch:
         limit = affordable(
             EdgeLimit(spec.facet_m, spec.radius_m), model, int(_GROUND_FRACTION * spec.max_triangles)
         )
-        points, normals, faces = refine(*model, limit)
+        points, normals, faces = refine(*_with_scarps(body, site, model, limit, spec), limit)
         law, edge = measured.result()
     facet = limit.facet_at(points)
     if spec.hurst is not None:
@@ -136,6 +139,22 @@ def build_patch(body: Body, site: Site, spec: PatchSpec) -> Patch:
         facet_m=limit.facet_m,
         radius_m=limit.radius_m,
     )
+
+
+def _with_scarps(body: Body, site: Site, model: Surface, limit: EdgeLimit, spec: PatchSpec) -> Surface:
+    """Return points, normals and faces of the model, refined as far as its scarps need, with `spec.scarps`."""
+    edge_m = mean_edge_m(body.vertices_m, body.faces)
+    finest_m = scarps.finest_facet_m(edge_m)
+    if not spec.scarps or limit.facet_m > scarps.COARSEST * edge_m:
+        return model
+    if limit.facet_m < finest_m:
+        # the same facets where they are coarser than this
+        limit = EdgeLimit(finest_m, limit.radius_m * (finest_m / limit.facet_m) ** (1 / GROWTH_POWER))
+    points, normals, faces = refine(*model, limit)
+    place_T_m = points + site.position_T_m
+    where = scarps.form(body, place_T_m)
+    raised = scarps.gathered(points, faces, where, scarps.wander(place_T_m, edge_m, spec.seed), edge_m)
+    return points + (spec.scarps * raised)[:, None] * where.up, normals, faces
 
 
 @lru_cache(maxsize=4)

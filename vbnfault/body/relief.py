@@ -23,6 +23,7 @@ from .gravity import GRAVITATIONAL_CONSTANT
 from .noise import Float32
 from .octaves import Octaves, smooth_max, smooth_step
 from .roughness import Roughness
+from .scarps import form
 from .shape import Float64, Int32, vertex_normals
 from .sites import Site
 from .spec import PatchSpec
@@ -34,6 +35,13 @@ _SHARED_M = 20.0  # longer octaves raise dust and rock alike
 LONGEST_EDGES = 1.0  # wavelength of the longest octave, in mean edges of the model
 _REGION_EDGES = 4.5  # size of the regions, in longest octaves
 _SHORTEST_FACETS = 1.8  # wavelength of the shortest octave, in the smallest facets
+
+# Of the uneven relief: limits of the model's local roughness, over its median; factor on level ground, and slopes
+# below which ground is level and above which it is bare; standard deviation of each factor of the cascade, their
+# number, and the longest in longest octaves
+_ROUGH_RANGE = (0.25, 2.5)
+_LEVEL, _LEVEL_DEG, _MEAN_COVERED = 0.5, (6.0, 36.0), 0.75
+_CASCADE, _CASCADE_STEPS, _CASCADE_LONGEST = 0.35, 3, 4.0
 
 _TERRACE_M = (5.5, 2.6)  # height of a step, and of the smaller steps between them
 # (cell width, height per unit of block noise) of the broken ground, in metres
@@ -103,8 +111,7 @@ def add_relief(
     """
     points, normals, faces = mesh
     up, elevation = _vertical(body, site, points)
-    scale = spec.relief
-    if scale == 0:
+    if spec.relief == 0:
         slope = _slope_deg(points, normals, faces, up)
         return Ground(
             height_m=np.zeros(len(points)),
@@ -116,6 +123,10 @@ def add_relief(
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
     noise = Octaves(points[order] + site.position_T_m, facet_m[order], spec.seed, roughness, longest_m)
+    scale: Float64 | float = spec.relief
+    if spec.intermittency:
+        slope = _slope_deg(points, normals, faces, up)[order]
+        scale = spec.relief * _unevenness(body, noise, slope, spec.intermittency)[rank]
 
     # Roughness differs between regions. Far away, facets show few octaves, and evenly rough ground would look like
     # orange peel.
@@ -153,6 +164,21 @@ def add_relief(
         slope = _slope_deg(points + height_m[:, None] * normals, normals, faces, up)
         dust = dust * fractured.dust_that_rests(slope, spec.fractured)
     return Ground(height_m=height_m, dust=dust, talus=talus)
+
+
+def _unevenness(body: Body, noise: Octaves, slope_deg: Float32, strength: float) -> Float64:
+    """Return the factor on the relief at the points of `noise`, float64[n]: the ground is rough here, smooth there.
+
+    Three causes multiply. Ground below the facets is rough where the model is. Dust smooths level ground. What
+    remains is a cascade (Mandelbrot 1974, J. Fluid Mech. 62, 331): independent factors of several sizes with
+    lognormal distributions.
+    """
+    rough = np.clip(form(body, noise.place_m).rough, *_ROUGH_RANGE)
+    covered = _LEVEL + (1 - _LEVEL) * smooth_step(*_LEVEL_DEG, slope_deg).astype(np.float64)
+    cascade = np.zeros(len(noise.facet_m))
+    for k in range(_CASCADE_STEPS):
+        cascade += _CASCADE * noise.gradient(_CASCADE_LONGEST * noise.longest_m / 2**k, 220 + k)
+    return np.asarray((rough * covered / _MEAN_COVERED * np.exp(cascade)) ** strength)
 
 
 # --- the vertical and slopes ------------------------------------------------------------------------------------

@@ -81,6 +81,18 @@ class PatchSpec:
         le=1.2,
         description="exponent of the roughness below the model's facets; default: that measured on the model",
     )
+    scarps: float = Field(
+        default=0.0,
+        ge=0,
+        le=1,
+        description="fraction of the way in which the slopes of the model are gathered into scarps",
+    )
+    intermittency: float = Field(
+        default=0.0,
+        ge=0,
+        le=1,
+        description="how much more relief lies on rough and steep ground than on smooth plains; 0: evenly",
+    )
     fractured: Fractured | None = Field(
         default=None, description="layered and jointed rock; default: rounded relief"
     )

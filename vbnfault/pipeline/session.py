@@ -343,6 +343,8 @@ class Session:
             radius_m=table.radius_m,
             relief=table.relief,
             hurst=table.hurst,
+            scarps=table.scarps,
+            intermittency=table.intermittency,
             craters_per_km2=table.craters_per_km2,
             min_boulder_m=table.min_boulder_m if table.boulders else 1e6,
             boulder_index=table.boulder_index,

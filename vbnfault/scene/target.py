@@ -197,6 +197,15 @@ class PatchTable(Table):
     hurst: float | None = Field(
         None, ge=0.3, le=1.2, description="exponent of the relief's roughness; default: as the model's own"
     )
+    scarps: float = Field(
+        0.0, ge=0, le=1, description="fraction of the way in which slopes of the model are gathered into scarps"
+    )
+    intermittency: float = Field(
+        0.0,
+        ge=0,
+        le=1,
+        description="how much more relief lies on rough and steep ground than on smooth plains; 0: evenly",
+    )
     craters_per_km2: float = Field(60.0, ge=0, le=600, description="of 10 m or more")
     boulders: bool = Field(True, description="whether boulders lie on the ground")
     min_boulder_m: float = Field(0.25, ge=0.05, le=1000, description="diameter of the smallest near the site")

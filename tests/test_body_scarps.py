@@ -1,0 +1,100 @@
+"""Scarps and unevenly spread relief: where they are made, what they keep, and what leaves the ground as it is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+
+from vbnfault.body import Body, PatchSpec, build_patch, site_at
+from vbnfault.body.roughness import mean_edge_m
+from vbnfault.body.scarps import Form, form, gathered
+
+
+def sphere(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return a sphere of 1 km."""
+    mesh = trimesh.creation.icosphere(subdivisions=subdivisions, radius=1000.0)
+    return np.asarray(mesh.vertices), np.asarray(mesh.faces, dtype=np.int32)
+
+
+SPHERE, FACES = sphere(5)
+EDGE = mean_edge_m(SPHERE, FACES)
+OUTWARD = SPHERE / np.linalg.norm(SPHERE, axis=1)[:, None]
+WAVELENGTH_M = 500.0
+WAVE = np.cos(2 * np.pi * SPHERE[:, 2] / WAVELENGTH_M)
+BAND = np.abs(SPHERE[:, 2]) < 400  # where the waves run along the surface
+
+
+def steps(height_m: np.ndarray) -> np.ndarray:
+    """Return the differences in height over the edges of the band, float64[n] in metres."""
+    ends = np.concatenate([FACES[:, [0, 1]], FACES[:, [1, 2]], FACES[:, [2, 0]]])
+    ends = ends[BAND[ends].all(axis=1)]
+    return np.asarray(np.abs(height_m[ends[:, 0]] - height_m[ends[:, 1]]))
+
+
+def after(height_m: np.ndarray) -> np.ndarray:
+    """Return the heights of the sphere with waves after the filter, crests where the waves are high."""
+    points = SPHERE + height_m[:, None] * OUTWARD
+    where = Form(up=OUTWARD, crest=2 * WAVE, rough=np.ones(len(SPHERE)))
+    # a model whose scarps reach a sixth of the waves
+    return height_m + gathered(points, FACES, where, np.zeros(len(SPHERE)), WAVELENGTH_M / 3)
+
+
+def test_slopes_gather_between_level_crests_and_floors() -> None:
+    before = 10 * WAVE
+    height = after(before)
+    # of a sine, a fifth lies within 5 % of its extremes; of a square wave all
+    level = np.abs(height[BAND]) > 9.5
+    assert level.mean() > 1.5 * (np.abs(before[BAND]) > 9.5).mean()
+    assert steps(height).max() > 1.3 * steps(before).max()
+    # the differences along the edges say that a sphere curves, by up to half of edge²/radius
+    curved_m = 0.5 * EDGE**2 / 1000.0
+    assert np.abs(height).max() < 10 + 20 * curved_m
+
+
+def test_a_plane_has_no_scarps() -> None:
+    """The sphere's facets alone raise crests by at most a step of its curvature each time."""
+    assert np.abs(after(np.zeros(len(SPHERE)))).max() < 20 * 0.5 * EDGE**2 / 1000.0
+
+
+@pytest.fixture(scope="module")
+def half_rough() -> Body:
+    """Return a sphere that is rough where z > 0."""
+    vertices, faces = sphere(3)
+    height = np.random.default_rng(3).normal(size=len(vertices)) * np.where(vertices[:, 2] > 0, 0.02, 0.0025)
+    return Body(name="half rough", vertices_m=vertices * (1 + height[:, None]), faces=faces)
+
+
+def test_form_tells_rough_ground_from_smooth(half_rough: Body) -> None:
+    found = form(half_rough, half_rough.vertices_m)
+    rough, smooth = (found.rough[sign * half_rough.vertices_m[:, 2] > 300] for sign in (1, -1))
+    assert np.median(rough) > 3 * np.median(smooth)
+    assert rough.min() > smooth[np.argsort(smooth)[-20]]
+    outward = half_rough.vertices_m / np.linalg.norm(half_rough.vertices_m, axis=1)[:, None]
+    assert np.einsum("ni,ni->n", found.up, outward).min() > 0.98
+
+
+def heights(body: Body, **keys: float) -> np.ndarray:
+    """Return the height of a patch over the model (edges of 150 m) at the model's vertices, float64[n] in m."""
+    spec = {"facet_m": 45.0, "radius_m": 3000.0, "min_boulder_m": 1e6, "relief": 0.0, "craters_per_km2": 0.0}
+    site = site_at(body, 0, body.vertices_m[0])
+    patch = build_patch(body, site, PatchSpec(seed=4, **{**spec, **keys}))
+    points = patch.vertices_L_m[: len(body.vertices_m)] @ site.T_from_L.T + site.position_T_m
+    return np.asarray(np.einsum("ni,ni->n", points - body.vertices_m, body.vertex_normals))
+
+
+def test_uneven_relief_lies_on_rough_ground(half_rough: Body) -> None:
+    even, uneven = (heights(half_rough, relief=1.0, intermittency=how) for how in (0.0, 1.0))
+    north, south = (sign * half_rough.vertices_m[:, 2] > 300 for sign in (1, -1))
+    assert uneven[north].std() / uneven[south].std() > 3 * even[north].std() / even[south].std()
+
+
+def test_scarps_move_the_ground_by_their_fraction(half_rough: Body) -> None:
+    flat, half, whole = (heights(half_rough, facet_m=30.0, scarps=part) for part in (0.0, 0.5, 1.0))
+    assert np.abs(whole - flat).max() > 1.0
+    # the patch holds float32 of some 2000 m, within 1e-4 m
+    np.testing.assert_allclose(half - flat, 0.5 * (whole - flat), atol=1e-3)
+
+
+def test_facets_too_coarse_for_scarps_leave_the_ground(half_rough: Body) -> None:
+    np.testing.assert_array_equal(heights(half_rough, facet_m=45.0), heights(half_rough, facet_m=45.0, scarps=1.0))
