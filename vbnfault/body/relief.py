@@ -36,7 +36,7 @@ LONGEST_EDGES = 1.0  # wavelength of the longest octave, in mean edges of the mo
 _REGION_EDGES = 4.5  # size of the regions, in longest octaves
 _SHORTEST_FACETS = 1.8  # wavelength of the shortest octave, in the smallest facets
 
-# Of the uneven relief: limits of the model's local roughness, over its median; factor on level ground, and slopes
+# Of the uneven relief: limits of the model's local roughness, over its mean; factor on level ground, and slopes
 # below which ground is level and above which it is bare; standard deviation of each factor of the cascade, their
 # number, and the longest in longest octaves
 _ROUGH_RANGE = (0.25, 2.5)
@@ -175,7 +175,7 @@ def _unevenness(body: Body, noise: Octaves, slope_deg: Float32, strength: float)
     """
     rough = np.clip(form(body, noise.place_m).rough, *_ROUGH_RANGE)
     covered = _LEVEL + (1 - _LEVEL) * smooth_step(*_LEVEL_DEG, slope_deg).astype(np.float64)
-    cascade = np.zeros(len(noise.facet_m))
+    cascade = np.full(len(noise.facet_m), -_CASCADE_STEPS * _CASCADE**2)  # the mean square of its exponential is 1
     for k in range(_CASCADE_STEPS):
         cascade += _CASCADE * noise.gradient(_CASCADE_LONGEST * noise.longest_m / 2**k, 220 + k)
     return np.asarray((rough * covered / _MEAN_COVERED * np.exp(cascade)) ** strength)

@@ -55,7 +55,7 @@ class Form:
     crest
         float64[n]: 0 on even slopes, positive on crests, negative in hollows; 1 in the median of the magnitude.
     rough
-        float64[n]: roughness of the model around the point, over the median of the body.
+        float64[n]: roughness of the model around the point, over the root mean square of the body.
     """
 
     up: Float64
@@ -77,7 +77,11 @@ def form(body: Body, points_T_m: Float64) -> Form:
     square = smoothed(vertices, faces, (crest**2)[:, None], _AROUND_EDGES * edge)[:, 0]
     rough = np.sqrt(np.maximum(square, 0))
     values = np.column_stack(
-        [up, crest / max(float(np.median(np.abs(crest))), 1e-9), rough / max(float(np.median(rough)), 1e-9)]
+        [
+            up,
+            crest / max(float(np.median(np.abs(crest))), 1e-9),
+            rough / max(float(np.sqrt(np.mean(rough**2))), 1e-9),
+        ]
     )
     distance, near = cKDTree(vertices).query(points_T_m, k=_NEAREST)
     # measured from the nearest vertex, so that the weights never all vanish
