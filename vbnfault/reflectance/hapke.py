@@ -72,16 +72,13 @@ class Hapke:
                 seeliger = m.select(lit, shadowing * (mu0 / (mu0 + mu)) * (k / (4 * np.pi)), 0)
                 shared[key] = seeliger, x0, x, m.log((1 + x0) / x0), m.log((1 + x) / x)
             seeliger, x0, x, log0, log1 = shared[key]
-            # 1 / (H(μ0) H(μ)), and P (1 + B) as a fraction: one division for each band, as divisions take longest
-            w, g = p["single_scattering_albedo"], p["asymmetry"]
-            inverse = _inverse_chandrasekhar(w, x0, log0) * _inverse_chandrasekhar(w, x, log1)
-            base = 1 + g * g + 2 * g * cos_phase
-            single, under = 1 - g * g, base * m.sqrt(base)  # Henyey and Greenstein's function
+            w = p["single_scattering_albedo"]
+            single = _henyey_greenstein(m, p["asymmetry"], cos_phase)
             if p["shadow_hiding_amplitude"]:
                 h = p["shadow_hiding_width"]
-                single = single * ((1 + p["shadow_hiding_amplitude"]) * h + half)
-                under = under * (h + half)
-            value = w * seeliger * ((single * inverse + under * (1 - inverse)) / (under * inverse))
+                single = single * (1 + p["shadow_hiding_amplitude"] * h / (h + half))
+            multiple = _chandrasekhar(w, x0, log0) * _chandrasekhar(w, x, log1) - 1
+            value = w * seeliger * (single + multiple)
             if p["coherent_amplitude"]:
                 value = value * (1 + p["coherent_amplitude"] * _coherent(m, half / p["coherent_width"]))
             out.append(value)
@@ -91,11 +88,17 @@ class Hapke:
 # --- parts of the models ------------------------------------------------------------------------------------
 
 
-def _inverse_chandrasekhar(w: float, x: Any, log: Any) -> Any:
-    """Return 1 / H(x) (Hapke 2002, eq. 13); `log` is ln((1 + x) / x)."""
+def _henyey_greenstein(m: Any, g: float, cos_phase: Any) -> Any:
+    """Return P(α) = (1 - g²) / (1 + 2 g cos α + g²)^(3/2)."""
+    base = 1 + g * g + 2 * g * cos_phase
+    return (1 - g * g) / (base * m.sqrt(base))
+
+
+def _chandrasekhar(w: float, x: Any, log: Any) -> Any:
+    """Return H(x) (Hapke 2002, eq. 13); `log` is ln((1 + x) / x)."""
     gamma = np.sqrt(1 - w)
     r0 = float((1 - gamma) / (1 + gamma))
-    return 1 - w * x * (r0 + (0.5 - r0 * x) * log)
+    return 1 / (1 - w * x * (r0 + (0.5 - r0 * x) * log))
 
 
 def _coherent(m: Any, z: Any) -> Any:
