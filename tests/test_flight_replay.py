@@ -179,7 +179,7 @@ def test_centre_and_limb_of_the_body_lie_where_the_table_says(frames: Path, real
 
 
 def test_a_replay_of_real_frames_agrees(frames: Path, real_shape: Path) -> None:
-    """At a quarter of the size; the floors leave 0.03 to what was reached: IoU 0.90 to 0.93, rank 0.70 to 0.77."""
+    """At a quarter of the size; the floors leave 0.03 to what was reached: IoU 0.945 to 0.96, rank 0.86."""
     table = load_trajectory(str(frames / "poses.csv"))
     values = {"body.shape": str(real_shape), "patch.max_triangles": 100_000}
     scene = flight_replay.replay_scene("navcam67p", (128, 128), values)
@@ -188,6 +188,6 @@ def test_a_replay_of_real_frames_agrees(frames: Path, real_shape: Path) -> None:
     for row in (12, 20):
         frame = flight_replay.reduced(flight_replay.read_frame(frames, table.name[row]), 128)
         figures = flight_replay.replay(session, table, row, frame, detectors).figures
-        assert figures["iou"] > 0.87
-        assert figures["rank"] > 0.65
+        assert figures["iou"] > 0.915
+        assert figures["rank"] > 0.83
         assert figures["limb_px"] < 2
