@@ -302,3 +302,5 @@ def test_stars_and_raw_numbers_are_computed_once(monkeypatch: pytest.MonkeyPatch
     alone = Session(config.parse_scene(scene, source="test")).frame(3)
     np.testing.assert_array_equal(rates[3], alone.exposure.rate.array)
     np.testing.assert_array_equal(frames[3].images.raw, alone.images.raw)
+    # samples without faults have one array of empty masks, which is then compressed once
+    assert len({id(to_sample(frame).layers["mask"]) for frame in frames}) == 1
