@@ -8,12 +8,14 @@ FOLDER holds `poses.csv` (the columns of `[trajectory]`) and for each row an 8-b
 that of the scene, by default `navcam67p` with its detector; of faults it has `SPOTS` alone. It renders `BINNING`
 times the size of the frames, which are half native size, and the raw image is developed as they were
 (`developed`): the square root of the digital numbers over the bias, halved, in 8 bits.
-The labels of flight images are some pixels off, so every pose is mended first: the similarity that correlates
-image and frame best gives the camera's attitude and distance, and the image is rendered again. What then remains
-is a shift of whole native pixels, which leaves the noise as it is. In 11 of the frames the labels are off by up to
-0.6° of turn about the line of sight, and the frames ask for a nucleus some 0.5 % larger than `67p_18k.obj`, or as
-much nearer: its volume is 18.41 km³, published are 18.56 (Preusker et al. 2017, A&A 607, L1) and 18.8 (Jorda et
-al. 2016, Icarus 277, 257).
+The labels of flight images are some pixels off, so every image is aligned first, by a shift of whole native
+pixels, which leaves its noise as it is.
+
+`--mend-poses 1` mends more than the shift: the similarity that correlates image and frame best gives the camera's
+attitude and distance, and the image is rendered again. In 11 of the frames the labels are off by up to 0.6° of turn
+about the line of sight, and the frames ask for a nucleus some 0.5 % larger than `67p_18k.obj`, or as much nearer:
+its volume is 18.41 km³, published are 18.56 (Preusker et al. 2017, A&A 607, L1) and 18.8 (Jorda et al. 2016,
+Icarus 277, 257). The figures then tell the errors of scene and shape from those of the table.
 
 The stretch of the frames is not documented. That it is the square root of the 12 bits shows in their noise: it
 falls from 0.92 at a sky of 2.5 to 0.52 at 14, by the same curve in all frames. Of 255 (DN/4095)^g the exponent 0.5
@@ -455,11 +457,11 @@ def replay(
     row: int,
     frame: NDArray[np.uint8],
     detectors: Sequence[str],
-    turns: int = 1,
+    mendings: int = 0,
 ) -> Pair:
-    """Render a row with one of the sensor files, align it with its real frame, and compare the two.
+    """Render a row with one of the sensor files, align it with its real frame by a shift, and compare the two.
 
-    The pose is mended `turns` times by the similarity between the images; what remains is a shift.
+    Before, the pose is mended `mendings` times by the similarity between the images.
     """
     start = time.perf_counter()
     real = look(frame)
@@ -467,11 +469,11 @@ def replay(
     bias_dn = float(session.base_camera.detector.description["bias_dn"])
     search_px = max(4, round(_SEARCH_PX * frame.shape[1] / 512))
     session.trajectory = trajectory
-    for turn in range(turns + 1):
+    for step in range(mendings + 1):
         raw_dn = session.simulate(row).layers["raw"]
         before = look(developed(raw_dn, bias_dn))
         shift = shift_between(real, before, search_px=search_px)
-        if turn < turns:
+        if step < mendings:
             similarity = similarity_between(real, before, shift)
             trajectory = with_pose(
                 trajectory,
@@ -571,6 +573,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("--rows", help="rows to replay, such as 0,5,18; default: all")
     parser.add_argument("--width", type=int, help="width in px; default: that of the frames")
+    parser.add_argument(
+        "--mend-poses", type=int, default=0, metavar="N", help="mend each pose N times by a similarity (default: 0)"
+    )
     parser.add_argument("--threads", type=int, help="render threads; default: every core")
     parser.add_argument("--out", type=Path, required=True, help="folder for replay.json and sheet.png")
     given = parser.parse_args(arguments)
@@ -591,7 +596,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     detectors = [scene.camera.detector, str(write_high_gain(scene.camera.detector, given.out).resolve())]
     pairs = []
     for row in rows:
-        pair = replay(session, trajectory, row, frames[row], detectors)
+        pair = replay(session, trajectory, row, frames[row], detectors, given.mend_poses)
         f = pair.figures
         print(
             f"{pair.name}: IoU {f['iou']:.4f}, rank {f['rank']:.3f}, limb {f['limb_px']:.2f} px, shift "
