@@ -196,5 +196,5 @@ def test_any_other_optics_make_another_aperture(finished_store: Any, key: str) -
     attributes = {**opened.attributes, "scene": {"camera": {"lens": "a", "f_number": 4.0}}}
     stub: Any = SimpleNamespace(spec=opened.spec, attributes={**attributes, "blocks": [opened.samples]})
     before = stub.attributes["scene"]["camera"]
-    assert retake._Reader(stub, before)._same_optics
-    assert not retake._Reader(stub, {**before, key: "other"})._same_optics
+    assert retake._StoredViews(stub, before)._same_optics
+    assert not retake._StoredViews(stub, {**before, key: "other"})._same_optics

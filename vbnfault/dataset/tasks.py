@@ -154,20 +154,20 @@ class _Shard:
         self._shared = store_module.SharedChunks()
         self._pending = set(wanted)
         self._made: dict[int, Encoded] = {}
-        self._coded: dict[int, Future[Encoded]] = {}  # at most one, to bound memory
+        self._coded: dict[int, Future[Encoded]] = {}  # at most two, to bound memory
         self.lost: set[int] = set()
 
     def add(self, sample: Sample, index: int) -> None:
-        """Begin to encode a sample, after the one before. A careful task waits until it is written."""
-        self.collect()
+        """Begin to encode a sample, and report the one before. A careful task waits until it is written."""
+        # begun first: an interrupt ends the report, and the sample is written all the same
         self._coded[index] = self._aside.submit(store_module.encode, self._store.spec, sample, self._shared)
-        if self._task.careful:
-            self.collect()
+        self.collect(left=0 if self._task.careful else 1)
 
-    def collect(self) -> None:
-        """Wait until the last sample is encoded, and report it."""
-        while self._coded:
-            i, future = self._coded.popitem()
+    def collect(self, left: int = 0) -> None:
+        """Wait until all samples but the last `left` are encoded, and report them."""
+        while len(self._coded) > left:
+            i = next(iter(self._coded))
+            future = self._coded.pop(i)
             try:
                 encoded = self._made[i] = future.result()
             except Exception as error:
