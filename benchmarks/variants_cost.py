@@ -27,6 +27,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
+import profile_sample
+
 from vbnfault import dataset, pipeline, store
 from vbnfault.core.quantities import Sample
 from vbnfault.dataset.tasks import Task, work
@@ -39,17 +41,7 @@ from vbnfault.scene import config
 P = ParamSpec("P")
 T = TypeVar("T")
 
-STAGES = (
-    "resolve",
-    "render_view",
-    "meter",
-    "add_stars",
-    "inject_faults",
-    "take_images",
-    "label",
-    "to_sample",
-    "store",
-)
+STAGES = (*profile_sample.STAGES, "store")
 
 
 @dataclass
