@@ -229,10 +229,11 @@ def test_workers_write_nothing_after_the_client_was_killed(
     assert resumed(out) == undisturbed[1]
 
 
-def until_idle() -> None:
-    """Wait until no task runs on a worker."""
-    with dask._worker_lock:
-        pass
+async def until_idle() -> None:
+    """Wait until no task runs on a worker, which needs its event loop to report that it was cancelled."""
+    while not dask._worker_lock.acquire(blocking=False):
+        await asyncio.sleep(0.02)
+    dask._worker_lock.release()
 
 
 def main(out: str, scheduler: str) -> None:
