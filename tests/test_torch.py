@@ -225,7 +225,7 @@ def test_a_batch_that_is_kept_is_not_written_over(finished_store: Path) -> None:
 def test_a_slot_is_free_when_its_last_tensor_is_gone(finished_store: Path) -> None:
     loader = Loader(batches(finished_store), num_workers=1, prefetch_factor=1)
     first = next(iter(loader))
-    slots = loader.batches.slots
+    slots = loader._slots
     assert slots is not None
     part, used = first["image"][:, :1], set(slots._used)
     assert len(used) == 1
@@ -239,6 +239,23 @@ def test_a_slot_is_free_when_its_last_tensor_is_gone(finished_store: Path) -> No
         for batch in loader:
             del batch
     assert not slots._used
+
+
+def test_a_loader_without_workers_uses_its_memory_again(
+    finished_store: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("vbnfault.torch.datasets.new_tensors", pytest.fail)
+    loader = Loader(batches(finished_store))
+    places = {batch["image"].untyped_storage().data_ptr() for _ in range(3) for batch in loader}
+    assert len(places) <= 2
+
+
+def test_batches_are_read_as_usual_after_a_loader(finished_store: Path) -> None:
+    source = batches(finished_store)
+    wanted = rows(Loader(source, num_workers=1))
+    source.set_epoch(0)
+    assert rows(source) == wanted
+    assert rows(DataLoader(source, batch_size=None, num_workers=1)) == wanted
 
 
 def test_small_tensors_need_no_shared_memory_of_their_own() -> None:

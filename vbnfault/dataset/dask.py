@@ -182,9 +182,13 @@ class _ClusterRun:
         self._deaths_between_items: Counter[int] = Counter()  # by task
         self._seen_workers = False
         self._without_workers_since: float | None = None
+        self._lost = False  # the connection to the scheduler
 
     def work(self) -> None:
-        """Do all tasks. At an interrupt or an error, let the workers write what they have made."""
+        """Do all tasks. At an interrupt or an error, let the workers write what they have made.
+
+        Without a scheduler nothing can be said to them: each request would only wait for its time limit.
+        """
         self._client.subscribe_topic(self._topic, self._on_event)
         try:
             number = self._job.next_task()
@@ -198,8 +202,9 @@ class _ClusterRun:
                 self._wind_up()
             raise
         finally:
-            with contextlib.suppress(Exception):
-                self._client.cancel(list(self._tasks))
+            if not self._lost:
+                with contextlib.suppress(Exception):
+                    self._client.cancel(list(self._tasks))
 
     def _submit(self, number: int) -> None:
         """Give a task to the cluster."""
@@ -254,7 +259,8 @@ class _ClusterRun:
             )
 
     def _connection_lost(self) -> VbnfaultError:
-        """Return the error for a scheduler that does not answer any more."""
+        """Note that the scheduler does not answer any more, and return the error for it."""
+        self._lost = True
         return VbnfaultError(
             f"--scheduler {self._scheduler}: the connection to the scheduler was lost; finished "
             f"{self._job.item_noun}s stay, and "
@@ -306,7 +312,7 @@ class _ClusterRun:
 
     def _wind_up(self) -> None:
         """Take back the tasks that no worker has begun, and wait until the others have written what they made."""
-        if self._client.status != "running":
+        if self._lost or self._client.status != "running":
             return
         begun = {key for keys in self._client.processing().values() for key in keys}
         waiting = {future for future in self._tasks if future.key in begun}
@@ -319,5 +325,8 @@ class _ClusterRun:
         )
         deadline = time.monotonic() + _SECONDS_TO_STOP
         while waiting and (seconds := deadline - time.monotonic()) > 0:
-            with contextlib.suppress(queue.Empty):
-                waiting.discard(self._ended.get(timeout=seconds))
+            try:
+                waiting.discard(self._ended.get(timeout=min(seconds, _SECONDS_BETWEEN_CHECKS)))
+            except queue.Empty:
+                if not self._client.nthreads():  # or an error, if the scheduler has gone
+                    return

@@ -18,11 +18,11 @@ from torch import Tensor
 from torch.utils.data import Dataset, IterableDataset, Sampler, default_collate, get_worker_info
 
 from ..core import environment
-from ..core.errors import InputError, VbnfaultError, shown
+from ..core.errors import InputError, shown
 from ..store import open_store
 from ..train import Columns, Order, SampleReader, Targets, select
 from ..train.selection import Where
-from .slots import Failure, Slots
+from .slots import Slots
 
 Batch = dict[str, Any]
 Transform = Callable[[Batch], Batch]
@@ -271,7 +271,6 @@ class BatchDataset(IterableDataset[Batch]):
     def __init__(self, data: SampleDataset, **order: Unpack[OrderOptions]) -> None:
         self.data = data
         self.order = _order(data, **order)
-        self.slots: Slots | None = None  # where a `Loader` wants the batches of workers
         self._position = _shared_numbers(2)  # epoch and first batch; workers that live on see a change
 
     def set_epoch(self, epoch: int, batch: int = 0) -> None:
@@ -291,7 +290,11 @@ class BatchDataset(IterableDataset[Batch]):
         return len(self.order)
 
     def __iter__(self) -> Iterator[Batch]:
-        """Yield the batches of this worker; in a worker of a `Loader`, in the memory that it shares."""
+        """Yield the batches of this worker."""
+        return self.read_batches()
+
+    def read_batches(self, slots: Slots | None = None) -> Iterator[Any]:
+        """Yield the batches of this worker; with slots, as `Packed` where one is free."""
         info = get_worker_info()
         worker, workers = (info.id, info.num_workers) if info else (0, 1)
         epoch, start = (int(number) for number in self._position)
@@ -302,27 +305,26 @@ class BatchDataset(IterableDataset[Batch]):
         try:
             for k, batch in enumerate(batches):
                 soon = np.concatenate([*batches[k + 1 : k + 1 + ahead], np.empty(0, dtype=np.int64)])
-                yield self._batch(batch.tolist(), soon.tolist(), epoch, scratch)
-        except VbnfaultError as error:
-            if self.slots is None or info is None:
-                raise
-            yield Failure(type(error), str(error))  # type: ignore[misc]
+                if self.data.transform is not None:
+                    yield self._transformed(batch.tolist(), soon.tolist(), epoch, scratch)
+                    continue
+                slot = slots.take(worker) if slots is not None else None
+                targets, count = self.data.targets, len(batch)
+                layers = slot.tensors(targets.buffers(count)) if slot else new_tensors(targets, count)
+                made = self.data.read(batch.tolist(), layers, soon.tolist())
+                yield slot.packed(made) if slot else made
         finally:
             self.data.close()
 
-    def _batch(
+    def _transformed(
         self, samples: list[int], upcoming: list[int], epoch: int, scratch: dict[int, dict[str, Tensor]]
-    ) -> Any:
-        """Return a batch of samples of the store; `Packed` where it lies in a slot."""
+    ) -> Batch:
+        """Return the collated results of the transform; `scratch` keeps the layers, which are used again."""
         data, count = self.data, len(samples)
-        if data.transform is not None:  # its results are collated, so that the layers can be used again
-            layers = scratch.setdefault(count, new_tensors(data.targets, count, shared=False))
-            return default_collate(data.transformed(split_batch(data.read(samples, layers, upcoming)), epoch))
-        info = get_worker_info()
-        slot = self.slots.take(info.id) if self.slots is not None and info is not None else None
-        if slot is None:
-            return data.read(samples, new_tensors(data.targets, count), upcoming)
-        return slot.packed(data.read(samples, slot.tensors(data.targets.buffers(count)), upcoming))
+        if count not in scratch:
+            scratch[count] = new_tensors(data.targets, count, shared=False)
+        read = data.read(samples, scratch[count], upcoming)
+        return default_collate(data.transformed(split_batch(read), epoch))
 
 
 def _order(

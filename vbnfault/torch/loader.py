@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.utils.data import DataLoader
+from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from ..core.errors import InputError, VbnfaultError, shown
 from .datasets import Batch, BatchDataset
@@ -32,8 +32,8 @@ class Loader:
     loaded. If a worker process dies, its batches are read again by new workers, with a warning; if that happens
     twice at the same batch, the iteration ends with one sentence.
 
-    A batch is a dictionary of tensors. In the main process it lies in memory that the workers fill again as soon as
-    no tensor of it is left, so nothing needs to be copied or released by hand.
+    A batch is a dictionary of tensors. It lies in memory that is filled again as soon as no tensor of it is left:
+    nothing needs to be copied or released by hand.
 
     Parameters
     ----------
@@ -80,6 +80,7 @@ class Loader:
         own: dict[str, Any] = {"generator": torch.Generator().manual_seed(batches.order.seed)}
         self._options = {**own, **({"persistent_workers": True} if num_workers else {}), **options}
         self._loader: DataLoader[Any] | None = None
+        self._slots: Slots | None = None
 
     def __len__(self) -> int:
         """Return the number of batches in an epoch."""
@@ -133,11 +134,11 @@ class Loader:
     def _received(self) -> Iterator[Batch]:
         """Yield the batches from the next one on, as tensors. Raises _WorkerDied, and the errors of workers."""
         self.batches.set_epoch(self.epoch, self._next)
-        if self._loader is None or not self._options.get("persistent_workers"):
+        if self._loader is None or (self._workers and not self._options.get("persistent_workers")):
             self._loader = self._new_loader()
-        slots = self.batches.slots
-        if slots is not None:
-            slots.free_dropped()
+        slots = self._slots
+        assert slots is not None
+        slots.free_dropped()
         received: Any = None
         try:
             with _signals_kept():
@@ -150,7 +151,6 @@ class Loader:
                 if isinstance(message, Failure):
                     raise message.kind(message.message)
                 if isinstance(message, Packed):
-                    assert slots is not None
                     message = slots.unpacked(message)
                 yield _pinned(message) if self._pin else message
                 del message  # a slot is free only when no tensor of it is left here either
@@ -162,13 +162,32 @@ class Loader:
             raise _WorkerDied(died) from None
 
     def _new_loader(self) -> DataLoader[Any]:
-        """Return a new PyTorch loader, with new slots for its workers."""
-        self.batches.slots = None
-        if self._workers:
-            each = int(self._options.get("prefetch_factor") or 2) + _SPARE_SLOTS
-            size = slot_size(self.batches.data.targets.buffers(self.batches.order.batch_size))
-            self.batches.slots = Slots(self._workers, each, size)
-        return DataLoader(self.batches, batch_size=None, num_workers=self._workers, **self._options)
+        """Return a new PyTorch loader, with new slots for its workers or for this process."""
+        ahead = int(self._options.get("prefetch_factor") or 2) if self._workers else 0
+        size = slot_size(self.batches.data.targets.buffers(self.batches.order.batch_size))
+        self._slots = Slots(max(1, self._workers), ahead + _SPARE_SLOTS, size, shared=self._workers > 0)
+        data = _InSlots(self.batches, self._slots)
+        return DataLoader(data, batch_size=None, num_workers=self._workers, collate_fn=_as_it_is, **self._options)
+
+
+class _InSlots(IterableDataset[Any]):
+    """Read the batches of a dataset into slots. A worker sends its errors as data."""
+
+    def __init__(self, batches: BatchDataset, slots: Slots) -> None:
+        self.batches, self.slots = batches, slots
+
+    def __iter__(self) -> Iterator[Any]:
+        try:
+            yield from self.batches.read_batches(self.slots)
+        except VbnfaultError as error:
+            if get_worker_info() is None:
+                raise
+            yield Failure(type(error), str(error))  # type: ignore[misc]
+
+
+def _as_it_is(batch: Any) -> Any:
+    """Return a batch unchanged: PyTorch would make tensors of its small arrays, each in its own shared memory."""
+    return batch
 
 
 class _WorkerDied(Exception):

@@ -91,14 +91,18 @@ class Slots:
         Slots of each worker.
     size
         Bytes of a slot, see `slot_size`.
+    shared
+        False: the workers are threads of this process.
     """
 
-    def __init__(self, workers: int, each: int, size: int) -> None:
+    def __init__(self, workers: int, each: int, size: int, *, shared: bool = True) -> None:
         # memory that nobody has written takes no room
         shape = (workers, each, _aligned(max(1, size)))
-        self._memory = torch.empty(0, dtype=torch.uint8).set_(
-            torch.UntypedStorage._new_shared(int(np.prod(shape))), 0, shape
-        )
+        if shared:
+            storage = torch.UntypedStorage._new_shared(int(np.prod(shape)))
+            self._memory = torch.empty(0, dtype=torch.uint8).set_(storage, 0, shape)
+        else:
+            self._memory = torch.empty(shape, dtype=torch.uint8)
         self._taken = torch.zeros(workers, each, dtype=torch.uint8).share_memory_()
         self._used: set[tuple[int, int]] = set()  # of the main process
 
