@@ -61,6 +61,19 @@ def samples() -> tuple[Session, list[Frame]]:
     return s, [s.frame(i) for i in range(6)]
 
 
+def test_the_relief_below_the_facets_follows_the_exponent_of_the_patch() -> None:
+    """On a self-affine surface, slopes over the length L vary as L to the power of the exponent minus 1."""
+    fine = {}
+    for hurst in (0.4, 0.9):
+        s = session(patch={"relief": 0.05, "hurst": hurst})  # so low that no slope reaches its limit
+        fine[hurst] = s.surface(s.patch(s.sites[0])).fine
+        assert fine[hurst].hurst == hurst
+    law = s.body.roughness
+    assert fine[0.4].slope / fine[0.9].slope == pytest.approx(
+        (fine[0.4].longest_m / 4 / law.baseline_m) ** -0.5, rel=1e-6
+    )
+
+
 def test_surface_points_reproject_onto_their_pixels(samples: tuple[Session, list[Frame]]) -> None:
     """A surface point, carried through T and the stored pose, lands on its pixel's centre to 0.01 px."""
     s, all_frames = samples

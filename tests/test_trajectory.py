@@ -328,6 +328,14 @@ def test_terrain_is_whole_from_afar_and_shared_and_a_patch_near_the_ground(tmp_p
     (middle,) = ground.ground_details(rich, body, [as_trajectory(columns_of([row("b", (0, 0, 1500.0))])).pose(0)])
     assert middle.position_T_m[2] > 450
     assert 0.7 < middle.facet_m / (1000 * ground.pixel_rad(scene)) < 1.25
+    # facets of two pixels, with the boulders that they can show
+    wide = rich.model_copy(update={"patch": rich.patch.model_copy(update={"facet_px": 2.0})})
+    (twice,) = ground.ground_details(wide, body, [as_trajectory(columns_of([row("b", (0, 0, 1500.0))])).pose(0)])
+    assert twice.facet_m == pytest.approx(2 * middle.facet_m, rel=1e-9)
+    assert (twice.boulder_m, middle.boulder_m) == (
+        pytest.approx(2 * twice.facet_m),
+        pytest.approx(2 * middle.facet_m),
+    )
 
 
 # ------------------------------------------------------------------------------------------------ stores

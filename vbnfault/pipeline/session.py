@@ -309,18 +309,21 @@ class Session:
         from .. import render
 
         vehicle = None if self.vehicle is None else assemble.render_vehicle(self.scene, self.vehicle)
+        law = self.body.roughness
+        if self.scene.patch.hurst is not None:
+            law = replace(law, hurst=self.scene.patch.hurst)
         fine = render.FineRelief(
             slope=0.0,
             facet_m=patch.facet_m,
             radius_m=patch.radius_m,
             growth=GROWTH_POWER,
-            hurst=self.body.roughness.hurst,
+            hurst=law.hurst,
         )
         # The slope of an octave of wavelength λ is 0.44 d / (λ/4), where d is the deviation over λ/4. The factor
         # 0.44 is the ratio of two integrals of the spectrum of a self-affine surface of Hurst exponent 0.85.
         length = fine.longest_m / 4
-        slope = 0.44 * float(self.body.roughness.deviation_at(length)) / length
-        slope = min(slope, _STEEPEST_DETAIL) * self.scene.patch.relief
+        slope = 0.44 * float(law.deviation_at(length)) / length
+        slope = min(slope * self.scene.patch.relief, _STEEPEST_DETAIL)
         return render.TerrainMesh(
             patch.vertices_L_m,
             patch.faces,

@@ -189,6 +189,9 @@ class PatchTable(Table):
     """Set how far and how finely the terrain around a site is refined."""
 
     facet_m: float = Field(0.12, ge=0.05, le=1e6, description="edge length aimed at within radius_m of the site")
+    facet_px: float = Field(
+        1.0, ge=0.25, le=8, description="for poses of a table: edge length in pixels of the nearest ground in view"
+    )
     radius_m: float = Field(40.0, ge=1, le=1e8, description="beyond, facets grow with the distance")
     max_triangles: int = Field(
         1_600_000, ge=10_000, le=20_000_000, description="facets are coarsened to keep to it"

@@ -1,9 +1,9 @@
-"""Choose the terrain for poses of a trajectory, so that its facets are about a pixel wide, from any distance.
+"""Choose the terrain for poses of a trajectory, so that its facets have the same width in pixels from any distance.
 
 Far away, the whole body is refined evenly, and poses at nearly the same distance share it. Where this would take
 too many triangles, the terrain is refined where the camera looks, as at a site of `[geometry]`: evenly over the
 ground in the frame, and beyond with facets that grow with the distance. Near the ground, `[patch]` sets the
-smallest facets. There is no border between these cases: facets are about a pixel wide in all of them.
+smallest facets. There is no border between these cases: facets are about `patch.facet_px` wide in all of them.
 """
 
 from __future__ import annotations
@@ -24,10 +24,8 @@ if TYPE_CHECKING:
 
 F64 = NDArray[np.float64]
 
-# Mean edge of a facet, in pixels of the nearest ground in the frame.
-FACET_PX = 1.0
-# Smallest boulder, in pixels of the nearest ground in the frame.
-_BOULDER_PX = 2.0
+# Smallest boulder, in facets.
+_BOULDER_FACETS = 2.0
 # Area of an equilateral triangle with edges of length 1.
 _TRIANGLE = 3**0.5 / 4
 # Fraction of the triangles for the even ground. The ground takes 0.66 of them (`body.patch`). Where one terrain
@@ -127,7 +125,7 @@ def _whole_body(scene: Scene, body: Body, pose: FlownPose) -> GroundDetail | Non
     Its origin is the vertex with the largest x in T, the same for all poses.
     """
     nearest_m = float(np.linalg.norm(body.vertices_m - pose.camera_position_T_m, axis=1).min())
-    facet_m = max(scene.patch.facet_m, FACET_PX * pixel_rad(scene) * _rounded(nearest_m))
+    facet_m = max(scene.patch.facet_m, scene.patch.facet_px * pixel_rad(scene) * _rounded(nearest_m))
     if body.area_m2 > _EVEN_FRACTION * scene.patch.max_triangles * _TRIANGLE * facet_m**2:
         return None
     origin = body.vertices_m[np.argmax(body.vertices_m[:, 0])]
@@ -137,9 +135,9 @@ def _whole_body(scene: Scene, body: Body, pose: FlownPose) -> GroundDetail | Non
 def _around(scene: Scene, seen: Sequence[_Seen]) -> GroundDetail:
     """Return the terrain for the ground in several frames.
 
-    A point at the distance d from its camera and s from the origin has facets of a pixel if the even radius is at
-    least s · d_nearest / d. The origin is the point for which this radius is smallest, or the ground nearest to a
-    camera where `patch.radius_m` suffices.
+    A point at the distance d from its camera and s from the origin has facets of the wanted width if the even
+    radius is at least s · d_nearest / d. The origin is the point for which this radius is smallest, or the ground
+    nearest to a camera where `patch.radius_m` suffices.
     """
     points = np.concatenate([part.points_T_m for part in seen])
     distance = np.concatenate([part.distance_m for part in seen])
@@ -154,7 +152,7 @@ def _around(scene: Scene, seen: Sequence[_Seen]) -> GroundDetail:
         spread = points[np.linspace(0, len(points) - 1, min(len(points), _ORIGINS)).astype(int)]
         origin = min(spread, key=needed_radius_m)
         radius_m = needed_radius_m(origin)
-    facet_m = max(scene.patch.facet_m, FACET_PX * pixel_rad(scene) * _rounded(least_m))
+    facet_m = max(scene.patch.facet_m, scene.patch.facet_px * pixel_rad(scene) * _rounded(least_m))
     return _detail(scene, origin, facet_m, max(radius_m, scene.patch.radius_m))
 
 
@@ -174,7 +172,7 @@ def _affordable(scene: Scene, body: Body, detail: GroundDetail) -> GroundDetail:
 def _detail(scene: Scene, origin_T_m: F64, facet_m: float, radius_m: float) -> GroundDetail:
     """Return a terrain with the boulders that facets of this size can show."""
     x, y, z = (float(v) for v in origin_T_m)
-    boulder_m = max(scene.patch.min_boulder_m, _BOULDER_PX * facet_m / FACET_PX)
+    boulder_m = max(scene.patch.min_boulder_m, _BOULDER_FACETS * facet_m)
     if facet_m == scene.patch.facet_m:  # pixels are smaller than facets
         boulder_m = scene.patch.min_boulder_m
     return GroundDetail(
