@@ -60,7 +60,9 @@ def candidates(array: NDArray[Any]) -> Iterator[Candidate]:
     gzip, lz4 = GZip(level=5), LZ4()
     yield Candidate("gzip 5", gzip.encode, gzip.decode)
     yield Candidate("lz4", lz4.encode, lz4.decode)
-    sizes = {array.itemsize, array.itemsize * array.shape[-1]} if array.shape[-1] in (3, 4) else {array.itemsize}
+    sizes = {array.itemsize} | ({array.itemsize * array.shape[-1]} if array.shape[-1] in (3, 4) else set())
+    if array.dtype == np.uint8:
+        sizes.add(2)  # Blosc shuffles the bits of single bytes without vector instructions
     for size in sorted(sizes):
         for shuffle in ("shuffle", "bitshuffle"):
             for library, level in (("lz4", 5), ("zstd", 1), ("zstd", 3), ("zstd", 5), ("zstd", 7)):

@@ -6,7 +6,8 @@
 It needs PyTorch. Every arm reads image and masks of all samples in shuffled order, in batches, for some epochs,
 with the files in the system's cache. The arms take turns, round by round. The table gives for each arm the median
 of wall time and of processor time (of all processes) a sample, and how many times as long that is as for
-`vbnfault.torch`. Before that, the arrays of all arms but PNG are compared: they are equal.
+`vbnfault.torch`. A line says how much of the machine's processor time other programs took meanwhile: wall times
+count only where that is little. Before that, the arrays of all arms but PNG are compared: they are equal.
 
 - `naive xarray`: what its documentation suggests, in this process: `data = xarray.open_zarr(store)`, and for each
   sample `data.image[i].values` and `data.mask[i].values`. Where Dask is installed, `open_zarr` makes Dask arrays.
@@ -93,6 +94,13 @@ def processor_s() -> float:
         times = process.cpu_times()
         total += times.user + times.system
     return total
+
+
+def of_machine_s() -> tuple[float, float]:
+    """Return the processor time that all programs have used, and all that there was, in s."""
+    times = psutil.cpu_times()
+    whole = sum(times) - getattr(times, "guest", 0.0) - getattr(times, "guest_nice", 0.0)
+    return whole - times.idle - getattr(times, "iowait", 0.0), whole
 
 
 def one_by_one(data: Naive) -> Iterator[Any]:
@@ -184,11 +192,13 @@ def main() -> None:
         begin = arms(options.store, Path(folder) / "png", options)
         samples = len(Naive(options.store))
         taken: dict[str, list[tuple[float, float]]] = {name: [] for name in begin}
+        own_before, before = processor_s(), of_machine_s()
         for k in range(options.rounds + 1):  # the first round starts the workers and fills the cache
             for name, epoch in begin.items():
                 times = timed(epoch, options.epochs, samples)
                 if k:
                     taken[name].append(times)
+        (busy, whole), own_s = np.subtract(of_machine_s(), before), processor_s() - own_before
     median = {name: [statistics.median(t[c] for t in times) for c in (0, 1)] for name, times in taken.items()}
     own = median["vbnfault.torch, workers"]
     print(
@@ -197,6 +207,7 @@ def main() -> None:
     print(f"{'':<30}{'wall':>8}{'ratio':>8}{'CPU':>8}{'ratio':>8}")
     for name, (wall, processor) in median.items():
         print(f"{name:<30}{wall:8.1f}{wall / own[0]:8.2f}{processor:8.1f}{processor / own[1]:8.2f}")
+    print(f"other programs took {max(0.0, busy - own_s) / whole:.0%} of the machine's processor time")
     imported, started = start_of_a_worker(options.store)
     print(
         f"a spawned worker: {started:.2f} s to its first sample, after {imported:.2f} s for the import of PyTorch"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,8 @@ from synthetic import fake_sample, filled, flip
 
 from vbnfault import store as st
 from vbnfault.core.errors import VbnfaultError
-from vbnfault.store import disk
+from vbnfault.store import disk, shards
+from vbnfault.store.codec import crc32c
 
 LAYERS = ("image", "mask", "depth_m")
 
@@ -97,6 +99,26 @@ def test_another_layer_in_the_place_of_a_chunk_is_noticed(whole: st.Store) -> No
     assert sum(fake_sample(whole.spec, 4).scalars["injected"]) > 0
     with pytest.raises(VbnfaultError, match="clean of sample 4 does not match its stored crc32c"):
         decoded(reader, reader.fetch(1, [4])[4], "clean")
+
+
+def test_a_layer_is_compared_again_only_where_its_chunk_or_checksum_is_another(
+    finished_store: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = st.open_store(finished_store)
+    reader = st.ShardReader(store, ["image"])
+    compared: list[int] = []
+    monkeypatch.setattr(shards, "crc32c", lambda array: compared.append(crc32c(array)) or compared[-1])
+    fetched = reader.fetch(1, [4, 5])
+    for _ in range(3):
+        for sample in fetched.values():
+            decoded(reader, sample, "image")
+    assert compared == [sample.crc32c["image"] for sample in fetched.values()]
+    out = np.empty_like(decoded(reader, fetched[4], "image"))
+    other_chunk = replace(fetched[4], chunks=fetched[5].chunks)
+    other_checksum = replace(fetched[4], crc32c={"image": fetched[5].crc32c["image"]})
+    for k, changed in enumerate((other_chunk, other_checksum), 3):
+        assert reader._decode(changed, "image", out) == "does not match its stored crc32c"
+        assert len(compared) == k
 
 
 def test_a_sample_that_is_rewritten_meanwhile_is_read_again(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import VbnfaultError
@@ -47,6 +48,8 @@ class ShardReader:
         self._checked = {name: k for k, name in enumerate(store.spec.checked)}
         # checksums of compressed chunks of zeros by layer, which are filled in without decoding them again
         self._zeros: dict[tuple[str, bytes], int] = {}
+        # by layer and sample, which chunk matched which stored checksum when it was last compared: 0 if none did
+        self._matched = {name: np.zeros(store.samples, dtype=np.uint64) for name in self.layers}
 
     def fetch(self, number: int, samples: Collection[int]) -> dict[int, FetchedSample]:
         """Return the compressed chunks of samples of one shard; each file is opened once.
@@ -67,6 +70,9 @@ class ShardReader:
 
     def decode(self, fetched: FetchedSample, name: str, out: NDArray[Any]) -> None:
         """Decode a layer of a sample into a contiguous array, and compare it with its checksum.
+
+        Every chunk has a checksum of its own, which is always compared. The one that the store holds of the decoded
+        layer is compared the first time, and again when the chunk or that checksum is another one.
 
         Raises VbnfaultError, with store, layer and sample, if it is damaged.
         """
@@ -110,9 +116,14 @@ class ShardReader:
                 compressor(self.store.spec.codecs[name]).decode_into(data, out)
             except ValueError:
                 return "cannot be decoded"
+            chunk = np.uint64(int.from_bytes(data[-4:], "little") << 32 | fetched.crc32c[name])
+            if self._matched[name][fetched.index] == chunk:
+                return ""
             crc = crc32c(out)
-            if len(data) <= _SMALL_CHUNK and crc == fetched.crc32c[name] and not out.any():
-                self._zeros[name, data] = crc
+            if crc == fetched.crc32c[name]:
+                self._matched[name][fetched.index] = chunk
+                if len(data) <= _SMALL_CHUNK and not out.any():
+                    self._zeros[name, data] = crc
         return "" if crc == fetched.crc32c[name] else "does not match its stored crc32c"
 
     def _span(self, number: int) -> str:

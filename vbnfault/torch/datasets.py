@@ -178,6 +178,11 @@ class SampleDataset(Dataset[Batch]):
             self._reader[1].close()
         self._reader = None
 
+    def release(self) -> None:
+        """Drop what was read ahead of its use."""
+        if self._reader is not None and self._reader[0][0] == os.getpid():
+            self._reader[1].release()
+
     def _class_indices(self) -> list[int]:
         """Return the positions of the chosen classes on the fault axis of the store."""
         return [self.targets.spec.faults.index(name) for name in self.classes]
@@ -314,7 +319,7 @@ class BatchDataset(IterableDataset[Batch]):
                 made = self.data.read(batch.tolist(), layers, soon.tolist())
                 yield slot.packed(made) if slot else made
         finally:
-            self.data.close()
+            self.data.release()
 
     def _transformed(
         self, samples: list[int], upcoming: list[int], epoch: int, scratch: dict[int, dict[str, Tensor]]

@@ -39,6 +39,11 @@ class SampleReader:
             if pool is not None:
                 pool.shutdown(wait=True, cancel_futures=True)
 
+    def release(self) -> None:
+        """Drop what was read ahead of its use."""
+        self._wait()
+        self._held.clear()
+
     def buffers(self, count: int) -> dict[str, NDArray[Any]]:
         """Return new arrays for `fill`, for `count` samples."""
         return {name: np.empty(shape, dtype) for name, (shape, dtype) in self.targets.buffers(count).items()}
