@@ -12,6 +12,7 @@ from vbnfault.body import ellipsoid, load_body
 from vbnfault.body.roughness import deviogram, mean_edge_m
 from vbnfault.body.shape import vertex_normals
 from vbnfault.body.sharpen import sharpened
+from vbnfault.dataset.identity import scene_identity
 
 SPHERE, FACES = ellipsoid((1000.0, 1000.0, 1000.0), 0.0)
 
@@ -53,6 +54,21 @@ def test_auto_continues_the_roughness_of_a_smoothed_model(real_shape: Path) -> N
     assert restored == pytest.approx(long * 1.3 / 3.8, rel=0.1)
     assert restored > 1.3 * short
     assert body.volume_m3 < sharp.volume_m3 < 18.6e9
+
+
+def test_a_shape_is_scaled_about_its_origin_to_the_volume_that_is_asked_for() -> None:
+    body, larger = load_body(), load_body(volume_m3=8 * load_body().volume_m3)
+    np.testing.assert_allclose(larger.vertices_m, 2 * body.vertices_m, rtol=1e-12)
+    for volume in (0.0, -1.0, np.inf, np.nan):
+        with pytest.raises(vbnfault.InputError, match=r"volume_m3 = .* must be positive"):
+            load_body(volume_m3=volume)
+    scene = vbnfault.load_scene("paper67p", {"body.volume_km3": 18.8})
+    session = vbnfault.Session(scene)
+    assert session.body.volume_m3 == pytest.approx(18.8e9, rel=1e-9)
+    assert scene_identity(session)["body"]["volume_km3"] == 18.8
+    assert "volume_km3" not in scene_identity(vbnfault.Session(vbnfault.load_scene("paper67p")))["body"]
+    with pytest.raises(vbnfault.InputError, match=r"volume_km3 = 5: semi_axes_m sets the volume"):
+        vbnfault.load_scene("paper67p", {"body.volume_km3": 5.0, "body.shape": "ellipsoid"})
 
 
 def test_a_shape_file_is_needed() -> None:

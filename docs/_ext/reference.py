@@ -48,6 +48,7 @@ _UNITS = {
     "_nm": "nm",
     "_per_100nm": "1/(100 nm)",
     "_per_km2": "1/km²",
+    "_km3": "km³",
     "_per_mm": "1/mm",
     "_percentile": "%",
     "_px": "px",

@@ -145,6 +145,7 @@ def load_body(
     unit: Unit = "auto",
     name: str | None = None,
     sharpen: float | Literal["auto"] = 0.0,
+    volume_m3: float | None = None,
     density_kg_m3: float = DENSITY_67P_KG_M3,
     rotation_period_s: float = ROTATION_PERIOD_67P_S,
 ) -> Body:
@@ -163,17 +164,23 @@ def load_body(
         Default: "embedded" or the file's name without its suffix.
     sharpen
         Gain with which relief lost by smoothing is restored, see `sharpened`; not used for the embedded nucleus.
+    volume_m3
+        Volume to which the shape is scaled about its origin; default: as it is.
 
     Raises
     ------
     InputError
-        The shape cannot be used, or density or period is not positive.
+        The shape cannot be used, or volume, density or period is not positive.
     """
     if str(shape) == EMBEDDED:
         vertices_m, faces = embedded_nucleus()
     else:
         vertices_m, faces = load_shape(shape, unit)
         vertices_m = sharpened(vertices_m, faces, sharpen)
+    if volume_m3 is not None:
+        if not 0 < volume_m3 < np.inf:
+            raise InputError(f"volume_m3 = {volume_m3:g}: must be positive and finite")
+        vertices_m = vertices_m * (volume_m3 / signed_volume(vertices_m, faces)) ** (1 / 3)
     return Body(
         name=name or (EMBEDDED if str(shape) == EMBEDDED else Path(shape).stem),
         vertices_m=vertices_m,

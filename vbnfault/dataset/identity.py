@@ -97,6 +97,8 @@ def _leave_out_unused(identity: dict[str, Any], scene: Scene) -> None:
         del identity["body"]["albedo_map"]["projection"]
     if scene.body.sharpen == 0:
         del identity["body"]["sharpen"]
+    if scene.body.volume_km3 is None:
+        del identity["body"]["volume_km3"]
     if scene.coma is None:
         del identity["coma"]
     if scene.camera.point_spread is None:
@@ -117,6 +119,7 @@ def _leave_out_unused(identity: dict[str, Any], scene: Scene) -> None:
         ("dataset", "variants_per_view"),
         ("dataset", "radiance_dtype"),
         ("camera", "exposure_stops"),
+        ("patch", "facet_px"),
     ):
         values = getattr(scene, table)
         if getattr(values, key) == type(values).model_fields[key].default:

@@ -117,6 +117,12 @@ class BodyTable(Table):
         description="restores the relief that a smoothed shape file has lost near its facets: the gain of its "
         "shortest wavelengths; 'auto': as far as its roughness at longer ones asks for; 0: the file as it is",
     )
+    volume_km3: float | None = Field(
+        None,
+        ge=1e-12,
+        le=1e13,
+        description="the shape is scaled about its origin to this volume; default: as it is",
+    )
     semi_axes_m: tuple[SemiAxis, SemiAxis, SemiAxis] = Field(
         (1000.0, 1000.0, 1000.0), description="of an 'ellipsoid'"
     )
@@ -145,9 +151,13 @@ class BodyTable(Table):
         return self
 
     @model_validator(mode="after")
-    def _sharp(self) -> BodyTable:
+    def _of_a_mesh(self) -> BodyTable:
         if self.sharpen and self.shape in ("embedded", "ellipsoid"):
             raise ValueError(f"sharpen = {self.sharpen!r}: needs a shape file, not shape = {self.shape!r}")
+        if self.volume_km3 is not None and self.shape == "ellipsoid":
+            raise ValueError(
+                f"volume_km3 = {self.volume_km3:g}: semi_axes_m sets the volume of shape = 'ellipsoid'"
+            )
         return self
 
     @model_validator(mode="after")

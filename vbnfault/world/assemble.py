@@ -288,7 +288,10 @@ def _body(scene: Scene) -> Body:
     if table.shape == "ellipsoid":
         vertices, faces = ellipsoid(table.semi_axes_m, table.relief_m)
         return Body(name=table.name, vertices_m=vertices, faces=faces, **physical)
-    return load_body(table.shape, unit=table.unit, name=table.name, sharpen=table.sharpen, **physical)
+    volume_m3 = None if table.volume_km3 is None else 1e9 * table.volume_km3
+    return load_body(
+        table.shape, unit=table.unit, name=table.name, sharpen=table.sharpen, volume_m3=volume_m3, **physical
+    )
 
 
 # A shape that differs by more than these fractions in volume or longest extent belongs to another body.
