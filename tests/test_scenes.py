@@ -22,7 +22,7 @@ _SMALL = {"camera.width_px": 64, "camera.height_px": 64, "render.samples_per_pix
 @pytest.mark.parametrize("name", sorted(resources.packaged("scenes")))
 def test_every_packaged_scene_builds_a_store_that_verifies(name: str, tmp_path: Path) -> None:
     whole = config.load_scene(name)
-    samples = min(3, whole.dataset.samples)
+    samples = min(2, whole.dataset.samples)
     coarse = {"patch.facet_m": max(whole.patch.facet_m, 15.0), "patch.radius_m": min(whole.patch.radius_m, 60.0)}
     small = {**_SMALL, **coarse, "dataset.samples": samples}
     if whole.is_aimed:  # each sample has its own terrain

@@ -202,7 +202,7 @@ def test_a_killed_migration_is_continued_by_the_same_call(
         if not was_killed:
             break
         shutil.rmtree(source)
-        operations += 1 if operations < 3 else 37  # the first ones, and then some of the hundreds
+        operations += 1 if operations < 3 else 83  # the first ones, and then some of the hundreds
     assert kills >= 4
     assert not list(tmp_path.glob(".*"))
 

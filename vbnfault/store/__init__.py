@@ -39,10 +39,11 @@ from .codec import Encoded, SharedChunks, encode, mask_union
 from .counts import FaultCounts
 from .files import Location, files_of, located
 from .formats import FORMAT_VERSION
-from .group import Store, create, is_store, open_store, write_samples
+from .group import create, is_store, open_store, write_samples
 from .labelled import open_dataset
 from .metadata import append_samples, recover
 from .migration import check_target, migrate, migrate_copy
+from .opened import Store
 from .schema import SPLITS, STRATA, VOLATILE_ATTRIBUTES, StoreSpec
 from .shards import FetchedSample, ShardReader
 

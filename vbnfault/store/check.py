@@ -24,8 +24,9 @@ from .codec import DIGEST_BYTES, crc_of_scalars, mask_union, sample_digest, thre
 from .compressors import compressor
 from .counts import FaultCounts
 from .formats import DIGEST_VERSION
-from .group import Store, open_store
+from .group import open_store
 from .metadata import metadata_problems, short
+from .opened import Store
 from .schema import VOLATILE_ATTRIBUTES, StoreSpec
 
 

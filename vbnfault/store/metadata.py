@@ -15,7 +15,7 @@ from . import disk
 from .arrays import Member
 from .bucket import Url
 from .files import Files
-from .group import Store, open_store, read_document, read_root
+from .group import open_store, read_document, read_root
 from .layout import (
     DOCUMENT,
     SPARE,
@@ -28,6 +28,7 @@ from .layout import (
     sealed,
     to_bytes,
 )
+from .opened import Store
 from .schema import spec_from_plain
 
 

@@ -22,9 +22,10 @@ from .codec import join_shard, threads
 from .compressors import compressor
 from .files import files_of, located
 from .formats import FORMAT_VERSION
-from .group import Store, group_files, is_store, open_store, read_root
+from .group import group_files, is_store, open_store, read_root
 from .layout import root_attributes
 from .metadata import bring_to
+from .opened import Store
 from .schema import StoreSpec
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..core.errors import VbnfaultError
 from .codec import crc32c
 from .compressors import compressor
-from .group import Store
+from .opened import Store
 
 # A compressed chunk of at most this size may be that of an empty mask, which occurs again and again.
 _SMALL_CHUNK = 1024

@@ -1,0 +1,458 @@
+"""Read samples of an open store, and write its shards.
+
+Only whole files are written, and `done` is written last.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.errors import InputError, VbnfaultError
+from ..core.quantities import Sample
+from . import disk
+from .arrays import SCALARS
+from .codec import (
+    Encoded,
+    chunk_ranges,
+    crc32c,
+    crc_of_scalars,
+    index_size,
+    join_shard,
+    split_shard,
+)
+from .files import Files
+from .layout import (
+    DOCUMENT,
+    OWN_ATTRIBUTES,
+    SPARE,
+    array_documents,
+    decode_values,
+    encode_values,
+    group_document,
+    sealed,
+    to_bytes,
+)
+from .schema import spec_from_plain
+
+if TYPE_CHECKING:
+    import zarr
+
+# errors that mean a damaged or missing file; any other OSError may be temporary
+_DAMAGE = (ValueError, FileNotFoundError, NotADirectoryError, disk.Misplaced)
+# a sample counts as damaged after so many reads that do not match the checksums although nothing was rewritten
+_READS = 3
+
+
+class Store:
+    """Hold an open store, as `open_store` returns it.
+
+    `array` and `read` read through zarr, as a user does, and so does `read_sample` the layers. `column` and `chunk`
+    read the files directly.
+    """
+
+    def __init__(self, files: Files, attributes: dict[str, Any], mode: str) -> None:
+        self.files, self.path = files, files.path
+        self.root_attributes = attributes
+        self.attributes = {k: v for k, v in attributes.items() if k not in OWN_ATTRIBUTES}
+        self.samples = int(attributes["samples"])
+        self.spec = spec_from_plain(attributes["store"], self.attributes)
+        self._mode: Any = mode
+        self._arrays: dict[str, zarr.Array[Any]] = {}
+        self._shapes: dict[str, tuple[int, ...]] = {}
+
+    @property
+    def shards(self) -> int:
+        """Return the number of shards along the sample axis."""
+        return -(-self.samples // self.spec.shard_samples)
+
+    def shard(self, number: int) -> range:
+        """Return the samples of a shard."""
+        size = self.spec.shard_samples
+        return range(number * size, min((number + 1) * size, self.samples))
+
+    def array(self, name: str) -> zarr.Array[Any]:
+        """Return the zarr array. Raises VbnfaultError if it is missing or its metadata cannot be read."""
+        if name not in self._arrays:
+            import zarr  # not above: reading the files directly needs no zarr, and its import takes 0.4 s
+
+            try:
+                self.files.expect_file(f"{name}/{DOCUMENT}")
+                root = self.files.zarr()
+                self._arrays[name] = zarr.open_array(root, path=name, mode=self._mode, zarr_format=3)
+            except Exception as error:  # zarr raises many types for metadata that it cannot parse
+                failure = self.files.failure(error, name)
+                if failure is not None:
+                    raise failure from error
+                raise VbnfaultError(
+                    f"{self.path}: {self.why_closed(name)}; the build command re-creates it"
+                ) from error
+        return self._arrays[name]
+
+    def update_attributes(self, values: Mapping[str, Any]) -> None:
+        """Change root attributes on disk, in `spare` first. A store must be opened again to show them."""
+        self.root_attributes = sealed({**self.root_attributes, **json.loads(json.dumps(values))})
+        arrays = array_documents(self.spec.members(self.samples))
+        self.files.write([(f"{SPARE}/{DOCUMENT}", to_bytes(group_document(self.root_attributes)))])
+        self.files.write([(DOCUMENT, to_bytes(group_document(self.root_attributes, arrays)))])
+
+    def why_closed(self, name: str) -> str:
+        """Return why `array` cannot open an array, as a clause."""
+        if not self.files.exists(f"{name}/{DOCUMENT}"):
+            return f"array {name} is missing"
+        return f"array {name} cannot be opened, {name}/{DOCUMENT} is damaged"
+
+    def read(self, name: str, start: int = 0, stop: int | None = None) -> NDArray[Any]:
+        """Return samples `start` to `stop` - 1 of an array; samples that are not built yet have the fill value.
+
+        Raises VbnfaultError if the samples cannot be decoded, or if the file of a finished one is missing.
+        """
+        stop = self.samples if stop is None else stop
+        try:
+            if name in self.spec.arrays:
+                for number in range(start // self.spec.shard_samples, -(-stop // self.spec.shard_samples)):
+                    self.files.expect_file(self.file_name(name, number))
+            values = np.asarray(self.array(name)[start:stop])
+        except VbnfaultError:
+            raise
+        except Exception as error:
+            failure = self.files.failure(error, name)
+            if failure is not None:
+                raise failure from error
+            raise VbnfaultError(
+                f"{self.path}: {name} of samples {start}-{stop - 1} cannot be read ({error}); "
+                f"the build command repairs it"
+            ) from error
+        self._expect_written(name, start, values)
+        return values
+
+    def _expect_written(self, name: str, start: int, values: NDArray[Any]) -> None:
+        """Raise VbnfaultError if zarr read zeros because the file of finished samples, from `start` on, is missing.
+
+        Only values that are all zero ask whether their file exists, which costs a request to an object store.
+        """
+        if name not in self.spec.arrays or name == "done" or self.spec.empty(name):
+            return
+        fill = self.spec.arrays[name].fill
+        for number in range(start // self.spec.shard_samples, -(-(start + len(values)) // self.spec.shard_samples)):
+            samples, file = self.shard(number), self.file_name(name, number)
+            part = values[max(0, samples.start - start) : max(0, samples.stop - start)]
+            written = ~np.isnan(part) if isinstance(fill, float) else part != fill  # numbers: NaN
+            if written.any() or self.files.exists(file):
+                continue
+            lost = [i for i, done in self.done(number).items() if done and start <= i < start + len(values)]
+            if lost:
+                raise VbnfaultError(
+                    f"{self.path}: {name} of samples {lost[0]}-{lost[-1]} cannot be read: the file {file} is "
+                    "missing; the build command repairs it"
+                )
+
+    def read_sample(self, index: int, layers: Collection[str] | None = None) -> Sample:
+        """Return one sample, compared with its checksums; with `layers`, only these of its layers.
+
+        If the sample is being rewritten, the result is the old or the new version, never a mixture. Raises
+        InputError if the sample does not exist or is not finished, VbnfaultError if it is damaged.
+        """
+        if not 0 <= index < self.samples:
+            raise InputError(f"{self.path}: sample {index} does not exist; the range is 0 to {self.samples - 1}")
+        chosen = [name for name in self.spec.pixel_layers if layers is None or name in layers]
+        compared = [k for k, name in enumerate(self.spec.checked) if name in chosen or name not in self.spec.arrays]
+        file = self.file_name("done", index // self.spec.shard_samples)
+        mismatches = 0
+        while mismatches < _READS:
+            stamp = self.files.stamp(file)
+            if not self.read("done", index, index + 1)[0]:
+                raise InputError(f"{self.path}: sample {index} is not finished yet; the build command resumes")
+            crcs = self.read("crc32c", index, index + 1)[0].tolist()
+            arrays = {name: self.read(name, index, index + 1)[0] for name in chosen}
+            scalars = self._scalars(index)
+            crcs_of_layers = [crc32c(layer) if layer.size else 0 for layer in arrays.values()]
+            if [*crcs_of_layers, crc_of_scalars(scalars)] == [crcs[k] for k in compared]:
+                return Sample(index=index, layers=arrays, scalars=scalars)
+            # a process that rewrites the sample replaces the file of `done` first
+            mismatches += self.files.stamp(file) == stamp
+        raise VbnfaultError(
+            f"{self.path}: sample {index} does not match its stored crc32c; the build command repairs it"
+        )
+
+    def _scalars(self, index: int) -> dict[str, Any]:
+        """Return the scalars of a sample. Raises VbnfaultError if they cannot be decoded.
+
+        Their small files are read directly: through zarr, the 45 of them would take longer than an image.
+        """
+        number = index // self.spec.shard_samples
+        scalars: dict[str, Any] = {}
+        for (name, row), column in zip(SCALARS.items(), self.columns(SCALARS, number), strict=True):
+            if isinstance(column, Exception):
+                raise VbnfaultError(
+                    f"{self.path}: {name} of sample {index} cannot be read ({column}); the build command repairs it"
+                ) from column
+            value = column[index - self.shard(number).start]
+            scalars[name] = str(value) if row.is_text else value
+        return scalars
+
+    def columns(self, names: Iterable[str], number: int) -> Iterator[NDArray[Any] | OSError | ValueError]:
+        """Yield several scalars for all samples of a shard, or why one cannot be read, in the order of `names`."""
+        wanted = list(names)
+        stored = [name for name in wanted if 0 not in self._shape(name)]
+        contents = dict(zip(stored, self.files.read_each([self.file_name(n, number) for n in stored]), strict=True))
+        for name in wanted:
+            content = contents.get(name, b"")
+            if isinstance(content, OSError):
+                yield content
+                continue
+            try:
+                yield self._column(name, number, content)
+            except ValueError as error:
+                yield error
+
+    def column(self, name: str, number: int) -> NDArray[Any]:
+        """Return a scalar for all samples of a shard. Raises OSError or ValueError if its chunk is damaged."""
+        content = b"" if 0 in self._shape(name) else self.files.read(self.file_name(name, number))
+        return self._column(name, number, content)
+
+    def _column(self, name: str, number: int, content: bytes) -> NDArray[Any]:
+        """Return a scalar for all samples of a shard from its chunk file. Raises ValueError if that is damaged."""
+        row, shape = self.spec.arrays[name], self._shape(name)
+        samples = len(self.shard(number))
+        if 0 in shape:
+            return np.zeros((samples, *shape), dtype=row.dtype)
+        return decode_values(content, row.dtype).reshape(self.spec.shard_samples, *shape)[:samples]
+
+    def _shape(self, name: str) -> tuple[int, ...]:
+        """Return the shape of one sample of an array; a large store asks for it a hundred thousand times."""
+        if name not in self._shapes:
+            self._shapes[name] = self.spec.shape(self.spec.arrays[name])
+        return self._shapes[name]
+
+    def _column_bytes(self, name: str, number: int, values: Mapping[int, Any]) -> bytes:
+        """Return the chunk file of a scalar of a shard; samples without a value get the fill value."""
+        row, first = self.spec.arrays[name], self.shard(number).start
+        dtype = object if row.is_text else row.dtype
+        column = np.full((self.spec.shard_samples, *self.spec.shape(row)), row.fill, dtype=dtype)
+        for i, value in values.items():
+            column[i - first] = value
+        return encode_values(column)
+
+    def done(self, number: int) -> dict[int, bool]:
+        """Return by sample whether it is finished; False for all of the shard if that cannot be read."""
+        samples = self.shard(number)
+        try:
+            return dict(zip(samples, self.column("done", number).astype(bool).tolist(), strict=True))
+        except (OSError, ValueError):
+            return dict.fromkeys(samples, False)
+
+    def begun(self) -> list[int]:
+        """Return the shards that have files, in ascending order; no sample of any other shard is built yet."""
+        listed = {*self.files.names("done/c"), *self.files.names("image/c")}
+        numbers = {int(name) for name in listed if name.isascii() and name.isdecimal()}
+        return sorted(n for n in numbers if n < self.shards)
+
+    def finished(self) -> int:
+        """Return how many samples are marked as finished in `done`."""
+        return sum(count for _, count in self._counts())
+
+    def whole_shards(self) -> set[int]:
+        """Return the shards whose samples are all marked as finished in `done`."""
+        return {number for number, count in self._counts() if count == len(self.shard(number))}
+
+    def _counts(self) -> Iterator[tuple[int, int]]:
+        """Yield each shard that has files, and how many of its samples are marked as finished in `done`."""
+        full = self.samples // self.spec.shard_samples
+        counts: dict[bytes, int] = {}  # most files have the same content, so each content is decoded once
+        for number in self.begun():
+            try:
+                data = self.files.read(self.file_name("done", number))
+                if data not in counts or number >= full:
+                    counts[data] = sum(self.done(number).values())
+            except OSError:
+                continue
+            yield number, counts[data]
+
+    def file_name(self, name: str, number: int) -> str:
+        """Return the name, relative to the store, of the file that holds an array's values for one shard."""
+        return f"{name}/c/{number}{'/0' * len(self._shape(name))}"
+
+    def file(self, name: str, number: int) -> Any:
+        """Return the path or the URL of the file that holds an array's values for one shard."""
+        return self.path / self.file_name(name, number)
+
+    def chunk(self, name: str, number: int, samples: Collection[int] | None = None) -> dict[int, bytes]:
+        """Return the compressed chunks of a layer's shard by sample; with `samples`, read only those of the file.
+
+        Raises ValueError or OSError if the file is damaged or missing.
+        """
+        size, first = self.spec.shard_samples, number * self.spec.shard_samples
+        if self.spec.empty(name):
+            return dict.fromkeys(self.shard(number) if samples is None else samples, b"")
+        if samples is None:
+            chunks = split_shard(self.files.read(self.file_name(name, number)), size)
+            return {first + i: chunk for i, chunk in chunks.items()}
+        wanted: dict[int, tuple[int, int]] = {}
+
+        def choose(tail: bytes) -> list[tuple[int, int]]:
+            ranges = chunk_ranges(tail, size)
+            wanted.update({i: ranges[i - first] for i in samples if i - first in ranges})
+            return _joined(wanted.values())
+
+        parts = self.files.read_parts(self.file_name(name, number), index_size(size), choose)
+        return {
+            i: data[start - begin : start - begin + length]
+            for i, (start, length) in wanted.items()
+            for begin, data in parts
+            if begin <= start and start + length <= begin + len(data)
+        }
+
+    def write_shard(self, number: int, given: Mapping[int, Encoded], damaged: Collection[int] = ()) -> set[int]:
+        """Write a shard: the `given` samples, and unchanged those that were finished before.
+
+        `damaged` samples are not kept. `done` is written last.
+
+        Returns
+        -------
+        set of int
+            Samples that were marked as finished, but could not be kept because their files are damaged.
+
+        Raises
+        ------
+        VbnfaultError
+            The files cannot be written.
+        """
+        samples = self.shard(number)
+        others = {i for i in samples if i not in given and i not in damaged}
+        with disk.explained(self.path, f"writing samples {samples.start}-{samples.stop - 1}"):
+            finished = self._finished(number, strict=bool(others))
+            wished = finished & others
+            if finished - wished:
+                self._write_done(number, wished)
+            kept, chunks, columns = self._kept(number, wished)
+            self.files.write(self._shard_files(number, given, kept, chunks, columns))
+            self._write_done(number, {*given, *kept})
+        return wished - kept
+
+    def copy_shard(self, number: int, source: Store, finished: Collection[int], *, link: bool = False) -> None:
+        """Copy the files of a shard from another store of the same schema; `done` is written last.
+
+        Parameters
+        ----------
+        finished
+            The samples that are finished then: those that were so in `source` before this call.
+        link
+            Give the files a second name here, where the file system can, so that no byte is copied.
+
+        Raises
+        ------
+        VbnfaultError
+            The files cannot be read or written.
+        """
+        samples = self.shard(number)
+        with disk.explained(self.path, f"copying samples {samples.start}-{samples.stop - 1} from {source.path}"):
+            if any(self.done(number).values()):
+                self._write_done(number, set())
+            names = [name for name in self.spec.arrays if name != "done" and not self.spec.empty(name)]
+            files = [self.file_name(name, number) for name in names]
+            self.files.write((file, source.files.copied(file, link=link)) for file in files)
+            self._write_done(number, set(finished))
+
+    def remove_shard(self, number: int) -> None:
+        """Remove the files of a shard, `done` first, so that its samples are not finished any more."""
+        samples = self.shard(number)
+        with disk.explained(self.path, f"removing samples {samples.start}-{samples.stop - 1}"):
+            self.files.remove([self.file_name("done", number)])
+            self.files.remove([self.file_name(name, number) for name in self.spec.arrays])
+
+    def encoded(self, number: int, samples: Collection[int]) -> dict[int, Encoded]:
+        """Return some samples of a shard as they are stored, for `write_shard` of another store; no digest is set.
+
+        Raises OSError or ValueError if their files are damaged.
+        """
+        first = self.shard(number).start
+        chunks = {name: self.chunk(name, number) for name in self.spec.pixel_layers}
+        columns = {name: self.column(name, number) for name in (*SCALARS, "crc32c")}
+        return {
+            i: Encoded(
+                index=i,
+                chunks={name: chunks[name][i] for name in chunks},
+                scalars={name: columns[name][i - first] for name in SCALARS},
+                crc32c=columns["crc32c"][i - first],
+                digest=b"",
+            )
+            for i in samples
+        }
+
+    def _finished(self, number: int, *, strict: bool) -> set[int]:
+        """Return the samples of a shard that are marked as finished in `done`.
+
+        If that file is missing, there are none. If it is damaged: none if `strict`, otherwise all. If the system
+        does not let us read it just now: OSError if `strict`, because finished samples could get lost; otherwise
+        all.
+        """
+        samples = self.shard(number)
+        try:
+            column = self.column("done", number).astype(bool)
+        except FileNotFoundError:
+            return set()
+        except _DAMAGE:
+            return set() if strict else set(samples)
+        except OSError:
+            if strict:
+                raise
+            return set(samples)
+        return {i for i, done in zip(samples, column.tolist(), strict=True) if done}
+
+    def _write_done(self, number: int, finished: set[int]) -> None:
+        """Mark exactly the `finished` samples of a shard as finished."""
+        data = self._column_bytes("done", number, {i: i in finished for i in self.shard(number)})
+        self.files.write([(self.file_name("done", number), data)])
+
+    def _kept(
+        self, number: int, wished: set[int]
+    ) -> tuple[set[int], dict[str, dict[int, bytes]], dict[str, NDArray[Any]]]:
+        """Return which of the `wished` samples can be kept, their chunks by layer, and the shard's scalars."""
+        chunks: dict[str, dict[int, bytes]] = {}
+        columns: dict[str, NDArray[Any]] = {}
+        try:
+            for name in (*SCALARS, "crc32c") if wished else ():
+                columns[name] = self.column(name, number)
+            for name in self.spec.pixel_layers if wished else ():
+                chunks[name] = self.chunk(name, number)
+                wished = wished & set(chunks[name])
+        except _DAMAGE:
+            return set(), {}, {}
+        return wished, chunks, columns
+
+    def _shard_files(
+        self,
+        number: int,
+        given: Mapping[int, Encoded],
+        kept: set[int],
+        chunks: Mapping[str, Mapping[int, bytes]],
+        columns: Mapping[str, NDArray[Any]],
+    ) -> Iterator[tuple[str, bytes]]:
+        """Yield the name and content of every file of a shard except `done`."""
+        first = self.shard(number).start
+        for name in self.spec.pixel_layers:
+            if not self.spec.empty(name):
+                held = {i: e.chunks[name] for i, e in given.items()} | {i: chunks[name][i] for i in kept}
+                shard = join_shard({i - first: chunk for i, chunk in held.items()}, self.spec.shard_samples)
+                yield self.file_name(name, number), shard
+        for name in (*SCALARS, "crc32c"):
+            if not self.spec.empty(name):
+                values = {i: e.crc32c if name == "crc32c" else e.scalars[name] for i, e in given.items()}
+                values |= {i: columns[name][i - first] for i in kept}
+                yield self.file_name(name, number), self._column_bytes(name, number, values)
+
+
+def _joined(ranges: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Return start and length of ranges of bytes, in ascending order; ranges that touch become one."""
+    joined: list[tuple[int, int]] = []
+    for start, length in sorted(set(ranges)):
+        if joined and sum(joined[-1]) == start:
+            joined[-1] = joined[-1][0], joined[-1][1] + length
+        else:
+            joined.append((start, length))
+    return joined
