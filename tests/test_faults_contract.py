@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from conftest import ALL_FAULTS
-from test_faults_kit import make, make_context, noisy, with_mosaic
+from test_faults_kit import make, make_context, noisy, noisy_electrons, with_mosaic
 
 from vbnfault.core.errors import InputError
 from vbnfault.core.quantities import RGBI
@@ -21,6 +21,7 @@ from vbnfault.faults import (
     MOSAIC_STEPS,
     STEPS,
     Fault,
+    act,
     dataset_order,
     from_dict,
     json_schema,
@@ -346,3 +347,37 @@ def test_limits_of_straylight_are_those_of_scatter(model: str) -> None:
                 physics(beyond)
             with pytest.raises(InputError, match=rf"faults\.straylight\.{key} = "):
                 from_dict("straylight", {"model": model, key: beyond}, source="test.toml")
+
+
+OPTICAL_TEXTURES = ["straylight", "dust_on_optics", "optics_degradation", "vignetting"]
+
+
+@pytest.mark.parametrize("name", OPTICAL_TEXTURES)
+def test_a_few_rows_with_the_sun_take_few_rows_of_work(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The Sun's disc does not make a fault act on a second plane, but on few rows beside the whole frame."""
+    context = make_context(128, sun=(50.0, 40.0))
+    fault: Fault = make(name)
+    params = fault.draw(context, np.random.default_rng(1))
+    light = noisy_electrons(context)
+    past = np.zeros_like(light.array)
+    past[40:42, 50:53] = 1e6
+    in_planes = dataclasses.replace(light, past_rims=past)
+    few = in_planes.scaled(1.0)
+    rows: list[int] = []
+    for hook in ("apply", "apply_to_rows"):
+        of_class = getattr(type(fault), hook)
+
+        def counted(self: Any, quantity: Any, *more: Any, of_class: Any = of_class) -> Any:
+            rows.append(len(quantity.array))
+            return of_class(self, quantity, *more)
+
+        monkeypatch.setattr(type(fault), hook, counted)
+    after = act(fault, few, params, context)
+    nested = 2 if name in ("vignetting", "optics_degradation") else 1  # one hook is made of the other
+    assert rows.count(128) == (2 if name == "vignetting" else 1)
+    assert sum(rows) - 128 * rows.count(128) <= nested * (2 + 4 * (fault.reach_rows(params) or 0))
+    assert after.rim_rows is not None
+    assert after.past_rims is None
+    expected = act(fault, in_planes, params, context)
+    np.testing.assert_array_equal(after.merged.array, expected.merged.array)
+    np.testing.assert_array_equal(after.in_planes.past_rims, expected.past_rims)

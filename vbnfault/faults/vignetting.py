@@ -65,7 +65,15 @@ class Cos4Vignetting(Fault):
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
         """Return the expected electrons times the factor of each pixel."""
-        cos4 = _cos4_planes(context.shape, context.camera.focal_length_px, quantity.array.shape[2])
+        return self.apply_to_rows(quantity, slice(None), params, context)
+
+    def reach_rows(self, params: Params) -> int:
+        """Return 0: each pixel has its own factor."""
+        return 0
+
+    def apply_to_rows(self, quantity: Any, rows: slice, params: Params, context: FaultContext) -> Any:
+        """Return the expected electrons of some rows times the factor of each pixel."""
+        cos4 = _cos4_planes(context.shape, context.camera.focal_length_px, quantity.array.shape[2])[rows]
         e0 = params["on_axis_illuminance_dn"] / 255
         return quantity.with_array(cv2.multiply(quantity.array, cos4, scale=e0).reshape(cos4.shape))
 
