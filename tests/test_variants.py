@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from vbnfault.core.quantities import Radiance
 from vbnfault.core.shared_results import SharedResults
 from vbnfault.dataset.identity import scene_identity, store_spec
 from vbnfault.detector import MosaicDetector
-from vbnfault.pipeline import Session, stages
+from vbnfault.pipeline import Session, injection, stages
 from vbnfault.pipeline.exposure import exposure_factor
 from vbnfault.pipeline.record import to_sample
 from vbnfault.pipeline.spec import SampleSpec
@@ -143,6 +144,63 @@ def test_a_view_is_rendered_once_and_no_sample_depends_on_another(
         assert np.array_equal(frame.labels.masks, made[k].labels.masks)
         assert frame.drawn == made[k].drawn
     assert rendered.keys() == {0, 4}
+
+
+def test_a_fault_that_needs_light_is_not_drawn_in_a_dark_view(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A view in whose place another one is needed in any case costs no draw, and the sample keeps its bits."""
+    faults: dict[str, Any] = {"dust_on_optics": {}, "broken_pixels": {}, "optics_degradation": {}}
+    scene = small_scene(
+        dataset={"samples": 4, "sites": 1, "variants_per_view": 4, "shard_samples": 4},
+        plan={"faulty_fraction": 1.0},
+    )
+    scene["faults"] = faults
+    rendered: list[int] = []
+    render_view = stages.render_view
+
+    def dark_at_first(spec: Any, pose: Any) -> Any:
+        rendering = render_view(spec, pose)
+        rendered.append(spec.index)
+        light = rendering.light
+        if len(rendered) > 1:
+            return rendering
+        dark = light.rendered.with_array(np.zeros_like(light.rendered.array))
+        return dataclasses.replace(rendering, light=dataclasses.replace(light, rendered=dark))
+
+    drawn: list[int] = []
+    draw_faults = injection.draw_faults
+
+    def counted(spec: Any, development: Any, commanded: Any, draws: Any, attempt: int) -> Any:
+        drawn.append(attempt)
+        return draw_faults(spec, development, commanded, draws, attempt)
+
+    monkeypatch.setattr(stages, "render_view", dark_at_first)
+    monkeypatch.setattr(injection, "draw_faults", counted)
+
+    def made() -> Any:
+        rendered.clear()
+        own = Session(config.parse_scene(scene, source="test"))
+        optical = {"dust_on_optics", "optics_degradation"}
+        index = next(i for i in range(4) if optical & set(own.plan.commanded(i)))
+        return own.frame(index)
+
+    quick = made()
+    assert (quick.views, len(rendered)) == (2, 2)
+    assert min(drawn) >= injection._DRAW_TRIES, "no draw belongs to the first view"
+    drawn.clear()
+    monkeypatch.setattr(injection, "_in_vain", lambda *of: [])
+    slow = made()
+    assert sorted(drawn)[: injection._DRAW_TRIES] == list(range(injection._DRAW_TRIES))
+    assert slow.drawn == quick.drawn
+    assert np.array_equal(slow.images.image.array, quick.images.image.array)
+    # where no other view is tried, the fault is left out and the others are drawn as ever
+    monkeypatch.undo()
+    spec, development = quick.spec, quick.injection.development
+    dark = dataclasses.replace(
+        development.exposure,
+        rate=development.exposure.rate.with_array(np.zeros_like(quick.images.clean.array[..., :3], np.float32)),
+    )
+    left = injection.inject_faults(spec, quick.pose, quick.rendering, dark)
+    assert set(left.draws) == set(spec.commanded) - {"dust_on_optics", "optics_degradation"}
 
 
 def test_exposures_follow_their_stops(session: Session) -> None:

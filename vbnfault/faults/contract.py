@@ -74,6 +74,9 @@ class Fault:
         False if the footprint covers about the whole frame.
     needs_sun
         True if the model needs the Sun's position.
+    needs_light
+        True if the model only takes light of the image away or moves it: a frame without light stays as it is,
+        whatever is drawn.
     lit_by_surroundings
         True if light from out of the field acts on the image, so that it is rendered too.
     informed
@@ -119,6 +122,7 @@ class Fault:
     steps: ClassVar[tuple[str, ...]]
     localised: ClassVar[bool] = True
     needs_sun: ClassVar[bool] = False
+    needs_light: ClassVar[bool] = False
     lit_by_surroundings: ClassVar[bool] = False
     informed: ClassVar[bool] = False
     thin_lens_only: ClassVar[str] = ""

@@ -41,6 +41,7 @@ class GaussianDegradation(Fault):
     after = "dust_on_optics"
     axis = 5
     step = "electrons"
+    needs_light = True
     # σ of the filter is 0.15 (size + 7/3) px of a 1024 px wide image; the power is measured from 256 to 512 px
     severity = Severity(key="filter_size_px", low=1, high=201, step=2, width_power=-0.6, offset=7 / 3)
     localised = False

@@ -45,6 +45,7 @@ class GaussianDust(Fault):
     after = "straylight"
     axis = 0
     step = "electrons"
+    needs_light = True
     # the power is measured from 256 to 512 px
     severity = Severity(key="count", low=1, high=3000, width_power=0.5)
     soft_layer = "dust_opacity"

@@ -35,6 +35,7 @@ class Cos4Vignetting(Fault):
     after = "optics_degradation"
     axis = 4
     step = "electrons"
+    needs_light = True
     severity = Severity(key="frame_illuminance_dn", low=255.0, high=2.0)
     localised = False
     soft_layer = "vignetting_factor"

@@ -28,10 +28,13 @@ def inject_faults(
     exposure: SceneExposure,
     views: int = 1,
     commanded: Sequence[str] | None = None,
+    *,
+    redrawn: bool = False,
 ) -> Injection:
     """Draw the commanded faults of a sample. `views` is the number of its views that were rendered so far.
 
-    `commanded` are the faults; by default those that the plan commands.
+    `commanded` are the faults; by default those that the plan commands. With `redrawn`, nothing is drawn in a view
+    in whose place another one is needed in any case (`asking_for_another_view`).
 
     A fault without a visible effect is drawn again a few times, then left out. So the result holds the faults that
     are in the image, and labels never claim more.
@@ -46,11 +49,15 @@ def inject_faults(
         rng=spec.rng,
         twins=[name for name in spec.faults if f"without_{name}" in stored_layers(spec.scene, spec.faults)],
     )
+    development.signal({}, [])  # before two threads need it
+    in_vain = _in_vain(spec, development, commanded)
+    if redrawn and asking_for_another_view(spec, in_vain):
+        return Injection(draws={}, development=development, in_vain=in_vain)
+    commanded = [name for name in commanded if name not in in_vain]
     # every view uses new draws: a draw that is invisible in one view is not tried again in the next
     attempt = (views - 1) * _DRAW_TRIES
     last = attempt + _DRAW_TRIES - 1
     # noise and the clean image use one core, the optics of the faults another
-    development.signal({}, [])
     with ThreadPoolExecutor(1) as aside:
         clean = aside.submit(development.image, {})
         draws = draw_faults(spec, development, commanded, {}, attempt)
@@ -63,7 +70,25 @@ def inject_faults(
         if attempt <= last:
             draws = draw_faults(spec, development, commanded, draws, attempt)
     release_unused()
-    return Injection(draws=draws, development=development)
+    return Injection(draws=draws, development=development, in_vain=in_vain)
+
+
+def asking_for_another_view(spec: SampleSpec, unseen: Sequence[str]) -> list[str]:
+    """Return those of the faults that are not in the image for which another view of the sample may be tried."""
+    scene = spec.scene
+    if scene.plan.on_invisible == "drop" or scene.is_flown:
+        return []
+    # with "as_drawn" the Sun may be hidden, so faults that need it may be absent
+    as_drawn = scene.geometry.sun_visibility == "as_drawn"
+    return [name for name in unseen if not (as_drawn and spec.faults[name].needs_sun)]
+
+
+def _in_vain(spec: SampleSpec, development: Development, commanded: Sequence[str]) -> list[str]:
+    """Return the commanded faults that need light, if neither the scene nor another fault sends any."""
+    optical = [name for name in commanded if spec.faults[name].step == "electrons"]
+    if not optical or not all(spec.faults[name].needs_light for name in optical):
+        return []
+    return [] if development.signal({}, []).merged.array.any() else optical
 
 
 def fault_context(pose: Pose, rendering: Rendering, exposure: SceneExposure) -> FaultContext:

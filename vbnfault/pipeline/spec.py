@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -210,11 +210,13 @@ class Draw:
 class Injection:
     """Hold the outcome of `inject_faults`: the draws of the faults that are in the image, by class.
 
-    `development` computes images of the exposure with any of these faults.
+    `development` computes images of the exposure with any of these faults. `in_vain` are the commanded faults that
+    no draw can show in this view. If they ask for another view, no fault is drawn in this one.
     """
 
     draws: Mapping[str, Draw]
     development: Development
+    in_vain: Sequence[str] = ()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -18,7 +18,7 @@ from ..core.quantities import Radiance
 from ..core.shared_results import SharedResults
 from .exposure import meter
 from .images import take_images
-from .injection import inject_faults
+from .injection import asking_for_another_view, inject_faults
 from .labels import label
 from .rendering import render_view
 from .resolve import resolve
@@ -103,7 +103,7 @@ def simulate_frame(spec: SampleSpec, run: StageRunner = run_stage, shared: Share
     """
     views, shared = 1, shared or SharedViews()
     view = _take_view(spec, run, shared, views=1, first_try=0)
-    while unseen := _asking_for_another_view(spec, view.injection):
+    while unseen := _unseen(spec, view.injection):
         if views == spec.scene.plan.max_views:
             raise VbnfaultError(
                 f"sample {spec.index}: {', '.join(unseen)} cannot be seen in the last of plan.max_views = {views} "
@@ -160,30 +160,27 @@ def _take_view(
     pose, rendering = shared.take(spec, run, first_try)
     if not any(spec.faults[name].needs_sun for name in spec.commanded):
         pose = replace(pose, resolved=True)  # only another sample of the view needs the Sun
-    return _expose(spec.at(pose), run, pose, rendering, views)
+    return _expose(spec.at(pose), run, pose, rendering, views, redrawn=True)
 
 
-def _expose(spec: SampleSpec, run: StageRunner, pose: Pose, rendering: Rendering, views: int) -> _RenderedView:
-    """Run the stages from the exposure of a rendered view to its faults."""
+def _expose(
+    spec: SampleSpec, run: StageRunner, pose: Pose, rendering: Rendering, views: int, *, redrawn: bool = False
+) -> _RenderedView:
+    """Run the stages from the exposure of a rendered view to its faults.
+
+    `redrawn` says whether another view may take the place of this one.
+    """
     exposure = run(add_stars, spec, pose, rendering, run(meter, spec, rendering))
     starless = rendering.light.rendered if "scene_radiance" in spec.scene.dataset.layers else None
     # a second copy of the light without stars takes 37 MB for 1024 pixels
     rendering = replace(rendering, light=exposure.light)
-    injection = run(inject_faults, spec, pose, rendering, exposure, views)
+    injection = run(inject_faults, spec, pose, rendering, exposure, views, redrawn=redrawn)
     return _RenderedView(
         spec=spec, pose=pose, rendering=rendering, starless=starless, exposure=exposure, injection=injection
     )
 
 
-def _asking_for_another_view(spec: SampleSpec, injection: Injection) -> list[str]:
+def _unseen(spec: SampleSpec, injection: Injection) -> list[str]:
     """Return the commanded faults that are not in the image, but that another view of the sample might show."""
-    scene = spec.scene
-    if scene.plan.on_invisible == "drop" or scene.is_flown:
-        return []
-    # with "as_drawn" the Sun may be hidden, so faults that need it may be absent
-    as_drawn = scene.geometry.sun_visibility == "as_drawn"
-    return [
-        name
-        for name in spec.commanded
-        if name not in injection.draws and not (as_drawn and spec.faults[name].needs_sun)
-    ]
+    unseen = asking_for_another_view(spec, injection.in_vain)
+    return unseen or asking_for_another_view(spec, [name for name in spec.commanded if name not in injection.draws])

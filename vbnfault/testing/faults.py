@@ -228,6 +228,9 @@ def _check_planes_of_light(fault: Fault, params: Params, context: FaultContext, 
         assert np.isfinite(plane).all(), "apply returned light past the rims that is not finite"
         assert (plane >= 0).all(), "apply returned negative light past the rims"
     _check_rows_of_light(fault, params, context, light)
+    if fault.needs_light:
+        dark = fault.apply(light.with_array(np.zeros_like(light.array)), params, context)
+        assert not dark.array.any(), "apply added light to a dark frame, although the model states needs_light"
 
 
 def _check_rows_of_light(fault: Fault, params: Params, context: FaultContext, light: Electrons) -> None:
