@@ -13,8 +13,9 @@ from conftest import ALL_FAULTS, small_scene
 
 from vbnfault import pipeline
 from vbnfault.core import frames
+from vbnfault.detector import ThreeColourDetector
 from vbnfault.pipeline import Session, masks
-from vbnfault.pipeline.development import without
+from vbnfault.pipeline.development import Development, without
 from vbnfault.pipeline.exposure import meter
 from vbnfault.pipeline.record import to_sample
 from vbnfault.pipeline.rendering import render_view
@@ -505,3 +506,35 @@ def test_the_effect_by_rows_equals_the_effect_of_whole_pictures(frames_: list[Fr
         for name in draws:
             other = development.image(without(draws, name), noisy=False).array
             assert np.array_equal(development.effect(draws, name), (whole != other).any(axis=-1))
+
+
+def test_a_twin_develops_only_the_pixels_that_its_fault_changes(
+    frames_: list[Frame], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A twin has the bits of the image without its fault, and takes no more pixels than the fault changes."""
+    developed: list[int] = []
+    develop = ThreeColourDetector.develop
+
+    def counted(self: Any, expected: Any, *more: Any) -> Any:
+        developed.append(expected.array.shape[0] * expected.array.shape[1])
+        return develop(self, expected, *more)
+
+    few = 0
+    for frame in frames_:
+        for name in set(frame.drawn) & {"dust_on_optics", "straylight"}:
+            draws, given = frame.injection.draws, frame.injection.development
+            own = Development(exposure=given.exposure, context=given.context, rng=frame.spec.rng)
+            own.image(draws)
+            expected = own.image(without(draws, name)).array
+            fresh = Development(exposure=given.exposure, context=given.context, rng=frame.spec.rng)
+            fresh.image(draws)
+            with monkeypatch.context() as patched:
+                patched.setattr(ThreeColourDetector, "develop", counted)
+                developed.clear()
+                twin = fresh.twin(draws, name)
+            np.testing.assert_array_equal(twin.array, expected)
+            assert fresh.image(without(draws, name)).array is twin.array, "the twin is kept"
+            changed = len(fresh._changed(draws, name))
+            assert sum(developed) == (changed if changed <= 0.7 * 96 * 80 else 96 * 80)
+            few += changed < 0.5 * 96 * 80
+    assert few > 2

@@ -13,6 +13,8 @@ from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 
+from . import buffers
+
 # Resident memory in bytes that a process reaches before it releases any. To take memory back from the system costs
 # a tenth of a sample's time where every stage does it, so memory is released only where a step would pass this.
 _MOST = 1260 << 20
@@ -30,9 +32,15 @@ def release_unused(coming_bytes: int = 0, *, always: bool = False) -> None:
     always
         Release it also if the process holds little.
     """
-    for release in (_trim, _flush):  # what drjit keeps serves the next wavefront, so it is released last
+    for release in (_trim, _forget, _flush):  # what drjit keeps serves the next wavefront, so it is released last
         if always or _resident_bytes() + coming_bytes >= _MOST:
             release()
+
+
+def _forget() -> None:
+    """Return to the system what is kept for coming arrays."""
+    buffers.clear()
+    _trim()
 
 
 def _flush() -> None:

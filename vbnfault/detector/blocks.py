@@ -8,8 +8,9 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
+
+from ..core import buffers
 
 # Measured as the fastest for steps on three colours, and for steps on one plane.
 ROWS_PER_BLOCK = 32
@@ -33,7 +34,17 @@ def blockwise(step: Callable[..., NDArray[Any]], array: NDArray[Any], *more: NDA
         rows = slice(start, start + ROWS_PER_BLOCK)
         return step(array[rows], *(None if extra is None else extra[rows] for extra in more))
 
-    return np.concatenate(list(pool().map(of_block, range(0, len(array), ROWS_PER_BLOCK))))
+    first = of_block(0)
+    if len(array) <= ROWS_PER_BLOCK:
+        return first
+    out = buffers.empty((len(array), *first.shape[1:]), first.dtype)
+    out[:ROWS_PER_BLOCK] = first
+
+    def fill(start: int) -> None:
+        out[start : start + ROWS_PER_BLOCK] = of_block(start)
+
+    list(pool().map(fill, range(ROWS_PER_BLOCK, len(array), ROWS_PER_BLOCK)))
+    return out
 
 
 def by_rows(step: Callable[[slice], None], height: int) -> None:

@@ -41,7 +41,10 @@ class Detector(Protocol):
 
     @property
     def local(self) -> bool:
-        """Return whether each pixel of the image depends on the light on this pixel alone."""
+        """Return whether each pixel of the image depends on the light on this pixel alone.
+
+        The noise of such a detector has the method `of_pixels`.
+        """
 
     @property
     def optics_key(self) -> Any:

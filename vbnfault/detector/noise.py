@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
+from ..core import buffers
 from .poisson import poisson_cumulative, poisson_least_count
 
 F32 = NDArray[np.float32]
@@ -44,7 +45,7 @@ def normal_field(shape: tuple[int, ...], rng: np.random.Generator) -> F32:
     """
     size = math.prod(shape)
     code, table = _codes(size, rng), _normal_table()
-    out = np.empty(size, dtype=np.float32)
+    out = buffers.empty((size,))
     for start in range(0, size, _CODES_AT_ONCE):
         part = slice(start, start + _CODES_AT_ONCE)
         np.take(table, code[part], mode="clip", out=out[part])
@@ -97,7 +98,7 @@ def poisson_quantile(mean: F32, normal: F32) -> F32:
         else:
             out.ravel()[:] += terms
     np.floor(out, out=out)
-    np.maximum(out, 0, out=out)
+    np.clip(out, 0, np.inf, out=out)  # half the time of `maximum`
     if len(few):
         low = np.flatnonzero(m < EXACT_POISSON_BELOW_E)
         out.ravel()[few[low]] = _poisson_exact(m[low], z[low])
@@ -111,6 +112,12 @@ def poisson_on_dark(signal: F32, dark: np.float32, normal: F32) -> F32:
     if count == signal.size:
         return poisson_quantile(signal + dark, normal)
     out = _counts_of_one_mean(float(dark), normal)
+    if 3 * count > 2 * signal.size:  # to choose the lit values takes longer than to compute all
+        dim, mean = ~lit, signal + dark
+        np.copyto(mean, np.float32(_ALL_TERMS_BELOW_E), where=dim)  # the quickest mean
+        counts = poisson_quantile(mean, normal)
+        np.copyto(counts, out, where=dim)
+        return counts
     if count:
         out[lit] = poisson_quantile(signal[lit] + dark, normal[lit])
     return out

@@ -38,6 +38,11 @@ class Noise:
         fields = pool().map(lambda rng: normal_field((*shape, 3), rng), (shot, read))
         return cls(shot=next(fields), read=next(fields))
 
+    def of_pixels(self, pixels: NDArray[np.intp]) -> Noise:
+        """Return the variates of some pixels, given by their flat indices intp[row, n], in that arrangement."""
+        shot, read = (np.take(field.reshape(-1, 3), pixels, axis=0) for field in (self.shot, self.read))
+        return Noise(shot=shot, read=read)
+
 
 @dataclass(frozen=True, kw_only=True)
 class ThreeColourDetector:
@@ -159,7 +164,7 @@ class ThreeColourDetector:
 
         def collect(signal: F32, shot: F32 | None) -> F32:
             mean = signal + dark if shot is None else poisson_on_dark(signal, dark, shot)
-            return np.minimum(mean, full_well, out=mean)
+            return np.clip(mean, 0, full_well, out=mean)  # half the time of `minimum`
 
         return collect
 
@@ -185,10 +190,9 @@ class ThreeColourDetector:
         def show(dn: F32) -> NDArray[np.uint8]:
             # OpenCV rounds to even and saturates at 0 and 255 as it converts
             rgb = cv2.multiply(dn - black, (*scale.tolist(), 0.0), dtype=cv2.CV_8U)
-            out = np.empty((*rgb.shape[:2], 4), dtype=np.uint8)
-            intensity = cv2.transform(rgb, luminance).reshape(*rgb.shape[:2], 1)
-            cv2.mixChannels([rgb, intensity], [out], [0, 0, 1, 1, 2, 2, 3, 3])
-            return out
+            intensity = cv2.transform(rgb, luminance).reshape(rgb.shape[:2])
+            out = cv2.cvtColor(rgb, cv2.COLOR_RGB2RGBA)
+            return np.asarray(cv2.insertChannel(intensity, out, 3))
 
         return show
 

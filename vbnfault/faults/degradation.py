@@ -24,6 +24,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core import buffers
 from .context import FaultContext, Params
 from .contract import Fault
 from .fields import Interval, Severity, bounds, flag
@@ -104,7 +105,7 @@ def _blur(
     height, width = array.shape[:2]
     white_row = np.tile(white_e, width)  # flat rows of width · channels values: far faster than broadcasting
     reach = len(kernel) // 2
-    out = np.empty_like(array)
+    out = buffers.empty(array.shape)
 
     def filter_rows(start: int, stop: int) -> None:
         if start == stop:

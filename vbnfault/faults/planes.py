@@ -9,22 +9,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..camera import Camera
+from ..core import buffers
 from ..core.quantities import LUMINANCE
+
+_ROWS_AT_ONCE = 64  # so that the factors of these rows stay in the cache
 
 
 def times(array: NDArray[np.float32], factor: NDArray[Any]) -> NDArray[np.float32]:
     """Return planes float32[y, x, channel] times a factor for each channel [channel] or for each pixel [y, x]."""
     if factor.ndim == 1:
         # OpenCV needs a scalar of four numbers
-        out = cv2.multiply(array, (*factor.tolist(), 0.0, 0.0, 0.0)[:4])
-    else:
-        out = cv2.multiply(array, cv2.merge([factor] * array.shape[2]))
-    return np.asarray(out).reshape(array.shape)
+        return np.asarray(cv2.multiply(array, (*factor.tolist(), 0.0, 0.0, 0.0)[:4])).reshape(array.shape)
+    out = buffers.empty(array.shape)
+    for start in range(0, len(array), _ROWS_AT_ONCE):
+        rows = slice(start, start + _ROWS_AT_ONCE)
+        cv2.multiply(array[rows], cv2.merge([factor[rows]] * array.shape[2]), dst=out[rows])
+    return out
 
 
 def plus(array: NDArray[np.float32], other: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the sum of two arrays float32[y, x, channel] of the same shape."""
-    return np.asarray(cv2.add(array, other)).reshape(array.shape)
+    out = buffers.empty(array.shape)
+    cv2.add(array, other, dst=out)
+    return out
 
 
 def intensity_dn(electrons: NDArray[np.float32], camera: Camera) -> NDArray[np.float32]:

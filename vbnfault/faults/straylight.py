@@ -37,6 +37,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core import buffers
 from ..core.errors import VbnfaultError
 from ..core.file_contents import cached_with_contents
 from ..core.images import decoded_image
@@ -255,7 +256,7 @@ def _layer(params: Params, context: FaultContext, white_e: NDArray[np.float32]) 
         if placed is None:
             continue
         if layer is None:
-            layer = np.zeros((height, width, len(white_e)), dtype=np.float32)
+            layer = buffers.zeros((height, width, len(white_e)))
         window, stamp = placed
         layer[window] += stamp
     return layer

@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core import buffers
 from ..lens.thin import cos4_map
 from .context import FaultContext, Params
 from .contract import Fault
@@ -76,7 +77,9 @@ class Cos4Vignetting(Fault):
         """Return the expected electrons of some rows times the factor of each pixel."""
         cos4 = _cos4_planes(context.shape, context.camera.focal_length_px, quantity.array.shape[2])[rows]
         e0 = params["on_axis_illuminance_dn"] / 255
-        return quantity.with_array(cv2.multiply(quantity.array, cos4, scale=e0).reshape(cos4.shape))
+        out = buffers.empty(cos4.shape)
+        cv2.multiply(quantity.array, cos4, dst=out, scale=e0)
+        return quantity.with_array(out)
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
         """Return the pixels where the loss reaches `mask_loss`, bool[y, x]."""

@@ -14,7 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..camera import Camera
+from ..core import buffers
 from ..core.quantities import RGBI, Electrons
+from ..detector.blocks import pool
 from ..faults import MOSAIC_STEPS, Fault, FaultContext, act, physical_order
 from . import masks
 from .spec import Draw, SceneExposure
@@ -22,6 +24,12 @@ from .spec import Draw, SceneExposure
 Draws = Mapping[str, Draw]
 Keys = tuple[tuple[str, int], ...]
 Mask = NDArray[np.bool_]
+
+# Of the pixels. Above this fraction it takes longer to choose pixels than to develop all of them.
+_MOST_CHANGED = 0.7
+
+# Their light, noise and image stay in the cache.
+_PIXELS_AT_ONCE = 1 << 15
 
 
 def acting_at(draws: Draws, step: str) -> list[str]:
@@ -73,6 +81,7 @@ class Development:
         self._images: dict[Any, RGBI] = {}
         self._raws: dict[Any, NDArray[np.uint16]] = {}
         self._effects: dict[Any, Mask] = {}
+        self._differences: dict[Any, NDArray[np.intp]] = {}
 
     @cached_property
     def noise(self) -> Any:
@@ -216,6 +225,17 @@ class Development:
 
     # --- effects ---------------------------------------------------------------------------------------------
 
+    def twin(self, draws: Draws, name: str) -> RGBI:
+        """Return `image` without one drawn fault; only the pixels that this fault changes are developed for it."""
+        others = without(draws, name)
+        key = (*self._image_key(others, True), ())
+        if key not in self._images and self._is_patch(draws, name):
+            changed = self._changed(draws, name)
+            if len(changed) <= _MOST_CHANGED * self.context.shape[0] * self.context.shape[1]:
+                base = self._before_readout(draws, noisy=True).array
+                self._images[key] = RGBI(array=self._patched(base, self._part(draws, name), changed, noisy=True))
+        return self.image(others)
+
     def effect(self, draws: Draws, name: str, least_dn: float = 1.0) -> Mask:
         """Return where the noise-free image changes by `least_dn` or more without one drawn fault, bool[y, x].
 
@@ -229,35 +249,71 @@ class Development:
     def _effect(self, draws: Draws, name: str, least_dn: float) -> Mask:
         """Return `effect`, computed anew."""
         others = without(draws, name)
-        # to choose the pixels of a fault that changes nearly all of them takes longer than to develop all
-        if not self.is_local(draws, name) or not draws[name].fault.localised:
+        if not self._is_patch(draws, name):
             with_it = self.image(draws, noisy=False).array
             lacking = self.image(others, noisy=False, keep_signals=name in self._twins).array
             return masks.effect(with_it, lacking, least_dn)
-        # only pixels whose signal differs can change, so only these are developed
-        optical = acting_at(draws, "electrons")
-        whole = self.signal(draws, optical).merged
-        part = self.signal(others, [n for n in optical if n != name], keep=name in self._twins).merged
-        differ = whole.array != part.array
-        changed = np.flatnonzero(np.logical_or.reduce([differ[..., k] for k in range(differ.shape[2])]))
+        changed = self._changed(draws, name)
         if not len(changed):
             return np.zeros(self.context.shape, dtype=bool)
         with_it = self.image(draws, noisy=False).array
-        image = self._before_readout(draws, False).array.copy()
-        # arrange these pixels as the rows of an image, and fill up the last row
-        width = self.context.shape[1]
-        filled = np.resize(changed, (-(-len(changed) // width), width))
-        pixels = np.take(part.array.reshape(-1, part.array.shape[2]), filled, axis=0)
-        camera = self.exposure.camera
-        developed = camera.detector.develop(part.with_array(pixels), camera.exposure_s, None).array
-        # each pixel, four channels of 8 bits, moves as one word
-        image.view(np.uint32).reshape(-1)[changed] = developed.view(np.uint32).reshape(-1)[: len(changed)]
+        base = self._before_readout(draws, False).array
+        image = self._patched(base, self._part(draws, name), changed, noisy=False)
         return masks.effect(with_it, self._read_out(RGBI(array=image), others).array, least_dn)
+
+    def _is_patch(self, draws: Draws, name: str) -> bool:
+        """Return whether a drawn fault changes few pixels, so that only these are developed without it."""
+        # to choose the pixels of a fault that changes nearly all of them takes longer than to develop all
+        return self.is_local(draws, name) and draws[name].fault.localised
+
+    def _part(self, draws: Draws, name: str) -> Electrons:
+        """Return the expected electrons without one drawn fault."""
+        optical = acting_at(draws, "electrons")
+        return self.signal(without(draws, name), [n for n in optical if n != name], keep=name in self._twins).merged
+
+    def _changed(self, draws: Draws, name: str) -> NDArray[np.intp]:
+        """Return the flat indices of the pixels whose expected electrons differ without one drawn fault.
+
+        No other pixel of a local detector's image can change.
+        """
+        key = (frozenset(_keys(draws, draws)), name)
+        if key not in self._differences:
+            whole = self.signal(draws, acting_at(draws, "electrons")).merged
+            self._differences[key] = _differing_pixels(whole.array, self._part(draws, name).array)
+        return self._differences[key]
+
+    def _patched(
+        self, image: NDArray[np.uint8], signal: Electrons, pixels: NDArray[np.intp], *, noisy: bool
+    ) -> NDArray[np.uint8]:
+        """Return a copy of an image in which some pixels, by their flat indices, show another signal."""
+        out, camera = buffers.copy(image), self.exposure.camera
+        lit, words = signal.array.reshape(-1, signal.array.shape[2]), out.view(np.uint32).reshape(-1)
+
+        def patch(start: int) -> None:
+            some = pixels[start : start + _PIXELS_AT_ONCE]
+            noise = self.noise.of_pixels(some[None]) if noisy else None
+            light = signal.with_array(np.take(lit, some[None], axis=0))  # one row of these pixels
+            developed = camera.detector.develop(light, camera.exposure_s, noise).array
+            words[some] = developed.view(np.uint32).reshape(-1)  # four channels of 8 bits move as one word
+
+        list(pool().map(patch, range(0, len(pixels), _PIXELS_AT_ONCE)))
+        return out
 
     def is_local(self, draws: Draws, name: str) -> bool:
         """Return whether a drawn fault changes only those pixels whose expected electrons it changes."""
         detector = self.exposure.camera.detector
         return "electrons" in draws[name].fault.steps and self.leaves_camera(draws) and detector.local
+
+
+def _differing_pixels(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.intp]:
+    """Return the flat indices of the pixels in which any channel differs, intp[n]."""
+    height, width, channels = a.shape
+    step, parts = 64, []
+    for start in range(0, height, step):  # blocks of rows stay in the cache
+        differ = a[start : start + step] != b[start : start + step]
+        any_channel = np.logical_or.reduce([differ[..., k] for k in range(channels)])
+        parts.append(np.flatnonzero(any_channel) + start * width)
+    return np.concatenate(parts)
 
 
 def _altering(draws: Draws) -> list[str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from .development import without
 from .spec import Images, Injection, SampleSpec, stored_layers
 
 
@@ -15,7 +14,7 @@ def take_images(spec: SampleSpec, injection: Injection) -> Images:
     return Images(
         image=image,
         clean=development.image({}),
-        without={name: development.image(without(draws, name)) if name in draws else image for name in twins},
+        without={name: development.twin(draws, name) if name in draws else image for name in twins},
         raw=development.raw(draws) if "raw" in layers else None,
         defects=development.defects(draws) if "defects" in layers else None,
     )

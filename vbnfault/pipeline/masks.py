@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core import buffers
 from ..faults import Fault, FaultContext, Params
 
 Mask = NDArray[np.bool_]
@@ -71,7 +72,7 @@ def mask_layers(
     """
     if not drawn:
         return no_masks((len(faults), *context.shape))
-    out = np.zeros((len(faults), *context.shape), dtype=bool)
+    out = buffers.zeros((len(faults), *context.shape), bool)
     for k, (name, fault) in enumerate(faults.items()):
         if name not in drawn:
             continue

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..core import spectra
+from ..core import buffers, spectra
 from ..core.memory import release_unused
 from ..core.quantities import SKY, FarSource, Radiance, Truth
 from ..lens.straylight.scene import RenderGrid, surrounding_grids
@@ -56,6 +56,7 @@ def render_view(spec: SampleSpec, pose: Pose) -> Rendering:
     """
     from .. import render
 
+    buffers.clear()  # a render takes the memory that arrays of another sample have left
     camera, scene, surface = spec.camera, describe(spec, pose), spec.terrain.surface
     angles = bool(ANGLE_LAYERS & set(spec.scene.dataset.layers))
     stars = spec.scene.sky.stars != "off"

@@ -1,0 +1,70 @@
+"""Memory of large arrays is used again, and only once nobody can see the array."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from vbnfault.core import buffers, memory
+
+SHAPE = (512, 1024, 3)  # 6 MB
+
+
+@pytest.fixture(autouse=True)
+def empty_pool() -> Iterator[None]:
+    buffers.clear()
+    yield
+    buffers.clear()
+
+
+def address(array: np.ndarray) -> int:
+    return int(array.ctypes.data)
+
+
+def test_memory_is_used_again_once_the_last_view_is_gone() -> None:
+    first = buffers.empty(SHAPE)
+    assert (first.shape, first.dtype) == (SHAPE, np.float32)
+    where, part = address(first), first[7:9, ::2]
+    del first
+    second = buffers.empty(SHAPE)
+    assert address(second) != where, "a view of the first array still shows its memory"
+    part[:] = 1
+    del part
+    assert address(buffers.empty((*SHAPE, 1))) == where
+    assert address(buffers.empty((SHAPE[0], SHAPE[1] - 1, 3))) != where, "the size differs"
+    same_size = buffers.empty((*SHAPE, 4), np.uint8)
+    assert address(same_size) == where
+    # a frozen array leaves memory that can be written again
+    same_size.flags.writeable = False
+    del same_size
+    third = buffers.zeros(SHAPE)
+    assert address(third) == where
+    assert not third.any()
+    copied = buffers.copy(third + 1)
+    assert (copied == 1).all()
+    assert copied.flags.writeable
+    assert copied.flags.c_contiguous
+
+
+def test_small_arrays_and_too_much_memory_are_not_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert buffers.empty((10, 10)).base is None
+    monkeypatch.setattr(buffers, "_MOST_KEPT_BYTES", 7 << 20)
+    arrays = [buffers.empty(SHAPE) for _ in range(3)]
+    del arrays
+    assert buffers._kept._bytes == 6 << 20
+    buffers.clear()
+    assert buffers._kept._bytes == 0
+    assert not buffers._kept._free
+
+
+def test_a_process_that_holds_much_gives_back_what_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    array = buffers.empty(SHAPE)
+    del array
+    assert buffers._kept._bytes
+    memory.release_unused()
+    assert buffers._kept._bytes, "the process holds little"
+    monkeypatch.setattr(memory, "_MOST", 0)
+    memory.release_unused()
+    assert not buffers._kept._bytes

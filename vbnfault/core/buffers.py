@@ -1,0 +1,93 @@
+"""Reuse the memory of large arrays.
+
+The system hands out memory page by page as it is first written, which for a plane of an image takes several times
+as long as to compute the plane. So the memory of such arrays is kept for the next ones of the same size.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import math
+import threading
+import weakref
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+T = TypeVar("T", bound=np.generic)
+
+_LEAST_BYTES = 1 << 20  # smaller arrays come from memory that the C library keeps
+_MOST_KEPT_BYTES = 256 << 20  # what the faults of a sample with 1024×1024 pixels leave
+
+
+class _Kept:
+    """Hold free blocks of memory by their size."""
+
+    def __init__(self) -> None:
+        self._lock = threading.RLock()  # a block may be freed by the garbage collector anywhere
+        self._free: dict[int, list[NDArray[np.uint8]]] = {}
+        self._bytes = 0
+
+    def take(self, size: int) -> NDArray[np.uint8] | None:
+        """Return a free block of `size` bytes, or None."""
+        with self._lock:
+            blocks = self._free.get(size)
+            if not blocks:
+                return None
+            self._bytes -= size
+            return blocks.pop()
+
+    def give(self, block: NDArray[np.uint8]) -> None:
+        """Keep a free block, unless too much is kept."""
+        with self._lock:
+            if self._bytes + len(block) <= _MOST_KEPT_BYTES:
+                self._bytes += len(block)
+                self._free.setdefault(len(block), []).append(block)
+
+    def clear(self) -> None:
+        """Free all blocks."""
+        with self._lock:
+            self._free.clear()
+            self._bytes = 0
+
+
+_kept = _Kept()
+
+
+def empty(shape: tuple[int, ...], dtype: DTypeLike = np.float32) -> NDArray[Any]:
+    """Return an array whose values are not set, as `numpy.empty`.
+
+    Its memory is kept for another array once the array and all its views are gone.
+    """
+    of_type = np.dtype(dtype)
+    size = math.prod(shape) * of_type.itemsize
+    if size < _LEAST_BYTES:
+        return np.empty(shape, of_type)
+    block = _kept.take(size)
+    if block is None:
+        block = np.empty(size, np.uint8)
+    # the array and its views hold this object, but not the block alone
+    owner = (ctypes.c_ubyte * size).from_buffer(block.data)
+    weakref.finalize(owner, _kept.give, block).atexit = False
+    array: NDArray[Any] = np.frombuffer(memoryview(owner), of_type).reshape(shape)
+    return array
+
+
+def zeros(shape: tuple[int, ...], dtype: DTypeLike = np.float32) -> NDArray[Any]:
+    """Return an array of zeros in memory as that of `empty`."""
+    out = empty(shape, dtype)
+    out.fill(0)
+    return out
+
+
+def copy(array: NDArray[T]) -> NDArray[T]:
+    """Return a copy of an array in memory as that of `empty`."""
+    out = empty(array.shape, array.dtype)
+    out[...] = array
+    return out
+
+
+def clear() -> None:
+    """Free the memory that is kept for coming arrays."""
+    _kept.clear()
