@@ -25,8 +25,9 @@ Draws = Mapping[str, Draw]
 Keys = tuple[tuple[str, int], ...]
 Mask = NDArray[np.bool_]
 
-# Of the pixels. Above this fraction it takes longer to choose pixels than to develop all of them.
-_MOST_CHANGED = 0.7
+# Of the pixels. Above these fractions it takes longer to choose pixels than to develop all of them.
+_MOST_CHANGED = 0.6
+_MOST_CHANGED_NOISE_FREE = 0.4
 
 # Their light, noise and image stay in the cache.
 _PIXELS_AT_ONCE = 1 << 15
@@ -188,8 +189,22 @@ class Development:
                 self._raws[key] = raw  # a fifth of the memory of the image, and needed by `raw`
                 self._images[key] = camera.mosaic.rgbi(raw, camera.exposure_s)
             else:
-                self._images[key] = camera.detector.develop(signal, camera.exposure_s, noise, self._acts(draws))
+                patched = self._patched_clean(draws, signal) if noisy else None
+                self._images[key] = patched or camera.detector.develop(
+                    signal, camera.exposure_s, noise, self._acts(draws)
+                )
         return self._images[key]
+
+    def _patched_clean(self, draws: Draws, signal: Electrons) -> RGBI | None:
+        """Return the noisy image of a signal from that without faults; None if too many pixels differ."""
+        clean = self._images.get((*self._image_key({}, True), ()))
+        if clean is None or not (self.exposure.camera.detector.local and self.leaves_camera(draws)):
+            return None
+        lit = self.signal({}, []).merged.array
+        if _differing_fraction(signal.array, lit) > _MOST_CHANGED:
+            return None
+        changed = _differing_pixels(signal.array, lit)
+        return RGBI(array=self._patched(clean.array, signal, changed, noisy=True))
 
     def _read_out(self, image: RGBI, draws: Draws) -> RGBI:
         """Return the image with the drawn faults that act on the finished image."""
@@ -229,11 +244,11 @@ class Development:
         """Return `image` without one drawn fault; only the pixels that this fault changes are developed for it."""
         others = without(draws, name)
         key = (*self._image_key(others, True), ())
-        if key not in self._images and self._is_patch(draws, name):
-            changed = self._changed(draws, name)
-            if len(changed) <= _MOST_CHANGED * self.context.shape[0] * self.context.shape[1]:
-                base = self._before_readout(draws, noisy=True).array
-                self._images[key] = RGBI(array=self._patched(base, self._part(draws, name), changed, noisy=True))
+        if key not in self._images and self.is_local(draws, name):
+            part, base = self._part(draws, name), self._before_readout(draws, noisy=True).array
+            changed = self._changed(draws, name, part, _MOST_CHANGED)
+            if changed is not None:
+                self._images[key] = RGBI(array=self._patched(base, part, changed, noisy=True))
         return self.image(others)
 
     def effect(self, draws: Draws, name: str, least_dn: float = 1.0) -> Mask:
@@ -249,37 +264,39 @@ class Development:
     def _effect(self, draws: Draws, name: str, least_dn: float) -> Mask:
         """Return `effect`, computed anew."""
         others = without(draws, name)
-        if not self._is_patch(draws, name):
+        if not self.is_local(draws, name):
             with_it = self.image(draws, noisy=False).array
             lacking = self.image(others, noisy=False, keep_signals=name in self._twins).array
             return masks.effect(with_it, lacking, least_dn)
-        changed = self._changed(draws, name)
-        if not len(changed):
+        part = self._part(draws, name)
+        changed = self._changed(draws, name, part, _MOST_CHANGED_NOISE_FREE)
+        if changed is not None and not len(changed):
             return np.zeros(self.context.shape, dtype=bool)
         with_it = self.image(draws, noisy=False).array
-        base = self._before_readout(draws, False).array
-        image = self._patched(base, self._part(draws, name), changed, noisy=False)
-        return masks.effect(with_it, self._read_out(RGBI(array=image), others).array, least_dn)
-
-    def _is_patch(self, draws: Draws, name: str) -> bool:
-        """Return whether a drawn fault changes few pixels, so that only these are developed without it."""
-        # to choose the pixels of a fault that changes nearly all of them takes longer than to develop all
-        return self.is_local(draws, name) and draws[name].fault.localised
+        if changed is None:
+            camera = self.exposure.camera
+            before = camera.detector.develop(part, camera.exposure_s, None)
+        else:
+            base = self._before_readout(draws, False).array
+            before = RGBI(array=self._patched(base, part, changed, noisy=False))
+        return masks.effect(with_it, self._read_out(before, others).array, least_dn)
 
     def _part(self, draws: Draws, name: str) -> Electrons:
         """Return the expected electrons without one drawn fault."""
         optical = acting_at(draws, "electrons")
         return self.signal(without(draws, name), [n for n in optical if n != name], keep=name in self._twins).merged
 
-    def _changed(self, draws: Draws, name: str) -> NDArray[np.intp]:
-        """Return the flat indices of the pixels whose expected electrons differ without one drawn fault.
+    def _changed(self, draws: Draws, name: str, part: Electrons, most: float) -> NDArray[np.intp] | None:
+        """Return the flat indices of the pixels whose expected electrons differ from `part`, without one fault.
 
-        No other pixel of a local detector's image can change.
+        No other pixel of a local detector's image can change. Return None if they are more than a fraction `most`.
         """
+        whole = self.signal(draws, acting_at(draws, "electrons")).merged
+        if _differing_fraction(whole.array, part.array) > most:
+            return None
         key = (frozenset(_keys(draws, draws)), name)
         if key not in self._differences:
-            whole = self.signal(draws, acting_at(draws, "electrons")).merged
-            self._differences[key] = _differing_pixels(whole.array, self._part(draws, name).array)
+            self._differences[key] = _differing_pixels(whole.array, part.array)
         return self._differences[key]
 
     def _patched(
@@ -303,6 +320,12 @@ class Development:
         """Return whether a drawn fault changes only those pixels whose expected electrons it changes."""
         detector = self.exposure.camera.detector
         return "electrons" in draws[name].fault.steps and self.leaves_camera(draws) and detector.local
+
+
+def _differing_fraction(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
+    """Return the fraction of the pixels in which any channel differs, estimated from every sixteenth row."""
+    rows = slice(len(a) // 32, None, 16)
+    return float((a[rows] != b[rows]).any(axis=2).mean())
 
 
 def _differing_pixels(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.intp]:
