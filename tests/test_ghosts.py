@@ -23,7 +23,7 @@ except VbnfaultError as error:
     pytest.skip(f"no usable LLVM: {error}", allow_module_level=True)
 
 from vbnfault.core.llvm import backend
-from vbnfault.lens.straylight import irradiance
+from vbnfault.lens.straylight import ghosts, irradiance
 from vbnfault.lens.straylight.bundles import Rays, Spots, Tracer, name_of, routes
 from vbnfault.lens.straylight.ghosts import boxes, lit_cells, traced_ghosts
 from vbnfault.lens.straylight.irradiance import FlareModel, disc_samples
@@ -427,3 +427,28 @@ def test_a_sun_that_cannot_be() -> None:
         model(load_lens("tessar_50_f2p8"), model="exact")
     with pytest.raises(InputError, match="reflections = 3"):
         routes(load_lens("tessar_50_f2p8"), 3)
+
+
+@pytest.mark.parametrize("kind", ["traced", "paraxial"])
+def test_the_brightest_ghosts_are_listed_without_the_work_for_the_others(
+    kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those with the highest peaks are the same with all ghosts traced and with few, to the last digit."""
+    made = model(load_lens("nikkor_28_f2p8"), wavelength_nm=np.array([450.0, 550.0, 650.0]), model=kind)
+    bundles: list[int] = []
+    together = ghosts._traced_together
+
+    def counted(tracer: Tracer, rays: Rays, *more: Any) -> Any:
+        bundles.append(len(rays))
+        return together(tracer, rays, *more)
+
+    monkeypatch.setattr(ghosts, "_traced_together", counted)
+    for worn in (0.0, 0.3):
+        lens = made.worn(worn)
+        every = sorted(lens.ghosts(11.0, 20.0), key=lambda g: -g.peak_irradiance_fraction)
+        assert len(every) > 30
+        bundles.clear()
+        few = sorted(lens.ghosts(11.0, 20.0, most=6), key=lambda g: -g.peak_irradiance_fraction)
+        assert few[:6] == every[:6]
+        assert bundles == [6 + irradiance._SPARE] * 3
+        assert lens.ghosts(11.0, 20.0, most=1000) == lens.ghosts(11.0, 20.0)

@@ -362,7 +362,7 @@ class _LensStraylight(LensFault):
         made = flare_model(*key).worn(context.coating_loss)
         shared = _shared_while_new(context)
         by_peak = sorted(
-            shared.once("ghosts", (*key, sun), lambda: made.ghosts(*sun)),
+            shared.once("ghosts", (*key, sun), lambda: made.ghosts(*sun, most=_MOST_GHOSTS)),
             key=lambda g: -g.peak_irradiance_fraction,
         )
         return [

@@ -343,14 +343,21 @@ def named(made: Tracer, rays: Rays, names: Collection[tuple[int, ...]]) -> NDArr
     return np.array([name_of(made.routes[r]) in wanted for r in rays.route], dtype=bool)
 
 
-def traced(made: Tracer, rays: Rays, sun_deg: float, turn_rad: float, across: int) -> tuple[Ghost, ...]:
-    """Return flux, centroid and spread on the sensor plane of each ghost's ray bundle, `across` rays wide."""
+def traced(
+    made: Tracer, rays: Rays, sun_deg: float, turn_rad: float, across: int, peak: F64 | None = None
+) -> tuple[Ghost, ...]:
+    """Return flux, centroid and spread on the sensor plane of each ghost's ray bundle, `across` rays wide.
+
+    `peak` is the result of `peaks` for these bundles, if it is known.
+    """
     pupil = np.pi / 4 * paraxial_properties(made.lens).entrance_pupil_diameter_mm ** 2
     out = []
     together = max(1, _TOGETHER // across**2)
     for first in range(0, len(rays), together):
-        part = rays.take(np.arange(first, min(first + together, len(rays))))
-        out += _traced_together(made, part, across, turn_rad, pupil, float(np.cos(np.radians(sun_deg))))
+        within = np.arange(first, min(first + together, len(rays)))
+        part = rays.take(within)
+        own = peaks(made, part, sun_deg) if peak is None else peak[within]
+        out += _traced_together(made, part, across, turn_rad, pupil, own)
     return tuple(sorted(out, key=lambda g: g.pair))
 
 
@@ -373,7 +380,7 @@ def lit_cells(spots: Spots, across: int) -> Any:
 
 
 def _traced_together(
-    made: Tracer, rays: Rays, across: int, turn: float, pupil_mm2: float, cosine: float
+    made: Tracer, rays: Rays, across: int, turn: float, pupil_mm2: float, peak: F64
 ) -> list[Ghost]:
     """Return the ghosts of bundles that are traced together."""
     be = backend()
@@ -385,7 +392,6 @@ def _traced_together(
     dr.eval(*parts)
     total, mx, my, square = (dr.block_sum(v, across * across).numpy() for v in parts)
     cell = 4 * rays.box_mm[:, 2] * rays.box_mm[:, 3] / across**2
-    peak = _peaks(made, rays) * cosine
     out = []
     for k in np.flatnonzero(total > 0):
         cx, cy = mx[k] / total[k], my[k] / total[k]
@@ -419,8 +425,8 @@ def _inside(radius: Any, across: int) -> Any:
     return dr.select(rise < _STEEP, part, dr.select(radius <= 1, 1.0, 0.0))
 
 
-def _peaks(made: Tracer, rays: Rays) -> F64:
-    """Return each ghost's largest irradiance over that at the entrance, float64[bundle].
+def peaks(made: Tracer, rays: Rays, sun_deg: float) -> F64:
+    """Return each ghost's largest irradiance over that of the Sun, float64[bundle].
 
     It is taken over the cells of a lattice.
     """
@@ -436,7 +442,8 @@ def _peaks(made: Tracer, rays: Rays) -> F64:
     with np.errstate(divide="ignore", invalid="ignore"):
         density = np.where(whole, fraction[:, 1:, 1:] * cell[:, None, None] / np.abs(ux * vy - uy * vx), 0)
     # a ghost of only a few rays has no whole cell, and its peak is 0
-    return np.asarray(np.nan_to_num(density, posinf=0.0).max(axis=(1, 2)), dtype=np.float64)
+    most = np.asarray(np.nan_to_num(density, posinf=0.0).max(axis=(1, 2)), dtype=np.float64)
+    return most * float(np.cos(np.radians(sun_deg)))
 
 
 def surface_interactions_per_second(

@@ -22,7 +22,7 @@ from ...core.llvm import backend
 from ...core.memory import release_unused
 from ..prescription import Prescription
 from .bundles import Rays, Spots, TraceOptions, Tracer, name_of
-from .ghosts import Arrivals, boxes, fluxes_mm2, named, traced
+from .ghosts import Arrivals, boxes, fluxes_mm2, named, peaks, traced
 from .paraxial import Ghost, along, mean_ghost
 from .pyramid import LEVELS, Canvas, Pyramid
 from .raster import PARTS, BundleDrawing, Sums, edge_kind
@@ -46,6 +46,7 @@ _FRAME_PIXELS = 16  # smallest number of pixels of a level across the frame
 _SPREAD = 0.25, 256.0  # bounds of the size of rims' images relative to the paraxial size
 _SPREAD_SHARP = 4.0  # upper bound of the same in estimates of sharpness
 _LEAST = 1e-10  # irradiance over the Sun's below which a ghost is omitted
+_SPARE = 8  # ghosts traced beyond those wanted: a few rays may pass the lattice of the peaks alone
 
 
 class ParaxialTracer(Tracer):
@@ -126,6 +127,11 @@ class ParaxialTracer(Tracer):
         )
         dr.eval(spots.x_mm, spots.y_mm, spots.fraction, spots.radius, spots.margin)
         return spots
+
+
+def _at_node(rays: Rays, node: int) -> Rays:
+    """Return the bundles at one wavelength of the tracer, by its index."""
+    return replace(rays, wavelength=np.full(len(rays), node))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -380,15 +386,25 @@ class FlareModel:
                 flux[name_of(made.routes[route])] += own
         return flux
 
-    def ghosts(self, sun_deg: float, azimuth_deg: float = 0.0, *, across: int = 48) -> tuple[Ghost, ...]:
-        """Return the ghosts of a point Sun that reach the frame, each the mean of all bands."""
+    def ghosts(
+        self, sun_deg: float, azimuth_deg: float = 0.0, *, across: int = 48, most: int | None = None
+    ) -> tuple[Ghost, ...]:
+        """Return the ghosts of a point Sun that reach the frame, each the mean of all bands.
+
+        With `most`, those with the highest peaks are among the result, as many as it says; flux and position of
+        most other ghosts are then not computed.
+        """
         turn = float(np.radians(azimuth_deg))
         made, rays, arrivals = self._boxes(sun_deg, turn)
         rays = rays.take(self._in_frame(arrivals) & (arrivals.peak > _LEAST))
+        nodes = range(0, len(self._fine), _SUBDIVISIONS)
+        peak = np.stack([peaks(made, _at_node(rays, node), sun_deg) for node in nodes])
+        if most is not None and most + _SPARE < len(rays):
+            highest = np.sort(np.argsort(-peak.sum(axis=0), kind="stable")[: most + _SPARE])
+            rays, peak = rays.take(highest), peak[:, highest]
         by_name: dict[tuple[int, ...], list[tuple[float, Ghost]]] = {}
-        for node in range(0, len(self._fine), _SUBDIVISIONS):
-            of_node = replace(rays, wavelength=np.full(len(rays), node))
-            for ghost in traced(made, of_node, sun_deg, turn, across):
+        for node, own in zip(nodes, peak, strict=True):
+            for ghost in traced(made, _at_node(rays, node), sun_deg, turn, across, own):
                 by_name.setdefault(ghost.pair, []).append((1 / len(self.nodes_nm), ghost))
         return tuple(mean_ghost(ghosts) for _, ghosts in sorted(by_name.items()))
 
