@@ -122,11 +122,13 @@ def test_memory_is_released_in_time(monkeypatch: pytest.MonkeyPatch) -> None:
         (limit - 2, 1, 0, []),
         (limit - 2, 2, limit - 3, ["_trim"]),
         (limit, 0, limit - 1, ["_trim"]),
-        (limit, 9, limit - 9, ["_trim", "_flush"]),
+        (limit, 9, limit - 9, ["_trim", "_forget"]),
+        (limit, 9, limit, ["_trim", "_forget", "_flush"]),
     ):
         held[0] = before
         released.clear()
         frees("_trim", after_trim)
+        frees("_forget", limit - 10 if after_trim < limit else after_trim)
         frees("_flush", 0)
         memory.release_unused(coming)
         assert released == want, (before, coming)
