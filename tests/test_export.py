@@ -268,6 +268,16 @@ def test_an_outline_of_the_smallest_regions_covers_them_exactly(pixels: list[tup
     assert np.array_equal(drawn == 1, mask)
 
 
+@pytest.mark.parametrize("pixels", [[(2, 3)], [(2, 3), (2, 4)], [(2, 3), (3, 3), (4, 3)]])
+def test_an_outline_of_a_straight_line_has_the_corners_of_its_box(pixels: list[tuple[int, int]]) -> None:
+    mask = np.zeros((8, 9), bool)
+    mask[tuple(np.transpose(pixels))] = True
+    (region,) = regions(mask)
+    x, y, w, h = region.box
+    corners = [(x, y), (x + w, y), (x + w, y + h), (x, y + h)]
+    np.testing.assert_allclose(polygon(region), corners, atol=2e-3)
+
+
 def test_an_outline_runs_through_the_centres_of_pixels() -> None:
     """So that a reader which cuts off decimals gets the pixels, also where a fraction is not exact."""
     mask = np.zeros((8, 9), bool)
