@@ -22,8 +22,11 @@ from test_cli import run
 
 from vbnfault import store as st
 from vbnfault.core.errors import InputError
+from vbnfault.faults import registry
 from vbnfault.output.viewer import Viewer
-from vbnfault.output.viewer.listing import NOT_KNOWN, Listing
+from vbnfault.output.viewer.listing import NOT_KNOWN, Listing, _keys, _measure
+from vbnfault.output.viewer.server import _exact, _plain
+from vbnfault.scene.names import STRATA
 
 
 class Served:
@@ -75,6 +78,7 @@ def test_files_of_the_store_are_served_by_byte_ranges(served: Served) -> None:
     assert served.ask(f"/store/{name}")[:2] == (200, content)
     for asked, start, stop in (
         ("5-9", 5, 10),
+        ("4-4", 4, 5),
         ("7-", 7, size),
         ("-16", size - 16, size),
         (f"0-{10 * size}", 0, size),
@@ -207,6 +211,48 @@ def test_severity_is_the_rank_of_what_was_drawn(tmp_path: Path) -> None:
     assert ranks[0].tolist() == [254, 0, 127, 127]
     assert ranks[2].tolist() == [0, 85, 169, 254]
     assert (ranks[[1, 3]] == NOT_KNOWN).all()
+
+
+def test_two_severities_of_a_class_are_the_least_and_the_most(tmp_path: Path) -> None:
+    attributes = {"scene": {}, "fault_models": {"dust_on_optics": "gaussian"}}
+    store = st.create(tmp_path / "s.zarr", make_spec(layers=(), attributes=attributes), 3)
+    for i, grains in enumerate((7, 2, 7)):
+        sample = fake_sample(store.spec, i)
+        # the longest list counts, not what else was drawn
+        sample.scalars["parameters"] = {"dust_on_optics": {"x_px": [1] * grains, "size": [2], "kind": "grain"}}
+        st.write_samples(store, [sample])
+    ranks = np.frombuffer(Listing(store).severities, np.uint8).reshape(4, 3)
+    assert ranks[0].tolist() == [190, 0, 190]
+
+
+def test_a_fault_is_more_severe_by_the_number_that_its_levels_change(finished_store: Path) -> None:
+    assert [_measure({"loss": 3}, "loss", less) for less in (False, True)] == [3.0, -3.0]
+    assert _measure({"loss": True, "x_px": [1, 2], "y_px": [1]}, "loss", False) == 2.0
+    assert np.isnan(_measure({"kind": "grain"}, "loss", False))
+    store = st.open_store(finished_store)
+    for fault, models in registry().items():
+        for name, model in models.items():
+            store.attributes["fault_models"] = dict.fromkeys(store.spec.faults, "") | {fault: name}
+            key, less_is_worse = dict(zip(store.spec.faults, _keys(store), strict=True)).get(fault, ("", False))
+            severity = model.severity if fault in store.spec.faults else None
+            assert key == ("" if severity is None else severity.key)
+            assert less_is_worse == (severity is not None and severity.high < severity.low)
+
+
+def test_numbers_that_neither_json_nor_a_browser_holds_are_sent_otherwise() -> None:
+    assert _plain(np.array([np.inf, -np.inf, np.nan, 1.5])) == [None, None, None, 1.5]
+    assert [_exact(str(n)) for n in (2**53 - 1, 2**53, -(2**53))] == [2**53 - 1, str(2**53), str(-(2**53))]
+
+
+def test_a_stratum_without_a_name_is_a_question_mark(tmp_path: Path) -> None:
+    store = st.create(tmp_path / "s.zarr", make_spec(layers=()), 2)
+    for i in range(2):
+        sample = fake_sample(store.spec, i)
+        sample.scalars["stratum"] = len(STRATA) - 1 + i
+        st.write_samples(store, [sample])
+    viewer = Viewer(store)
+    viewer.server.server_close()
+    assert [viewer.sample(i)["values"]["stratum"] for i in range(2)] == [STRATA[-1], "?"]
 
 
 def test_damage_is_said_in_a_sentence(whole: st.Store) -> None:
