@@ -41,6 +41,16 @@ def test_layers_are_those_that_were_written(finished_store: Path, chosen: list[i
             assert np.array_equal(decoded(reader, fetched[i], name), written[name])
 
 
+def test_small_chunks_are_decoded_again_unless_they_are_empty(finished_store: Path) -> None:
+    store = st.open_store(finished_store)
+    reader = st.ShardReader(store, ["mask"])
+    fetched = reader.fetch(1, [4, 5, 6, 7])
+    assert max(sample.size for sample in fetched.values()) < shards._SMALL_CHUNK
+    for _ in range(3):
+        for i, sample in fetched.items():
+            assert np.array_equal(decoded(reader, sample, "mask"), fake_sample(store.spec, i).layers["mask"])
+
+
 def test_each_file_is_opened_once_and_only_the_bytes_wanted_are_read(
     finished_store: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

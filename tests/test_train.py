@@ -112,6 +112,7 @@ def test_a_state_continues_its_own_order_only() -> None:
         ({"batch_size": 4}, "state: its batch_size = 3, but here batch_size = 4"),
         ({"seed": 6}, "state: its seed = 5, but here seed = 6"),
         ({"samples": np.arange(49)}, "state: it belongs to other samples"),
+        ({"shard_samples": 5}, "state: it belongs to other samples"),
     ):
         with pytest.raises(InputError, match=says):
             order(**changes).position(state)
@@ -132,6 +133,9 @@ def test_samples_are_chosen_by_split_fault_and_value(finished_store: Path) -> No
     dusty = injected[:, FAULTS.index("dust_on_optics")]
     assert select(store, containing=["dust_on_optics"]).tolist() == everything[dusty].tolist()
     assert 0 < dusty.sum() < store.samples
+    either = dusty | injected[:, FAULTS.index("straylight")]
+    assert select(store, containing=["dust_on_optics", "straylight"]).tolist() == everything[either].tolist()
+    assert dusty.sum() < either.sum()
     high = select(store, "train", where=lambda c: (c["sun_elevation_deg"] > 0) & (c["split"] != "val"))
     assert high.tolist() == everything[(split == "train") & (elevation > 0)].tolist()
 
