@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import threading
 from collections.abc import Iterator
 
 import numpy as np
@@ -68,3 +71,28 @@ def test_a_process_that_holds_much_gives_back_what_is_kept(monkeypatch: pytest.M
     monkeypatch.setattr(memory, "_MOST", 0)
     memory.release_unused()
     assert not buffers._kept._bytes
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="the system has no fork")
+@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
+def test_a_forked_process_does_not_wait_for_a_thread_that_it_lacks() -> None:
+    """Loaders of training data fork, maybe while another thread takes memory."""
+    holds, done = threading.Event(), threading.Event()
+
+    def hold() -> None:
+        with buffers._kept._lock:
+            holds.set()
+            done.wait()
+
+    thread = threading.Thread(target=hold)
+    thread.start()
+    holds.wait()
+    child = os.fork()
+    if not child:
+        signal.alarm(20)
+        buffers.clear()
+        os._exit(0 if buffers.empty(SHAPE).shape == SHAPE else 1)
+    _, status = os.waitpid(child, 0)
+    done.set()
+    thread.join()
+    assert os.waitstatus_to_exitcode(status) == 0

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ctypes
 import math
+import os
 import threading
 import weakref
 from typing import Any, TypeVar
@@ -25,6 +26,10 @@ class _Kept:
     """Hold free blocks of memory by their size."""
 
     def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Hold nothing; what other threads are about to do is forgotten, too."""
         self._lock = threading.RLock()  # a block may be freed by the garbage collector anywhere
         self._free: dict[int, list[NDArray[np.uint8]]] = {}
         self._bytes = 0
@@ -53,6 +58,9 @@ class _Kept:
 
 
 _kept = _Kept()
+
+if hasattr(os, "register_at_fork"):  # another thread of the parent may hold the lock at that moment
+    os.register_at_fork(after_in_child=_kept.reset)
 
 
 def empty(shape: tuple[int, ...], dtype: DTypeLike = np.float32) -> NDArray[Any]:
