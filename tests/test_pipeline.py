@@ -540,3 +540,34 @@ def test_a_twin_develops_only_the_pixels_that_its_fault_changes(
             assert sum(developed) == changed or changed > 0.5 * 96 * 80
             few += changed < 0.5 * 96 * 80
     assert few > 2
+
+
+def test_an_image_develops_only_the_pixels_that_differ_from_the_clean_one(
+    frames_: list[Frame], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    developed: list[int] = []
+    develop = ThreeColourDetector.develop
+
+    def counted(self: Any, expected: Any, *more: Any) -> Any:
+        developed.append(expected.array.shape[0] * expected.array.shape[1])
+        return develop(self, expected, *more)
+
+    few = 0
+    for frame in frames_:
+        draws, given = frame.injection.draws, frame.injection.development
+        optical = acting_at(draws, "electrons")
+        alone, after = (
+            Development(exposure=given.exposure, context=given.context, rng=frame.spec.rng) for _ in range(2)
+        )
+        after.image({})
+        with monkeypatch.context() as patched:
+            patched.setattr(ThreeColourDetector, "develop", counted)
+            developed.clear()
+            image = after.image(draws)
+        np.testing.assert_array_equal(image.array, alone.image(draws).array)
+        lit = [after.signal(draws, names).merged.array for names in ([], optical)]
+        changed = np.count_nonzero((lit[0] != lit[1]).any(axis=2))
+        if optical:  # without optical faults the image before readout is the clean one
+            assert sum(developed) == changed or changed > 0.5 * 96 * 80
+            few += changed < 0.5 * 96 * 80
+    assert few > 2

@@ -206,6 +206,17 @@ class Development:
         changed = _differing_pixels(signal.array, lit)
         return RGBI(array=self._patched(clean.array, signal, changed, noisy=True))
 
+    def twin(self, draws: Draws, name: str) -> RGBI:
+        """Return `image` without one drawn fault; only the pixels that this fault changes are developed for it."""
+        others = without(draws, name)
+        key = (*self._image_key(others, True), ())
+        if key not in self._images and self.is_local(draws, name):
+            part, base = self._part(draws, name), self._before_readout(draws, noisy=True).array
+            changed = self._changed(draws, name, part, _MOST_CHANGED)
+            if changed is not None:
+                self._images[key] = RGBI(array=self._patched(base, part, changed, noisy=True))
+        return self.image(others)
+
     def _read_out(self, image: RGBI, draws: Draws) -> RGBI:
         """Return the image with the drawn faults that act on the finished image."""
         for name in acting_at(draws, "rgbi"):
@@ -239,17 +250,6 @@ class Development:
         return defects
 
     # --- effects ---------------------------------------------------------------------------------------------
-
-    def twin(self, draws: Draws, name: str) -> RGBI:
-        """Return `image` without one drawn fault; only the pixels that this fault changes are developed for it."""
-        others = without(draws, name)
-        key = (*self._image_key(others, True), ())
-        if key not in self._images and self.is_local(draws, name):
-            part, base = self._part(draws, name), self._before_readout(draws, noisy=True).array
-            changed = self._changed(draws, name, part, _MOST_CHANGED)
-            if changed is not None:
-                self._images[key] = RGBI(array=self._patched(base, part, changed, noisy=True))
-        return self.image(others)
 
     def effect(self, draws: Draws, name: str, least_dn: float = 1.0) -> Mask:
         """Return where the noise-free image changes by `least_dn` or more without one drawn fault, bool[y, x].
