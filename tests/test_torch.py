@@ -258,6 +258,19 @@ def test_batches_are_read_as_usual_after_a_loader(finished_store: Path) -> None:
     assert rows(DataLoader(source, batch_size=None, num_workers=1)) == wanted
 
 
+def test_an_iteration_that_is_left_drops_what_was_read_ahead_and_keeps_the_reader(finished_store: Path) -> None:
+    source = batches(finished_store, buffer=8)
+    left: Any = iter(source)
+    next(left)
+    opened = source.data._reader
+    assert opened is not None
+    assert opened[1]._held
+    left.close()
+    assert not opened[1]._held
+    assert len(rows(source)) == len(source)
+    assert source.data._reader is opened  # it knows which layers it has compared with their checksums
+
+
 def test_small_tensors_need_no_shared_memory_of_their_own() -> None:
     slots = Slots(1, 1, 1024)
     slot = slots.take(0)

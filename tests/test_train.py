@@ -217,6 +217,11 @@ def test_instances_are_the_connected_regions_of_localised_classes(store: st.Stor
         assert np.array_equal(instances > 0, mask)
         whole = FAULTS.index("vignetting")
         assert set(np.unique(instances[whole])) <= {0, 1}
+    apart = np.zeros((1, len(FAULTS), 4, 7), bool)
+    apart[..., 1, [1, 5]] = True
+    most = Targets(store, ["instances"])._instances(apart)[0].max(axis=(1, 2))
+    assert most.tolist() == [2 if name in (store.spec.localised_faults or ()) else 1 for name in FAULTS]
+    assert set(most.tolist()) == {1, 2}
 
 
 def test_regions_are_numbered_by_their_first_pixel() -> None:
@@ -278,6 +283,15 @@ def test_what_is_held_ahead_is_limited(store: st.Store, monkeypatch: pytest.Monk
         source.fill(sequence[k : k + 1], source.buffers(1), sequence[k + 1 :])
         source._wait()
         assert len(source._held) <= 1
+    source.close()
+
+
+def test_scalars_of_the_latest_shards_are_kept(store: st.Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reader, "SHARDS_OF_SCALARS", 2)
+    source = SampleReader(store, Targets(store, ["classes"]))
+    for i in (0, 4, 8, 5):
+        source.fill([i], source.buffers(1))
+    assert list(source._scalars) == [1, 2]
     source.close()
 
 

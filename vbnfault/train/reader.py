@@ -14,6 +14,8 @@ from .targets import Targets
 
 # The most compressed bytes that one reader holds ahead of their use.
 READ_AHEAD_BYTES = 256 * 2**20
+# The most shards of which one reader keeps the scalars.
+SHARDS_OF_SCALARS = 64
 
 
 class SampleReader:
@@ -118,6 +120,6 @@ class SampleReader:
                     kept[name] = self._reader.column(name, number)
                 rows.append(kept[name][k])
             values[name] = np.stack(rows)
-        while len(self._scalars) > 64:
+        while len(self._scalars) > SHARDS_OF_SCALARS:
             del self._scalars[next(iter(self._scalars))]
         return values
