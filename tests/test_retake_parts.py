@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -297,3 +298,23 @@ def test_the_radiance_before_the_lens_and_without_stars_is_used(
 ) -> None:
     spec: Any = SimpleNamespace(layers=layers)
     assert retake._radiance_layer(spec, {"scene": scene}) == layer
+
+
+@pytest.mark.parametrize(("overwrite", "taken"), [(False, [1, 2]), (True, [0, 1, 2, 3])])
+def test_a_store_that_has_begun_keeps_its_samples_unless_it_is_replaced(
+    overwrite: bool, taken: list[int], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    finished: Any = SimpleNamespace(
+        begun=lambda: [0],
+        done=lambda _: dict.fromkeys(range(4), True),
+        samples=4,
+        path="s.zarr",
+        attributes={"blocks": [4]},
+    )
+    begun = SimpleNamespace(attributes={retake.RETAKE: {"samples": [[1, 2]]}})
+    monkeypatch.setattr(retake.store, "is_store", lambda _: True)
+    monkeypatch.setattr(retake.store, "open_store", lambda _: begun)
+    options: Any = SimpleNamespace(overwrite=overwrite)
+    assert retake._samples(finished, Path("new.zarr"), options).tolist() == taken
+    noted = "note: s.zarr: 2 of 4 samples are taken, those that were finished\n"
+    assert capsys.readouterr().err == ("" if overwrite else noted)
