@@ -21,6 +21,7 @@ from vbnfault import store as st
 from vbnfault.core import registry
 from vbnfault.core.errors import InputError, VbnfaultError
 from vbnfault.output.export import Entry, Format, export_store, formats
+from vbnfault.output.export.folder import Folder
 from vbnfault.output.export.formats import coco
 from vbnfault.output.export.regions import coco_text, polygon, regions, whole
 from vbnfault.store import disk
@@ -276,6 +277,22 @@ def test_an_outline_of_a_straight_line_has_the_corners_of_its_box(pixels: list[t
     x, y, w, h = region.box
     corners = [(x, y), (x + w, y), (x + w, y + h), (x, y + h)]
     np.testing.assert_allclose(polygon(region), corners, atol=2e-3)
+
+
+def test_regions_come_in_the_order_of_their_first_pixel_down_the_columns() -> None:
+    mask = np.zeros((5, 7), bool)
+    mask[0, 5] = mask[3, 1] = True
+    assert [region.box for region in regions(mask)] == [(1, 3, 1, 1), (5, 0, 1, 1)]
+
+
+@pytest.mark.parametrize("content", [b"1", b"123"])
+def test_a_part_whose_file_has_another_size_is_not_finished(content: bytes, tmp_path: Path) -> None:
+    folder = Folder(tmp_path)
+    folder.put([("a.png", b"12")])
+    folder.write_part(0, {})
+    assert folder.has_part(0)
+    (tmp_path / "a.png").write_bytes(content)
+    assert not folder.has_part(0)
 
 
 def test_an_outline_runs_through_the_centres_of_pixels() -> None:
