@@ -21,7 +21,7 @@ from vbnfault.core.quantities import Radiance
 from vbnfault.core.shared_results import SharedResults
 from vbnfault.dataset.identity import scene_identity, store_spec
 from vbnfault.detector import MosaicDetector
-from vbnfault.pipeline import Session, injection, stages
+from vbnfault.pipeline import Session, injection, resolve, sight, stages
 from vbnfault.pipeline.exposure import exposure_factor
 from vbnfault.pipeline.record import to_sample
 from vbnfault.pipeline.spec import SampleSpec
@@ -201,6 +201,40 @@ def test_a_fault_that_needs_light_is_not_drawn_in_a_dark_view(monkeypatch: pytes
     )
     left = injection.inject_faults(spec, quick.pose, quick.rendering, dark)
     assert set(left.draws) == set(spec.commanded) - {"dust_on_optics", "optics_degradation"}
+
+
+def test_shared_views_of_faults_that_need_light_are_not_dark(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each of the samples of a dark view would have another view rendered."""
+    faults: dict[str, Any] = {"dust_on_optics": {}, "straylight": {}}
+    table = small_scene(
+        dataset={"samples": 96, "sites": 1, "variants_per_view": 4, "shard_samples": 4},
+        plan={"faulty_fraction": 1.0},
+    )
+    table["faults"] = faults
+    own = Session(config.parse_scene(table, source="test"))
+
+    def lit() -> list[float]:
+        """Sunlit fraction of each view's frame, and 1 more where the Sun is in it."""
+        specs = [own.spec(k) for k in range(0, 96, 4)]
+        poses = [(spec, resolve.resolve(spec)) for spec in specs if "dust_on_optics" in spec.commanded_in_view]
+        camera = own.scene.camera
+        half_deg = 0.5 * camera.fov_deg * camera.height_px / camera.width_px
+        light = []
+        for spec, pose in poses:
+            axes, sun_L = pose.L_from_C, pose.sun_L
+            fraction = sight.lit_fraction(camera, spec.terrain, pose.position_L_m[None], axes[None], sun_L[None])[0]
+            light.append(float(fraction) + float(axes[:, 2] @ sun_L > np.cos(np.radians(half_deg))))
+        return light
+
+    assert min(lit()) > 0
+    monkeypatch.setattr(resolve, "faults_needing_light", lambda spec: [])
+    assert lit().count(0.0) > 0, "no view of this plan is dark, so the test says nothing"
+    monkeypatch.undo()
+    # a sample with a view of its own keeps the view that it had
+    single = small_scene(dataset={"samples": 4, "sites": 1}, plan={"faulty_fraction": 1.0})
+    single["faults"] = faults
+    alone = Session(config.parse_scene(single, source="test"))
+    assert [sight.faults_needing_light(alone.spec(k)) for k in range(4)] == [[]] * 4
 
 
 def test_exposures_follow_their_stops(session: Session) -> None:

@@ -16,7 +16,7 @@ from ..scene.trajectory import FlownPose
 from ..world import assemble
 from ..world.ground import encloses
 from .aimed import resolve_aimed
-from .sight import lit_fraction, no_view, placed
+from .sight import faults_needing_light, lit_fraction, no_view, placed
 from .spec import Pose, SampleSpec, Terrain
 
 F64 = NDArray[np.float64]
@@ -35,7 +35,8 @@ def resolve(spec: SampleSpec, first_try: int = 0) -> Pose:
     - camera and spacecraft are above the ground
     - a Sun-averted camera does not look at the Sun
     - if `sun_visibility` is "required", a sample whose faults need the Sun sees the whole Sun
-    - enough of the frame is sunlit ground
+    - enough of the frame is sunlit ground; some of it, or the Sun's disc, if samples that share the view have
+      faults that need light
 
     A pose of a trajectory, from SPICE or from a table, is kept. Where the camera aims, `resolve_aimed` says which
     conditions hold.
@@ -160,9 +161,12 @@ def _first_usable(spec: SampleSpec, views: _Views, count: int, unmet: dict[str, 
         met[f"the whole Sun visible before the camera, for {', '.join(needing_sun)}"] = seen
     good = np.logical_and.reduce(list(met.values()))
     lit_fraction = plan.strata(scene)[stratum].min_lit_fraction
-    if lit_fraction and good[:count].any():
-        enough = _lit_fraction(spec, views) >= lit_fraction
-        met[f"geometry.min_lit_fraction = {lit_fraction:g} of the frame sunlit ground"] = enough | ~good
+    needing_light = faults_needing_light(spec)
+    if (lit_fraction or needing_light) and good[:count].any():
+        fraction = _lit_fraction(spec, views)
+        enough = fraction >= lit_fraction if lit_fraction else (fraction > 0) | _sees_disc(spec, views)
+        of_the_frame = f"geometry.min_lit_fraction = {lit_fraction:g} of the frame sunlit ground"
+        met[of_the_frame if lit_fraction else f"sunlit ground, for {', '.join(needing_light)}"] = enough | ~good
         good = good & enough
     for k in np.flatnonzero(good[:count]):
         if vehicle is None:
@@ -176,6 +180,13 @@ def _first_usable(spec: SampleSpec, views: _Views, count: int, unmet: dict[str, 
         if failed:
             unmet[text] = unmet.get(text, 0) + failed
     return None
+
+
+def _sees_disc(spec: SampleSpec, views: _Views) -> Mask:
+    """Return whether the Sun's disc lies within the circle that fits into the frame, bool[view]."""
+    camera = spec.scene.camera
+    half_deg = 0.5 * camera.fov_deg * min(1.0, camera.height_px / camera.width_px)
+    return np.asarray((views.sun_visible > 0) & (views.sun_angle_deg() < half_deg))
 
 
 def _lit_fraction(spec: SampleSpec, views: _Views) -> F64:

@@ -70,6 +70,17 @@ def no_view(spec: SampleSpec, kind: str, unmet: Mapping[str, int]) -> VbnfaultEr
     )
 
 
+def faults_needing_light(spec: SampleSpec) -> list[str]:
+    """Return the commanded faults that a dark view cannot show, if several samples share the view.
+
+    A single sample finds out by its render. Of samples that share a view, each would have a second view rendered
+    for it, so the darkness is looked for before the render, on a grid of rays.
+    """
+    if spec.plan.variants == 1:
+        return []
+    return [name for name in spec.commanded_in_view if spec.faults[name].needs_light]
+
+
 def lit_fraction(camera: CameraTable, terrain: Terrain, position_L_m: F64, L_from_C: F64, sun_L: F64) -> F64:
     """Return the fraction of each view's frame that shows sunlit ground, float64[view].
 
