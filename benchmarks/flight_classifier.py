@@ -1,6 +1,6 @@
 """Let a classifier tell rendered flight frames from real ones: an honest two-sample test on patches.
 
-    python benchmarks/flight_replay.py --frames FOLDER --shape SHAPE --out replay
+    python benchmarks/flight_replay.py --frames FOLDER --shape SHAPE --texture --out replay
     python benchmarks/flight_classifier.py --pairs replay/pairs --out classifier
 
 `pairs` holds NAME_real.png and NAME_rendered.png, aligned and both in 8 bits, as `flight_replay.py` writes them.
