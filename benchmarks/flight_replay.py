@@ -46,8 +46,9 @@ layer, the others are fainter, as of electrons from the housing that end there. 
 brighter than magnitude 7 in such a field, of which about four show. `SPOTS` gives the rendered frames the same
 tracks, and the grains of the coma at 3.6 au. Stars and warm pixels come from scene and sensor.
 
-A shape file is sharpened as far as its own roughness asks for (`body.sharpen`). One of 67P is scaled to 18.7 km³, and
-its ground has the relief of `GROUND`. Its dust has no contrast, since random dust lies elsewhere than on the comet.
+A shape file is sharpened as far as its own roughness asks for (`body.sharpen`). One of 67P is scaled to 18.7 km³,
+and its ground has the relief of `GROUND`. Its dust has no contrast, since random dust lies elsewhere than on the
+comet.
 
 `rank` and the texture ask for different things. What the shape does not know, the renderer has to make up, and any
 made-up texture lowers the correlation with the frame, also one with the right statistics: the frames' own texture
