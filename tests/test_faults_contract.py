@@ -353,6 +353,24 @@ OPTICAL_TEXTURES = ["straylight", "dust_on_optics", "optics_degradation", "vigne
 
 
 @pytest.mark.parametrize("name", OPTICAL_TEXTURES)
+def test_a_plane_of_no_light_past_the_rims_is_no_light(name: str) -> None:
+    context = make_context(64, sun=(50.0, 40.0))
+    fault: Fault = make(name)
+    params, light = fault.draw(context, np.random.default_rng(1)), noisy_electrons(context)
+    none = dataclasses.replace(light, past_rims=np.zeros_like(light.array)).scaled(1.0)
+    assert (none.past_rims, none.rim_rows) == (None, None)
+    np.testing.assert_array_equal(act(fault, none, params, context).array, act(fault, light, params, context).array)
+
+
+def test_light_past_the_rims_in_few_rows_is_scaled_again() -> None:
+    light = noisy_electrons(make_context(64))
+    past = np.zeros_like(light.array)
+    past[30:32] = 8.0
+    both = dataclasses.replace(light, past_rims=past)
+    np.testing.assert_array_equal(both.scaled(2.0).scaled(4.0).merged.array, both.scaled(8.0).merged.array)
+
+
+@pytest.mark.parametrize("name", OPTICAL_TEXTURES)
 def test_a_few_rows_with_the_sun_take_few_rows_of_work(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The Sun's disc does not make a fault act on a second plane, but on few rows beside the whole frame."""
     context = make_context(128, sun=(50.0, 40.0))

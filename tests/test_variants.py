@@ -230,7 +230,16 @@ def test_shared_views_of_faults_that_need_light_are_not_dark(monkeypatch: pytest
     monkeypatch.setattr(resolve, "faults_needing_light", lambda spec: [])
     assert lit().count(0.0) > 0, "no view of this plan is dark, so the test says nothing"
     monkeypatch.undo()
-    # a sample with a view of its own keeps the view that it had
+    # a body that may lie between the rays of the grid is left to the render
+    far = own.spec(next(k for k in range(0, 96, 4) if "dust_on_optics" in own.spec(k).commanded_in_view))
+    views = dataclasses.replace(resolve._Views.of(far, 0), sun_visible=np.zeros(8))
+    away = dataclasses.replace(views, position_L_m=views.position_L_m - [0.0, 0.0, 1e7])
+    assert not resolve._may_have_light(far, views).any()
+    assert resolve._may_have_light(far, away).all()
+    # where such a fault is left out instead, and where a sample has a view of its own, views are as they were
+    dropping = {**table, "plan": {**table["plan"], "on_invisible": "drop"}}
+    left_out = Session(config.parse_scene(dropping, source="test"))
+    assert [sight.faults_needing_light(left_out.spec(k)) for k in range(8)] == [[]] * 8
     single = small_scene(dataset={"samples": 4, "sites": 1}, plan={"faulty_fraction": 1.0})
     single["faults"] = faults
     alone = Session(config.parse_scene(single, source="test"))

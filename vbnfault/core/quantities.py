@@ -157,10 +157,14 @@ class Electrons(Quantity):
 
     def scaled(self, factor: float) -> Electrons:
         """Return all light multiplied by a factor; light past the rims in few rows becomes `rim_rows`."""
+        if self.rim_rows is not None:
+            return self.in_planes.scaled(factor)
         array, times = self.array * np.float32(factor), np.float32(factor)
         if self.past_rims is None:
             return replace(self, array=array)
         rows = _lit_rows(self.past_rims)
+        if rows.stop == rows.start:
+            return replace(self, array=array, past_rims=None)
         if rows.stop - rows.start > len(array) * _MOST_RIM_ROWS:
             return replace(self, array=array, past_rims=self.past_rims * times)
         band = RimRows(rows=rows, before=array[rows].copy(), past=self.past_rims[rows] * times)

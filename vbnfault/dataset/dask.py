@@ -198,8 +198,10 @@ class _ClusterRun:
             while self._tasks:
                 self._take(self._next_ended())
         except BaseException:
-            with contextlib.suppress(Exception):
+            try:
                 self._wind_up()
+            except Exception:
+                self._lost = True  # nothing more is asked of the scheduler
             raise
         finally:
             if not self._lost:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..scene import plan
 from ..world.aiming import AimedView, aimed_view
-from .sight import faults_needing_light, grid_rays_C, lit_fraction, no_view, placed
+from .sight import grid_rays_C, lit_fraction, no_view, placed
 from .spec import Pose, SampleSpec, Terrain
 
 F64 = NDArray[np.float64]
@@ -103,13 +103,10 @@ def _unmet(spec: SampleSpec, terrain: Terrain, view: AimedView) -> tuple[str, Po
     if geometry.sun_visibility == "required" and (needing or aim == "sun") and pose.sun_visible_fraction < 1:
         return "the whole Sun visible", pose
     least = geometry.min_lit_fraction if aim != "sun" else 0.0
-    needing_light = faults_needing_light(spec) if aim != "sun" else []
-    if least or needing_light:
+    if least:
         lit = lit_fraction(scene.camera, terrain, position[None], pose.L_from_C[None], pose.sun_L[None])[0]
         if lit < least:
             return f"geometry.min_lit_fraction = {least:g} of the frame sunlit ground", pose
-        if not lit:
-            return f"sunlit ground, for {', '.join(needing_light)}", pose
     if terrain.vehicle is not None:
         parts = position + terrain.vehicle.outline_B_m @ pose.L_from_C.T
         if render.is_between(surface, position, parts):

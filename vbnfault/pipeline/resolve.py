@@ -16,7 +16,7 @@ from ..scene.trajectory import FlownPose
 from ..world import assemble
 from ..world.ground import encloses
 from .aimed import resolve_aimed
-from .sight import faults_needing_light, lit_fraction, no_view, placed
+from .sight import LIT_GRID, faults_needing_light, lit_fraction, no_view, placed
 from .spec import Pose, SampleSpec, Terrain
 
 F64 = NDArray[np.float64]
@@ -161,10 +161,10 @@ def _first_usable(spec: SampleSpec, views: _Views, count: int, unmet: dict[str, 
         met[f"the whole Sun visible before the camera, for {', '.join(needing_sun)}"] = seen
     good = np.logical_and.reduce(list(met.values()))
     lit_fraction = plan.strata(scene)[stratum].min_lit_fraction
-    needing_light = faults_needing_light(spec)
+    needing_light = faults_needing_light(spec) if vehicle is None else []  # a spacecraft in view may be sunlit
     if (lit_fraction or needing_light) and good[:count].any():
         fraction = _lit_fraction(spec, views)
-        enough = fraction >= lit_fraction if lit_fraction else (fraction > 0) | _sees_disc(spec, views)
+        enough = fraction >= lit_fraction if lit_fraction else (fraction > 0) | _may_have_light(spec, views)
         of_the_frame = f"geometry.min_lit_fraction = {lit_fraction:g} of the frame sunlit ground"
         met[of_the_frame if lit_fraction else f"sunlit ground, for {', '.join(needing_light)}"] = enough | ~good
         good = good & enough
@@ -182,11 +182,19 @@ def _first_usable(spec: SampleSpec, views: _Views, count: int, unmet: dict[str, 
     return None
 
 
-def _sees_disc(spec: SampleSpec, views: _Views) -> Mask:
-    """Return whether the Sun's disc lies within the circle that fits into the frame, bool[view]."""
-    camera = spec.scene.camera
+def _may_have_light(spec: SampleSpec, views: _Views) -> Mask:
+    """Return which views may have light although no ray of a grid meets sunlit ground, bool[view].
+
+    The Sun's disc lies within the circle that fits into the frame, or the body is so small in the frame that it
+    may lie between the rays.
+    """
+    camera, terrain = spec.scene.camera, spec.terrain
     half_deg = 0.5 * camera.fov_deg * min(1.0, camera.height_px / camera.width_px)
-    return np.asarray((views.sun_visible > 0) & (views.sun_angle_deg() < half_deg))
+    sees_disc = (views.sun_visible > 0) & (views.sun_angle_deg() < half_deg)
+    centre_L_m = terrain.site.T_from_L.T @ (terrain.body.centre_of_mass_T_m - terrain.site.position_T_m)
+    diameter_m = (6 * terrain.body.volume_m3 / np.pi) ** (1 / 3)
+    size_rad = diameter_m / np.linalg.norm(centre_L_m - views.position_L_m, axis=1)
+    return np.asarray(sees_disc | (size_rad < 2 * np.radians(camera.fov_deg) / LIT_GRID))
 
 
 def _lit_fraction(spec: SampleSpec, views: _Views) -> F64:

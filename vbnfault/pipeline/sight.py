@@ -23,7 +23,7 @@ Mask = NDArray[np.bool_]
 
 # Rays per direction that sample the frame for sunlit ground: 576 in total, so a fraction of 5 % has an error of
 # 0.9 %.
-_LIT_GRID = 24
+LIT_GRID = 24
 
 
 def placed(spec: SampleSpec, terrain: Terrain, flown: FlownPose) -> Pose:
@@ -71,12 +71,12 @@ def no_view(spec: SampleSpec, kind: str, unmet: Mapping[str, int]) -> VbnfaultEr
 
 
 def faults_needing_light(spec: SampleSpec) -> list[str]:
-    """Return the commanded faults that a dark view cannot show, if several samples share the view.
+    """Return the commanded faults in whose samples a dark view is replaced, if several samples share the view.
 
     A single sample finds out by its render. Of samples that share a view, each would have a second view rendered
     for it, so the darkness is looked for before the render, on a grid of rays.
     """
-    if spec.plan.variants == 1:
+    if spec.plan.variants == 1 or spec.scene.plan.on_invisible == "drop":
         return []
     return [name for name in spec.commanded_in_view if spec.faults[name].needs_light]
 
@@ -106,7 +106,7 @@ def lit_fraction(camera: CameraTable, terrain: Terrain, position_L_m: F64, L_fro
 
 def grid_rays_C(fov_deg: float, height_over_width: float) -> F64:
     """Return unit directions through the centres of a grid of cells over the frame, float64[ray, 3]."""
-    centres = (np.arange(_LIT_GRID) + 0.5) / _LIT_GRID * 2 - 1
+    centres = (np.arange(LIT_GRID) + 0.5) / LIT_GRID * 2 - 1
     slope = np.tan(np.radians(fov_deg) / 2)
     x, y = np.meshgrid(slope * centres, slope * height_over_width * centres)
     rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)

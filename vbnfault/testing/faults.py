@@ -234,8 +234,11 @@ def _check_planes_of_light(fault: Fault, params: Params, context: FaultContext, 
 
 
 def _check_rows_of_light(fault: Fault, params: Params, context: FaultContext, light: Electrons) -> None:
-    """Check that light past the rims in a few rows gives the bits of the same light in a plane."""
+    """Check that light past the rims in a few rows gives the bits of the same light in a plane, also if it is 0."""
     middle, past = len(light.array) // 2, np.zeros_like(light.array)
+    nothing = act(fault, replace(light, past_rims=past.copy()).scaled(1.0), params, context)
+    same = np.array_equal(nothing.merged.array, act(fault, light, params, context).merged.array)
+    assert same, "a plane of no light past the rims gives another result than none"
     past[middle : middle + 2] = light.array[middle : middle + 2] + 1
     in_planes = replace(light, past_rims=past)
     few = in_planes.scaled(1.0)

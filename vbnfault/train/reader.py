@@ -42,9 +42,10 @@ class SampleReader:
                 pool.shutdown(wait=True, cancel_futures=True)
 
     def release(self) -> None:
-        """Drop what was read ahead of its use."""
+        """Drop what was read, so that a store that changes between epochs gives its new samples."""
         self._wait()
         self._held.clear()
+        self._scalars.clear()
 
     def buffers(self, count: int) -> dict[str, NDArray[Any]]:
         """Return new arrays for `fill`, for `count` samples."""
