@@ -397,6 +397,8 @@ class FlareModel:
         turn = float(np.radians(azimuth_deg))
         made, rays, arrivals = self._boxes(sun_deg, turn)
         rays = rays.take(self._in_frame(arrivals) & (arrivals.peak > _LEAST))
+        if not len(rays):
+            return ()
         nodes = range(0, len(self._fine), _SUBDIVISIONS)
         peak = np.stack([peaks(made, _at_node(rays, node), sun_deg) for node in nodes])
         if most is not None and most + _SPARE < len(rays):
