@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -508,10 +510,9 @@ def test_the_effect_by_rows_equals_the_effect_of_whole_pictures(frames_: list[Fr
             assert np.array_equal(development.effect(draws, name), (whole != other).any(axis=-1))
 
 
-def test_a_twin_develops_only_the_pixels_that_its_fault_changes(
-    frames_: list[Frame], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A twin has the bits of the image without its fault, and takes no more pixels than the fault changes."""
+@contextlib.contextmanager
+def counted_pixels(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
+    """Give a list to which each development of an image adds the number of its pixels."""
     developed: list[int] = []
     develop = ThreeColourDetector.develop
 
@@ -519,6 +520,15 @@ def test_a_twin_develops_only_the_pixels_that_its_fault_changes(
         developed.append(expected.array.shape[0] * expected.array.shape[1])
         return develop(self, expected, *more)
 
+    with monkeypatch.context() as patched:
+        patched.setattr(ThreeColourDetector, "develop", counted)
+        yield developed
+
+
+def test_a_twin_develops_only_the_pixels_that_its_fault_changes(
+    frames_: list[Frame], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A twin has the bits of the image without its fault, and takes no more pixels than the fault changes."""
     few = 0
     for frame in frames_:
         for name in set(frame.drawn) & {"dust_on_optics", "straylight"}:
@@ -528,9 +538,7 @@ def test_a_twin_develops_only_the_pixels_that_its_fault_changes(
             expected = own.image(without(draws, name)).array
             fresh = Development(exposure=given.exposure, context=given.context, rng=frame.spec.rng)
             fresh.image(draws)
-            with monkeypatch.context() as patched:
-                patched.setattr(ThreeColourDetector, "develop", counted)
-                developed.clear()
+            with counted_pixels(monkeypatch) as developed:
                 twin = fresh.twin(draws, name)
             np.testing.assert_array_equal(twin.array, expected)
             assert fresh.image(without(draws, name)).array is twin.array, "the twin is kept"
@@ -545,13 +553,6 @@ def test_a_twin_develops_only_the_pixels_that_its_fault_changes(
 def test_an_image_develops_only_the_pixels_that_differ_from_the_clean_one(
     frames_: list[Frame], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    developed: list[int] = []
-    develop = ThreeColourDetector.develop
-
-    def counted(self: Any, expected: Any, *more: Any) -> Any:
-        developed.append(expected.array.shape[0] * expected.array.shape[1])
-        return develop(self, expected, *more)
-
     few = 0
     for frame in frames_:
         draws, given = frame.injection.draws, frame.injection.development
@@ -560,9 +561,7 @@ def test_an_image_develops_only_the_pixels_that_differ_from_the_clean_one(
             Development(exposure=given.exposure, context=given.context, rng=frame.spec.rng) for _ in range(2)
         )
         after.image({})
-        with monkeypatch.context() as patched:
-            patched.setattr(ThreeColourDetector, "develop", counted)
-            developed.clear()
+        with counted_pixels(monkeypatch) as developed:
             image = after.image(draws)
         np.testing.assert_array_equal(image.array, alone.image(draws).array)
         lit = [after.signal(draws, names).merged.array for names in ([], optical)]

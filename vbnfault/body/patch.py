@@ -15,7 +15,7 @@ ground.
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
@@ -108,10 +108,14 @@ def build_patch(body: Body, site: Site, spec: PatchSpec) -> Patch:
         points, normals, faces = refine(*_with_scarps(body, site, model, limit, spec), limit)
         law, edge = measured.result()
     facet = limit.facet_at(points)
-    if spec.hurst is not None:
-        law = replace(law, hurst=spec.hurst)
     ground = add_relief(
-        body, site, (points, normals, faces), facet, spec, roughness=law, longest_m=LONGEST_EDGES * edge
+        body,
+        site,
+        (points, normals, faces),
+        facet,
+        spec,
+        roughness=law.with_hurst(spec.hurst),
+        longest_m=LONGEST_EDGES * edge,
     )
     place_T_m = points + site.position_T_m
     points = points + ground.height_m[:, None] * normals

@@ -6,7 +6,7 @@ points a distance L apart, with heights measured against the local shape. On a s
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
@@ -40,6 +40,10 @@ class Roughness:
     deviation_m: float
     baseline_m: float
     hurst: float
+
+    def with_hurst(self, hurst: float | None) -> Roughness:
+        """Return the surface with another exponent and the same deviation at `baseline_m`; None keeps it."""
+        return self if hurst is None else replace(self, hurst=hurst)
 
     def deviation_at(self, baseline_m: NDArray | float) -> Float64:
         """Return the RMS deviation in metres at baselines in metres."""

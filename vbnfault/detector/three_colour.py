@@ -39,7 +39,7 @@ class Noise:
         return cls(shot=next(fields), read=next(fields))
 
     def of_pixels(self, pixels: NDArray[np.intp]) -> Noise:
-        """Return the variates of some pixels, given by their flat indices intp[row, n], in that arrangement."""
+        """Return the variates of the pixels with the flat indices intp[row, n], arranged like the indices."""
         shot, read = (np.take(field.reshape(-1, 3), pixels, axis=0) for field in (self.shot, self.read))
         return Noise(shot=shot, read=read)
 

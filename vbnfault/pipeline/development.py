@@ -196,7 +196,7 @@ class Development:
         return self._images[key]
 
     def _patched_clean(self, draws: Draws, signal: Electrons) -> RGBI | None:
-        """Return the noisy image of a signal from that without faults; None if too many pixels differ."""
+        """Return the noisy image of a signal, made from the clean image; None if too many of its pixels differ."""
         clean = self._images.get((*self._image_key({}, True), ()))
         if clean is None or not (self.exposure.camera.detector.local and self.leaves_camera(draws)):
             return None

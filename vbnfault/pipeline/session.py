@@ -309,9 +309,7 @@ class Session:
         from .. import render
 
         vehicle = None if self.vehicle is None else assemble.render_vehicle(self.scene, self.vehicle)
-        law = self.body.roughness
-        if self.scene.patch.hurst is not None:
-            law = replace(law, hurst=self.scene.patch.hurst)
+        law = self.body.roughness.with_hurst(self.scene.patch.hurst)
         fine = render.FineRelief(
             slope=0.0,
             facet_m=patch.facet_m,

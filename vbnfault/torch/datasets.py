@@ -179,7 +179,7 @@ class SampleDataset(Dataset[Batch]):
         self._reader = None
 
     def release(self) -> None:
-        """Drop what was read ahead of its use."""
+        """Drop what was read, so that a store that changes between epochs gives its new samples."""
         if self._reader is not None and self._reader[0][0] == os.getpid():
             self._reader[1].release()
 
