@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import builtins
+import contextlib
 import errno
 import gc
 import io
@@ -52,12 +53,39 @@ ALL_FAULTS = (
     "optics_degradation",
 )
 
+# Stores flush every file, and a disk is slow at that and at removing files. Temporary files are in memory instead,
+# where there is room: no test is of the disk itself; what is flushed, and in which order, is counted.
+_MEMORY, _ROOM = Path("/dev/shm"), 4 << 30
+if "TMPDIR" not in os.environ and os.access(_MEMORY, os.W_OK) and shutil.disk_usage(_MEMORY).free > _ROOM:
+    os.environ["TMPDIR"] = tempfile.tempdir = str(_MEMORY)
+
 # Patches are cached for this run alone: the tests neither read nor fill the cache of the user. The processes of
 # xdist, and those that tests start, share the folder of the first process.
 if "VBNFAULT_TESTS_CACHE" not in os.environ:
     _CACHE = tempfile.TemporaryDirectory(prefix="vbnfault-tests-")
     os.environ["VBNFAULT_TESTS_CACHE"] = _CACHE.name
 os.environ["VBNFAULT_CACHE_DIR"] = os.environ["VBNFAULT_TESTS_CACHE"]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_render_thread() -> None:
+    """The processes of xdist share the cores: each renders with one thread, where a test asks for no more."""
+    if "PYTEST_XDIST_WORKER" in os.environ and "drjit" in sys.modules:
+        sys.modules["drjit"].set_thread_count(1)
+
+
+@contextlib.contextmanager
+def render_threads(count: int) -> Iterator[None]:
+    """Render with as many threads in a `with` block."""
+    from vbnfault import render
+    from vbnfault.core.llvm import backend
+
+    before = backend().dr.thread_count()
+    render.set_threads(count)
+    try:
+        yield
+    finally:
+        render.set_threads(before)
 
 
 @pytest.fixture(scope="session")

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from conftest import render_threads
 from test_lens import BACK, GLASS, STOP
 
 from vbnfault.core import llvm
@@ -22,7 +23,6 @@ try:
 except VbnfaultError as error:
     pytest.skip(f"no usable LLVM: {error}", allow_module_level=True)
 
-from vbnfault.core.llvm import backend
 from vbnfault.lens.straylight import ghosts, irradiance
 from vbnfault.lens.straylight.bundles import Rays, Spots, Tracer, name_of, routes
 from vbnfault.lens.straylight.ghosts import boxes, lit_cells, traced_ghosts
@@ -344,15 +344,10 @@ def test_a_picture_turns_with_the_sun() -> None:
 
 def test_threads_do_not_change_a_bit() -> None:
     made = model(load_lens("tessar_50_f2p8"), wavelength_nm=np.linspace(400, 700, 3))
-    dr = backend().dr
-    threads = dr.thread_count()
     pictures = []
-    try:
-        for count in (1, 2, 2):
-            dr.set_thread_count(count)
+    for count in (1, 2, 2):
+        with render_threads(count):
             pictures.append(made.image(7.0, 20.0).tobytes())
-    finally:
-        dr.set_thread_count(threads)
     assert len(set(pictures)) == 1
 
 

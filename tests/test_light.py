@@ -9,6 +9,7 @@ import sys
 
 import numpy as np
 import pytest
+from conftest import render_threads
 from test_reflectance import SETS, by_angles, directions
 from test_render import NODES, UP, CountedScene, join, plane, sun, view
 
@@ -326,12 +327,11 @@ def test_bits_do_not_depend_on_threads() -> None:
     a_view, light = view(np.array([0, 0, -12.0]), -UP, width=64), limb(2.0)
     light = dataclasses.replace(light, direction_L=frames.direction_L(30, 20))
     a_scene = scene(a_view, light, hapke_at(NODES), bounces=1)
-    first = render.radiance(surface, a_scene).array
-    try:
-        render.set_threads(1)
-        np.testing.assert_array_equal(first, render.radiance(surface, a_scene).array)
-    finally:
-        render.set_threads(2)
+    found = []
+    for threads in (2, 1):
+        with render_threads(threads):
+            found.append(render.radiance(surface, a_scene).array)
+    np.testing.assert_array_equal(*found)
 
 
 def _stone(k: int) -> tuple[np.ndarray, np.ndarray]:

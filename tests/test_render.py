@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from conftest import render_threads
 
 from vbnfault import render
 from vbnfault.core import frames, spectra
@@ -309,14 +310,12 @@ def test_bits_do_not_depend_on_threads_or_history() -> None:
     surface = join(plane(), box(np.array([2.0, 1.0, -1.0]), 1.0))
     a = scene(view(10 * UP, -UP), sun(frames.direction_L(0, 30)))
     b = scene(view(6 * UP, np.array([0.3, 0.2, 1.0])), sun(frames.direction_L(90, 10)), key=6)
-    first = render.radiance(surface, a).array
-    render.radiance(surface, b)
-    render.set_threads(1)
-    try:
+    with render_threads(2):
+        first = render.radiance(surface, a).array
+        render.radiance(surface, b)
+    with render_threads(1):
         again = render.radiance(surface, a).array
         fresh = render.radiance(join(plane(), box(np.array([2.0, 1.0, -1.0]), 1.0)), a).array
-    finally:
-        render.set_threads(2)
     assert np.array_equal(first, again)
     assert np.array_equal(first, fresh)
     assert not np.array_equal(first, render.radiance(surface, b).array)
