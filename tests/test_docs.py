@@ -94,13 +94,15 @@ def small_study(*arguments: Any, **keywords: Any) -> Any:
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, ...], Path]:
-    """Return an empty memory of what commands have made: command without its path → store, folder or file."""
+def made() -> dict[tuple[str, ...], Path]:
+    """Return an empty memory of what commands have made: command without its path → copy of the store or file."""
     return {}
 
 
 @pytest.fixture
-def command(made: dict[tuple[str, ...], Path]) -> Callable[[list[str]], int]:
+def command(
+    made: dict[tuple[str, ...], Path], tmp_path_factory: pytest.TempPathFactory
+) -> Callable[[list[str]], int]:
     """Return what runs a command small; it copies what an earlier page made by the same command."""
 
     def run(words: list[str]) -> int:
@@ -111,11 +113,11 @@ def command(made: dict[tuple[str, ...], Path]) -> Callable[[list[str]], int]:
             return checked(arguments, given)
         key = tuple(word for word in arguments if word != str(out))
         if key in made:
-            (shutil.copytree if made[key].is_dir() else shutil.copy)(made[key], out)
+            copy(made[key], out)
             return 0
         code = checked(arguments, given)
         if not code and list(given) == ["--out"]:
-            made[key] = out.resolve()
+            made[key] = copy(out, tmp_path_factory.mktemp("made") / out.name)
         return code
 
     def checked(arguments: list[str], outputs: dict[str, Path]) -> int:
@@ -125,6 +127,11 @@ def command(made: dict[tuple[str, ...], Path]) -> Callable[[list[str]], int]:
         return code
 
     return run
+
+
+def copy(made: Path, to: Path) -> Path:
+    """Copy a store, folder or file."""
+    return Path((shutil.copytree if made.is_dir() else shutil.copy)(made, to))
 
 
 def depends_on_nothing(words: list[str]) -> bool:

@@ -71,18 +71,21 @@ def test_twins_leave_no_light_behind(session: Session) -> None:
 
 
 def test_samples_leave_nothing_behind(session: Session) -> None:
-    """Bytes that Python and numpy hold after a sample, from the second on: no more than a plane of the image."""
+    """Bytes that Python and numpy hold after three more samples: no more than a plane of the image.
+
+    What they cache fills up at first; what stays behind would do so in every round.
+    """
     held = []
     tracemalloc.start()
     try:
-        for _ in range(2):
+        for _ in range(3):
             for index in range(3):
                 to_sample(simulate_frame(session.spec(index)))
             gc.collect()
             held.append(tracemalloc.get_traced_memory()[0])
     finally:
         tracemalloc.stop()
-    assert held[1] - held[0] < 4 * SIZE**2
+    assert min(np.diff(held)) < 4 * SIZE**2
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads the resident memory from /proc")
