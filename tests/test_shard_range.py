@@ -8,6 +8,7 @@ import os
 import platform
 import re
 import shutil
+import signal
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,7 @@ from vbnfault.core.quantities import Sample
 from vbnfault.dataset import build as bd
 from vbnfault.dataset import lock
 from vbnfault.dataset.merge import MergeSummary, join_stores, merge_stores
+from vbnfault.dataset.progress import Progress
 from vbnfault.store import disk
 
 SHARDS = 5
@@ -186,8 +188,102 @@ def test_samples_of_one_shard_in_two_stores_are_joined(tmp_path: Path, parts: li
         with pytest.raises(bd.BuildFailed):
             run(part, Session(raises=frozenset(numbers)))
     summary = merge(parts, tmp_path / "m.zarr", move=True)
-    assert summary.digest == st.digest(whole)
+    assert summary.digest == st.digest(whole) == st.digest(tmp_path / "m.zarr")
     assert [*summary.taken.values()] == [16, 2]
+
+
+def lacking(path: Path, *numbers: int, shards: range = range(SHARDS)) -> Path:
+    """Make a store that lacks some samples."""
+    with pytest.raises(bd.BuildFailed):
+        run(path, Session(raises=frozenset(numbers)), shard_range=shards)
+    return path
+
+
+def test_a_sample_of_several_stores_is_taken_once(tmp_path: Path, whole: Path) -> None:
+    """Of a shard of which two stores hold some samples each, and one of them both."""
+    first, second = lacking(tmp_path / "a.zarr", 0), lacking(tmp_path / "b.zarr", 2)
+    summary = merge([first, second], tmp_path / "m.zarr")
+    assert [*summary.taken.values()] == [17, 1]
+    assert st.digest(tmp_path / "m.zarr") == st.digest(whole)
+
+
+def test_a_sample_that_nobody_has_built_is_missing_and_not_damaged(tmp_path: Path) -> None:
+    first, second = (lacking(tmp_path / name, 9, 10) for name in ("a.zarr", "b.zarr"))
+    assert merge([first, second], tmp_path / "m.zarr").missing == (9, 10)
+
+
+def test_a_store_that_holds_everything_is_examined_alone(
+    tmp_path: Path, parts: list[Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its progress says that nothing was made."""
+    examined, made = [], []
+    examine, advance = st.examine_shard, Progress.advance
+    monkeypatch.setattr(st, "examine_shard", lambda store, n: examined.append(store.path) or examine(store, n))
+    monkeypatch.setattr(Progress, "advance", lambda bar, built: made.append(built) or advance(bar, built))
+    merge(parts, tmp_path / "m.zarr")
+    assert made == SAMPLES * [True]
+    examined.clear()
+    made.clear()
+    merge(parts, tmp_path / "m.zarr")
+    assert examined == SHARDS * [tmp_path / "m.zarr"]
+    assert made == SAMPLES * [False]
+
+
+def test_a_store_that_gets_samples_is_compared_and_locked_like_the_others(
+    tmp_path: Path, parts: list[Path]
+) -> None:
+    out = tmp_path / "m.zarr"
+    st.create(out, make_spec(attributes={**st.open_store(parts[0]).attributes, "seed": 8}), SAMPLES)
+    with pytest.raises(InputError, match=r"a\.zarr: holds another dataset than .*m\.zarr: seed is 7 here and 8 th"):
+        merge(parts, out)
+    shutil.rmtree(out)
+    with lock.locked(out), pytest.raises(VbnfaultError, match=r"m\.zarr: another command is writing to it"):
+        merge(parts, out)
+    merge(parts, out)
+    remake(out, 5, tries=3)
+    with pytest.raises(InputError, match="sample 5 differs"):
+        merge(parts, out)
+
+
+def test_shards_that_move_are_not_copied(tmp_path: Path, parts: list[Path]) -> None:
+    files = [st.open_store(part).file("image", n) for part, n in zip(parts, (1, 4), strict=True)]
+    before = [file.stat().st_ino for file in files]
+    merge(parts, tmp_path / "m.zarr", move=True)
+    moved = st.open_store(tmp_path / "m.zarr")
+    assert [moved.file("image", n).stat().st_ino for n in (1, 4)] == before
+
+
+def test_what_a_killed_removal_left_is_removed_and_what_cannot_be_read_is_kept(
+    tmp_path: Path, parts: list[Path]
+) -> None:
+    out, sound = tmp_path / "m.zarr", Path(shutil.copytree(parts[0], tmp_path / "c.zarr"))
+    damaged = st.open_store(parts[0])
+    flip(damaged.file("done", 0), -3)
+    damaged.file("done", 1).unlink()  # the first file that goes
+    merge([*parts, sound], out, move=True)
+    assert st.verify(out) == []
+    assert damaged.file("image", 0).exists()
+    assert not damaged.file("image", 1).exists()
+
+
+def test_ctrl_c_ends_a_merge_after_the_shard_in_work(
+    tmp_path: Path, parts: list[Path], whole: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    copy = st.Store.copy_shard
+
+    def interrupted(store: st.Store, number: int, *rest: object, **more: object) -> None:
+        if number == 1:
+            signal.raise_signal(signal.SIGINT)
+        copy(store, number, *rest, **more)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(st.Store, "copy_shard", interrupted)
+    out = tmp_path / "m.zarr"
+    with pytest.raises(bd.Interrupted, match="merged samples stay, and the same command resumes") as stopped:
+        merge(parts, out)
+    assert stopped.value.exit_code == 130
+    assert st.open_store(out).finished() == 8
+    monkeypatch.undo()
+    assert merge(parts, out).digest == st.digest(whole)
 
 
 def test_samples_that_no_store_holds_are_named(tmp_path: Path, parts: list[Path]) -> None:
@@ -217,9 +313,10 @@ def test_stores_of_another_dataset_are_refused(
     assert not (tmp_path / "m.zarr").exists()
 
 
-def test_stores_of_other_codecs_are_refused(tmp_path: Path, parts: list[Path]) -> None:
+@pytest.mark.parametrize("changes", [{"format_version": 2}, {"codecs": {"image": "zstd 3"}}])
+def test_stores_of_other_codecs_are_refused(tmp_path: Path, parts: list[Path], changes: dict) -> None:
     spec = st.open_store(parts[0]).spec
-    st.create(tmp_path / "c.zarr", dataclasses.replace(spec, format_version=2), SAMPLES)
+    st.create(tmp_path / "c.zarr", dataclasses.replace(spec, **changes), SAMPLES)
     with pytest.raises(
         InputError, match=r"c\.zarr: has another format or other codecs than .*vbnfault migrate STORE"
     ):
@@ -295,6 +392,21 @@ def test_versions_of_samples_are_joined(tmp_path: Path, parts: list[Path]) -> No
     merge(parts, tmp_path / "m.zarr")
     made = st.open_store(tmp_path / "m.zarr").attributes["versions_of_samples"]
     assert made == [{"versions": {"v": "2"}, "samples": [[2, 7], [16, 17]]}]
+    merge(parts[:1], tmp_path / "n.zarr")
+    made = st.open_store(tmp_path / "n.zarr").attributes["versions_of_samples"]
+    assert made == [{"versions": {"v": "2"}, "samples": [[2, 7]]}]
+
+
+def test_versions_are_those_of_the_store_that_a_sample_is_taken_from(tmp_path: Path, parts: list[Path]) -> None:
+    """The first that holds it; what the store held before stays."""
+    again = Path(shutil.copytree(parts[0], tmp_path / "c.zarr"))
+    entries = [{"versions": {"v": "2"}, "samples": [[2, 7]]}]
+    st.open_store(again, "r+").update_attributes({"versions_of_samples": entries})
+    merge([parts[0], again], tmp_path / "m.zarr")
+    merge(parts[:1], tmp_path / "n.zarr")
+    merge([again], tmp_path / "n.zarr")
+    for name in ("m.zarr", "n.zarr"):
+        assert "versions_of_samples" not in st.open_store(tmp_path / name).attributes
 
 
 @pytest.mark.parametrize("move", [False, True])
