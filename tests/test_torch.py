@@ -93,6 +93,15 @@ def test_weights_balance_classes_and_pixels(finished_store: Path) -> None:
     assert np.allclose(dataset.pixel_weights().numpy(), (1 - inside) / inside)
     two = SampleDataset(finished_store, targets=["masks"], classes=["vignetting", "straylight"])
     assert np.allclose(two.pixel_weights().numpy(), ((1 - inside) / inside)[[3, 2]])
+    clear = ~injected[:, 0].astype(bool)
+    without = data(finished_store, where=lambda scalars: ~scalars["injected"][:, 0].astype(bool))
+    positive = injected[clear].sum(axis=0)
+    wanted = np.where(positive > 0, (clear.sum() - positive) / np.maximum(positive, 1), 1)
+    assert 0 < clear.sum() < len(injected)
+    assert np.allclose(without.class_weights().numpy(), wanted)
+    assert without.class_weights()[0] == without.pixel_weights()[0] == 1  # of a class that never occurs
+    with pytest.raises(InputError, match="most = 0: must be at least 1"):
+        dataset.pixel_weights(most=0)
     with pytest.raises(InputError, match="the dataset reads no masks; add masks to targets"):
         SampleDataset(finished_store).pixel_weights()
 
