@@ -18,6 +18,7 @@ from vbnfault.lens.coating import mean_reflectance
 from vbnfault.lens.rays import ghost
 from vbnfault.lens.straylight.irradiance import FlareModel
 from vbnfault.lens.straylight.paraxial import transmittance
+from vbnfault.lens.straylight.total import SunlightInLens
 
 try:
     llvm.find()
@@ -195,6 +196,25 @@ def test_worn_coatings_raise_ghosts(model: str) -> None:
     # of the Sun's light near the axis, told at normal incidence
     assert np.median(gains) == pytest.approx(1, abs=0.02)
     assert coated.sum() < half.sum()
+
+
+def test_samples_of_a_view_with_worn_coatings_share_the_starburst(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their ghosts differ, and each sample has the same bits as alone; another lens has its own starburst."""
+    made: list[tuple[Any, ...]] = []
+    starburst = SunlightInLens.starburst
+    monkeypatch.setattr(
+        SunlightInLens, "starburst", lambda inside: made.append(inside.burst_key) or starburst(inside)
+    )
+    losses, of_view = [0.4, 0.1, 0.0, 0.4], SharedResults(kept=True)
+    together = [light("paraxial", context(coating_loss=loss, of_view=of_view), coating="bbar") for loss in losses]
+    assert len(made) == 2  # of the worn coatings, and within the light of the whole ones
+    alone = [light("paraxial", context(coating_loss=loss), coating="bbar") for loss in losses]
+    assert len(made) == 2 + 4
+    for (added, params), (added_alone, params_alone) in zip(together, alone, strict=True):
+        np.testing.assert_array_equal(added, added_alone)
+        assert params == params_alone
+    light("paraxial", context(coating_loss=0.1, of_view=of_view), coating="mgf2")
+    assert len(made) == 6 + 1  # another lens
 
 
 def test_samples_of_a_view_share_the_ghosts_of_whole_coatings(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -386,10 +386,17 @@ def _shared_while_new(context: FaultContext) -> SharedResults:
 def _clear_light(light: SunlightInLens, context: FaultContext) -> ClearLight:
     """Return ghosts and starburst of the Sun, which the samples of a view share."""
     shared = _shared_while_new(context)
-    clear = shared.once("ghosts and starburst", light.clear_key, light.clear_light)
+    clear = shared.once("ghosts and starburst", light.clear_key, lambda: _new_clear_light(light, context))
     if shared.kept:
         clear.array.flags.writeable = False
     return clear
+
+
+def _new_clear_light(light: SunlightInLens, context: FaultContext) -> ClearLight:
+    """Return ghosts and starburst; the starburst does not depend on the coatings, whose wear differs by sample."""
+    if context.coating_loss and context.of_view.kept:
+        return light.clear_light(context.of_view.once("starburst", light.burst_key, light.starburst))
+    return light.clear_light()
 
 
 def _diffracts(params: Params, context: FaultContext) -> bool:

@@ -242,18 +242,20 @@ class SunlightInLens:
     @property
     def clear_key(self) -> tuple[Any, ...]:
         """Return all that `clear_light` depends on."""
-        passed = tuple(self.passed.tolist()), self.past_baffle, self.lit, self.beam_fraction, self.pupil_mm2
-        return *self.ghost_key, self._sun_xy_mm, *passed
+        return *self.ghost_key, self.past_baffle, *self.burst_key
 
-    def clear_light(self) -> ClearLight:
-        """Return ghosts and starburst, which roughness, dust and veil do not change."""
+    def clear_light(self, starburst: tuple[F32, F64] | None = None) -> ClearLight:
+        """Return ghosts and starburst, which roughness, dust and veil do not change.
+
+        `starburst` is the result of the method of that name, if it is known; it stays as it is.
+        """
         frame_bytes = 4 * len(self.nodes_nm) * self.sensor.shape[0] * self.sensor.shape[1]
         release_unused(9 * frame_bytes)  # the sums of all levels take 90 MB, the cells 200 MB
         array = self._ghosts()
         # what the drawing took, before the other parts and the signals of the sample's faults take as much
         release_unused(9 * frame_bytes)
         ghosts_mm2 = _flux_mm2(array, self.sensor.pitch_mm)
-        layer, beyond = self.starburst()
+        layer, beyond = self.starburst() if starburst is None else starburst
         starburst_mm2 = _flux_mm2(layer, self.sensor.pitch_mm)
         array += layer
         return ClearLight(array=array, ghosts_mm2=ghosts_mm2, starburst_mm2=starburst_mm2, beyond_mm2=beyond)
@@ -344,6 +346,12 @@ class SunlightInLens:
         """Return the factor on diffracted light whose flux on the whole plane is `flux_mm2`, float64[band]."""
         # diffraction scales with the light that passes the stop, and cannot exceed it
         return np.asarray(self.lit * self.passed * self.beam_fraction / np.maximum(flux_mm2 / self.pupil_mm2, 1))
+
+    @property
+    def burst_key(self) -> tuple[Any, ...]:
+        """Return all that `starburst` depends on."""
+        where = self.lens, self._nodes, self.sensor, self.sun.radius_rad, self._sun_xy_mm
+        return *where, tuple(self.passed.tolist()), self.lit, self.beam_fraction, self.pupil_mm2
 
     def starburst(self) -> tuple[F32, F64]:
         """Return what the stop diffracts."""
