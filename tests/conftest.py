@@ -57,7 +57,9 @@ ALL_FAULTS = (
 # where there is room: no test is of the disk itself; what is flushed, and in which order, is counted.
 _MEMORY, _ROOM = Path("/dev/shm"), 4 << 30
 if "TMPDIR" not in os.environ and os.access(_MEMORY, os.W_OK) and shutil.disk_usage(_MEMORY).free > _ROOM:
-    os.environ["TMPDIR"] = tempfile.tempdir = str(_MEMORY)
+    os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(_MEMORY))  # the folders of tests that fail stay there
+    _TEMPORARY = tempfile.TemporaryDirectory(prefix="vbnfault-tests-", dir=_MEMORY)  # what processes left goes
+    os.environ["TMPDIR"] = tempfile.tempdir = _TEMPORARY.name
 
 # Patches are cached for this run alone: the tests neither read nor fill the cache of the user. The processes of
 # xdist, and those that tests start, share the folder of the first process.
