@@ -76,6 +76,20 @@ def test_planes_are_linear_between_edges() -> None:
     assert spread.mean() == pytest.approx(0.5, abs=0.005)
 
 
+@pytest.mark.parametrize(("angularity", "straight"), [(0.0, False), (0.5, False), (1.0, True)])
+def test_angular_octaves_are_planes_as_high_as_the_waves(angularity: float, straight: bool) -> None:
+    line = np.array([910.0, 470.0, -330.0]) + np.linspace(0, 400, 40_001)[:, None] * np.array([0.6, 0.64, 0.48])
+    noise = octaves(line, 0.01)
+    height = noise.fractal(80.0, 60.0, 0, angularity).astype(np.float64)  # the octave of 80 m alone
+    # steps of 1 cm; between edges, float32 of some 30 m bends a plane by 1e-5 m; a wave bends by (2 pi / 80)^2 1e-4
+    # of its height, and the line crosses at most ten edges in each of its 5 cells
+    bent = np.abs(height[200::100] - 2 * height[100:-100:100] + height[:-200:100])
+    assert (np.mean(bent < 1e-4) > 0.8) == straight
+    scattered = np.random.default_rng(2).uniform(-9000, 9000, (100_000, 3))
+    spread = octaves(scattered, 1.0).fractal(80.0, 60.0, 0, angularity).std()
+    assert spread == pytest.approx(float(noise.amplitude(80.0)), rel=0.02)
+
+
 def test_layers_turn_an_incline_into_treads_and_scarps() -> None:
     # An incline of 25°, finely sampled. The layers gather its rise into scarps, and change no height by more than
     # two of the thickest layers.

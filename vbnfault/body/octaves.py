@@ -82,11 +82,19 @@ class Octaves:
         both = [(k, self.longest_m / 2**k) for k in range(last + 1)]
         return [(k, w) for k, w in both if shortest_m < w <= longest_m * 1.0001]
 
-    def fractal(self, longest_m: float, shortest_m: float, stream: int) -> Float32:
-        """Return the sum of plain octaves that follow the roughness law, metres."""
+    def fractal(self, longest_m: float, shortest_m: float, stream: int, angularity: float = 0.0) -> Float32:
+        """Return the sum of octaves that follow the roughness law, metres.
+
+        The part `angularity` of each consists of planes that meet in edges, the rest of rounded waves.
+        """
         total = np.zeros(len(self.facet_m), dtype=np.float32)
+        unit = np.hypot(angularity, 1 - angularity)  # planes and waves are independent
         for k, wavelength in self.wavelengths(longest_m, shortest_m):
-            total += self.amplitude(wavelength) * self.gradient(wavelength, stream + k)
+            size = self.amplitude(wavelength)
+            if angularity < 1:
+                total += size * np.float32((1 - angularity) / unit) * self.gradient(wavelength, stream + k)
+            if angularity > 0:
+                total += size * np.float32(angularity / unit) * self.planes(wavelength, stream + k)
         return total
 
     def blocks(self, width_m: float, height_m: float, stream: int) -> Float32:

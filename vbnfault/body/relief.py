@@ -40,8 +40,8 @@ _SHORTEST_FACETS = 1.8  # wavelength of the shortest octave, in the smallest fac
 # below which ground is level and above which it is bare; standard deviation of each factor of the cascade, their
 # number, and the longest in longest octaves
 _ROUGH_RANGE = (0.25, 2.5)
-_LEVEL, _LEVEL_DEG, _MEAN_COVERED = 0.5, (6.0, 36.0), 0.75
-_CASCADE, _CASCADE_STEPS, _CASCADE_LONGEST = 0.35, 3, 4.0
+_LEVEL, _LEVEL_DEG, _MEAN_COVERED = 0.2, (6.0, 36.0), 0.6
+_CASCADE, _CASCADE_STEPS, _CASCADE_LONGEST = 0.5, 3, 4.0
 
 _TERRACE_M = (5.5, 2.6)  # height of a step, and of the smaller steps between them
 # (cell width, height per unit of block noise) of the broken ground, in metres
@@ -131,7 +131,7 @@ def add_relief(
     # Roughness differs between regions. Far away, facets show few octaves, and evenly rough ground would look like
     # orange peel.
     region = 0.45 + 0.95 * smooth_step(-1.0, 1.2, noise.gradient(_REGION_EDGES * longest_m, 210))
-    swell = region * noise.fractal(longest_m, _SHARED_M, 0)
+    swell = region * noise.fractal(longest_m, _SHARED_M, 0, spec.angularity)
     shown = noise.shown(longest_m)
 
     def raised(height: Float32) -> Float64:

@@ -93,6 +93,13 @@ class PatchSpec:
         le=1,
         description="how much more relief lies on rough and steep ground than on smooth plains; 0: evenly",
     )
+    angularity: float = Field(
+        default=0.0,
+        ge=0,
+        le=1,
+        description="part of the relief longer than 20 m that consists of planes which meet in edges; the rest is "
+        "rounded",
+    )
     fractured: Fractured | None = Field(
         default=None, description="layered and jointed rock; default: rounded relief"
     )

@@ -346,6 +346,7 @@ class Session:
             hurst=table.hurst,
             scarps=table.scarps,
             intermittency=table.intermittency,
+            angularity=table.angularity,
             craters_per_km2=table.craters_per_km2,
             min_boulder_m=table.min_boulder_m if table.boulders else 1e6,
             boulder_index=table.boulder_index,

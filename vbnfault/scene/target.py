@@ -219,6 +219,12 @@ class PatchTable(Table):
         le=1,
         description="how much more relief lies on rough and steep ground than on smooth plains; 0: evenly",
     )
+    angularity: float = Field(
+        0.0,
+        ge=0,
+        le=1,
+        description="part of the relief longer than 20 m that consists of planes which meet in edges; 0: rounded",
+    )
     craters_per_km2: float = Field(60.0, ge=0, le=600, description="of 10 m or more")
     boulders: bool = Field(True, description="whether boulders lie on the ground")
     min_boulder_m: float = Field(0.25, ge=0.05, le=1000, description="diameter of the smallest near the site")
