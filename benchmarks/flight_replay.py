@@ -58,7 +58,7 @@ has a third of the real variance there; it is for figures that compare places. W
 `TEXTURE`, for figures that compare statistics, as those of `flight_classifier.py`: facets of half a native pixel,
 rougher at short wavelengths, with scarps, uneven, of planes that meet in edges, and with dust of another albedo.
 What matters most is the size of the facets: relief shorter than two of them is not shown, so facets of a native
-pixel blur what the camera resolves. Then follow the edges, which rounded waves lack. On the 33 frames:
+pixel blur what the camera resolves. Next come the edges, which rounded waves lack. On the 33 frames:
 
 | ground    | `rank` | variance at 2-4, 4-8, 8-16, 16-32, 32-64 px | body   | limb   | sky    |
 |-----------|--------|---------------------------------------------|--------|--------|--------|
@@ -66,9 +66,9 @@ pixel blur what the camera resolves. Then follow the edges, which rounded waves 
 | `TEXTURE` | 0.748  | 0.86, 0.86, 0.95, 1.09, 1.02 of the real    | 80.7 % | 78.4 % | 72.3 % |
 
 The last three columns are the patches that the classifier tells, with `--splits 4`; 50 % would be none. With
-rounded and less uneven relief and without dust, they were 86.6, 79.2 and 71.0 %. Smooth plains still give the
-images away: the real ones have more power at frequencies that are high in both axes, since points and edges in them
-are sharper, while most of their pixels differ less from their neighbours.
+rounded and less uneven relief, a third of the boulders and no dust, they were 86.6, 79.2 and 71.0 %. Smooth
+plains still give the images away: the real ones have more power at frequencies that are high in both axes, since
+points and edges in them are sharper, while most of their pixels differ less from their neighbours.
 
 The sky of 31 frames is the sum of six parts, fitted by least squares to means over 8 px: the halo of the limb;
 light scattered farther, 0.5 % of that of the body (0.4 to 0.8 % in four fifths of the frames; the wings of the
@@ -158,8 +158,8 @@ GROUND: dict[str, Any] = {
 # Of 67P: the frames ask for 0.5 % more length than that of 67p_18k.obj, 18.41 km³; published: 18.56 and 18.8
 _VOLUME_KM3, _SAME_BODY = 18.7, 0.05
 # In place of `GROUND`: relief with nearly the variance of the frames at 2 to 8 px. Shading alone makes features too
-# long across the Sun's direction, unlike albedo. Boulders, three times as many as were counted, stand for all that
-# is sharp and small.
+# long across the Sun's direction; the contrast of dust, chosen for the classifier, makes others that are not.
+# Boulders stand for all that is sharp and small: three times as many as Pajola et al. (2015) counted.
 TEXTURE: dict[str, Any] = {
     **GROUND,
     "body.photometry.dust_contrast": 0.2,

@@ -217,7 +217,9 @@ def run_tests(
     `limit_s`: duration after which the tests count as failed. `more`: further environment variables.
     """
     paths = os.pathsep.join((str(root), str(root / "tests")))
-    environment = {**os.environ, "PYTHONPATH": paths, "PYTHONDONTWRITEBYTECODE": "1", **(more or {})}
+    # tests that are killed leave their files: on the disk, not in memory
+    own = {"PYTHONPATH": paths, "PYTHONDONTWRITEBYTECODE": "1", "TMPDIR": tempfile.gettempdir()}
+    environment = {**os.environ, **own, **(more or {})}
     command = [python, "-m", "pytest", *_ALWAYS, "-x", *tests]
     try:
         done = subprocess.run(

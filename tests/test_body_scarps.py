@@ -5,10 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
+from conftest import small_scene
 
 from vbnfault.body import Body, PatchSpec, build_patch, site_at
-from vbnfault.body.roughness import mean_edge_m
+from vbnfault.body.octaves import Octaves
+from vbnfault.body.relief import _unevenness
+from vbnfault.body.roughness import Roughness, mean_edge_m
 from vbnfault.body.scarps import Form, form, gathered
+from vbnfault.pipeline import Session
+from vbnfault.pipeline import session as sessions
+from vbnfault.scene import config
 
 
 def sphere(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
@@ -87,6 +93,59 @@ def test_uneven_relief_lies_on_rough_ground(half_rough: Body) -> None:
     even, uneven = (heights(half_rough, relief=1.0, intermittency=how) for how in (0.0, 1.0))
     north, south = (sign * half_rough.vertices_m[:, 2] > 300 for sign in (1, -1))
     assert uneven[north].std() / uneven[south].std() > 3 * even[north].std() / even[south].std()
+
+
+@pytest.mark.parametrize("strength", [0.5, 1.0])
+def test_uneven_relief_is_a_fifth_on_level_ground(half_rough: Body, strength: float) -> None:
+    law = Roughness(deviation_m=12.0, baseline_m=75.0, hurst=1.0)
+    count = len(half_rough.vertices_m)
+    noise = Octaves(half_rough.vertices_m, np.full(count, 45.0), 3, law, 400.0)
+    # the other two causes are the same in all
+    level, also, bare, steep = (
+        _unevenness(half_rough, noise, np.full(count, slope, np.float32), strength) for slope in (0, 6, 36, 80)
+    )
+    np.testing.assert_allclose(level / steep, 0.2**strength, rtol=1e-6)  # float32 of the slope
+    np.testing.assert_array_equal(level, also)
+    np.testing.assert_allclose(bare, steep, rtol=1e-6)
+
+
+def test_angular_relief_differs_where_it_is_longer_than_20_m(half_rough: Body) -> None:
+    round_, angular = (heights(half_rough, relief=1.0, angularity=part) for part in (0.0, 1.0))
+    assert np.corrcoef(round_, angular)[0, 1] < 0.9
+    assert angular.std() == pytest.approx(round_.std(), rel=0.3)
+    # the longest octave is as long as the model's edges, 15 m here
+    small = Body(name="small", vertices_m=half_rough.vertices_m / 10, faces=half_rough.faces)
+    spec = {"facet_m": 4.5, "radius_m": 300.0, "min_boulder_m": 1e6, "craters_per_km2": 0.0}
+    np.testing.assert_array_equal(*(heights(small, relief=1.0, angularity=part, **spec) for part in (0.0, 1.0)))
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("relief", 0.3),
+        ("hurst", 0.4),
+        ("scarps", 0.2),
+        ("intermittency", 0.6),
+        ("angularity", 0.7),
+        ("craters_per_km2", 5.0),
+        ("boulder_index", 2.5),
+        ("boulders_per_km2", 30.0),
+        ("min_boulder_m", 3.0),
+        ("radius_m", 77.0),
+    ],
+)
+def test_keys_of_a_scene_reach_the_ground(monkeypatch: pytest.MonkeyPatch, key: str, value: float) -> None:
+    class BuiltError(Exception):
+        pass
+
+    def built(body: Body, site: object, spec: PatchSpec) -> None:
+        raise BuiltError(spec)
+
+    session = Session(config.parse_scene(small_scene(patch={key: value}), source="test"))
+    monkeypatch.setattr(sessions, "cached_patch", built)
+    with pytest.raises(BuiltError) as found:
+        session.patch(session.sites[0])
+    assert getattr(found.value.args[0], key) == value
 
 
 def test_scarps_move_the_ground_by_their_fraction(half_rough: Body) -> None:

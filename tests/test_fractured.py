@@ -81,8 +81,8 @@ def test_angular_octaves_are_planes_as_high_as_the_waves(angularity: float, stra
     line = np.array([910.0, 470.0, -330.0]) + np.linspace(0, 400, 40_001)[:, None] * np.array([0.6, 0.64, 0.48])
     noise = octaves(line, 0.01)
     height = noise.fractal(80.0, 60.0, 0, angularity).astype(np.float64)  # the octave of 80 m alone
-    # steps of 1 cm; between edges, float32 of some 30 m bends a plane by 1e-5 m; a wave bends by (2 pi / 80)^2 1e-4
-    # of its height, and the line crosses at most ten edges in each of its 5 cells
+    # Between points 1 m apart, a wave bends by (2 pi / 80)^2, 6e-3, of its height of metres. Float32 of 8 m bends a
+    # plane by 1e-6 m, except at the few edges of the 5 cells: found are 0.01 and 0.96 of all points.
     bent = np.abs(height[200::100] - 2 * height[100:-100:100] + height[:-200:100])
     assert (np.mean(bent < 1e-4) > 0.8) == straight
     scattered = np.random.default_rng(2).uniform(-9000, 9000, (100_000, 3))

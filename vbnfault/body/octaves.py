@@ -85,16 +85,16 @@ class Octaves:
     def fractal(self, longest_m: float, shortest_m: float, stream: int, angularity: float = 0.0) -> Float32:
         """Return the sum of octaves that follow the roughness law, metres.
 
-        The part `angularity` of each consists of planes that meet in edges, the rest of rounded waves.
+        Of the variance of each, the part `angularity` is that of planes which meet in edges, the rest that of
+        rounded waves. The two are independent.
         """
         total = np.zeros(len(self.facet_m), dtype=np.float32)
-        unit = np.hypot(angularity, 1 - angularity)  # planes and waves are independent
         for k, wavelength in self.wavelengths(longest_m, shortest_m):
             size = self.amplitude(wavelength)
             if angularity < 1:
-                total += size * np.float32((1 - angularity) / unit) * self.gradient(wavelength, stream + k)
+                total += size * np.float32((1 - angularity) ** 0.5) * self.gradient(wavelength, stream + k)
             if angularity > 0:
-                total += size * np.float32(angularity / unit) * self.planes(wavelength, stream + k)
+                total += size * np.float32(angularity**0.5) * self.planes(wavelength, stream + k)
         return total
 
     def blocks(self, width_m: float, height_m: float, stream: int) -> Float32:

@@ -97,8 +97,8 @@ class PatchSpec:
         default=0.0,
         ge=0,
         le=1,
-        description="part of the relief longer than 20 m that consists of planes which meet in edges; the rest is "
-        "rounded",
+        description="part of the variance of the relief longer than 20 m that is of planes which meet in edges; "
+        "the rest is of rounded waves",
     )
     fractured: Fractured | None = Field(
         default=None, description="layered and jointed rock; default: rounded relief"

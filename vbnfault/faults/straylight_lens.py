@@ -394,9 +394,11 @@ def _clear_light(light: SunlightInLens, context: FaultContext) -> ClearLight:
 
 def _new_clear_light(light: SunlightInLens, context: FaultContext) -> ClearLight:
     """Return ghosts and starburst; the starburst does not depend on the coatings, whose wear differs by sample."""
-    if context.coating_loss and context.of_view.kept:
-        return light.clear_light(context.of_view.once("starburst", light.burst_key, light.starburst))
-    return light.clear_light()
+    if not (context.coating_loss and context.of_view.kept):
+        return light.clear_light()  # whole coatings: the sum is shared
+    layer, beyond = context.of_view.once("starburst", light.burst_key, light.starburst)
+    layer.flags.writeable = False
+    return light.clear_light((layer, beyond))
 
 
 def _diffracts(params: Params, context: FaultContext) -> bool:

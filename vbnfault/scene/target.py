@@ -223,7 +223,7 @@ class PatchTable(Table):
         0.0,
         ge=0,
         le=1,
-        description="part of the relief longer than 20 m that consists of planes which meet in edges; 0: rounded",
+        description="part of the variance of relief over 20 m that is of planes which meet in edges; 0: none",
     )
     craters_per_km2: float = Field(60.0, ge=0, le=600, description="of 10 m or more")
     boulders: bool = Field(True, description="whether boulders lie on the ground")
