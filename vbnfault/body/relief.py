@@ -38,7 +38,8 @@ _SHORTEST_FACETS = 1.8  # wavelength of the shortest octave, in the smallest fac
 
 # Of the uneven relief: limits of the model's local roughness, over its mean; factor on level ground, and slopes
 # below which ground is level and above which it is bare; standard deviation of each factor of the cascade, their
-# number, and the longest in longest octaves. Chosen so that a classifier tells rendered from flight images least.
+# number, and the longest in longest octaves. Level ground and cascade were chosen together with the texture of the
+# flight replay (`benchmarks`), by a classifier of its patches.
 _ROUGH_RANGE = (0.25, 2.5)
 _LEVEL, _LEVEL_DEG, _MEAN_COVERED = 0.2, (6.0, 36.0), 0.6
 _CASCADE, _CASCADE_STEPS, _CASCADE_LONGEST = 0.5, 3, 4.0
