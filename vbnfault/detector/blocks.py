@@ -27,8 +27,11 @@ if hasattr(os, "register_at_fork"):  # threads do not survive in a forked proces
     os.register_at_fork(after_in_child=pool.cache_clear)
 
 
-def blockwise(step: Callable[..., NDArray[Any]], array: NDArray[Any], *more: NDArray[Any] | None) -> NDArray[Any]:
-    """Return `step(block, *blocks of more)` of all blocks of rows, joined; None in `more` stays None."""
+def blockwise(step: Callable[..., NDArray[Any]], array: NDArray[Any], *more: Any) -> NDArray[Any]:
+    """Return `step(block, *blocks of more)` of all blocks of rows, joined.
+
+    `more` are arrays, or whatever yields a block for a slice of rows; None stays None.
+    """
 
     def of_block(start: int) -> NDArray[Any]:
         rows = slice(start, start + ROWS_PER_BLOCK)

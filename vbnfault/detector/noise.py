@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import sys
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -37,22 +38,94 @@ _CODES_AT_ONCE = 1 << 17
 _SUMMED_AT_ONCE = 1 << 15
 
 
-def normal_field(shape: tuple[int, ...], rng: np.random.Generator) -> F32:
-    """Draw standard normal variates by the inverse distribution function of 16 bit uniform numbers.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class NormalField:
+    """Hold standard normal variates as 16 bit uniform numbers, from which `values` looks them up.
 
     Each number stands for the median of its bin. The two outermost bins, 4.2 standard deviations from the mean, are
-    drawn again within the bin, so the tails are complete.
+    drawn again within the bin, so the tails are complete. A variate is a monotonic function of its number.
+
+    Attributes
+    ----------
+    codes
+        The uniform numbers, uint16[y, x, ...].
+    tail
+        Flat indices of the two outermost numbers, intp[n], ascending.
+    tail_values
+        Their variates, float32[n].
     """
-    size = math.prod(shape)
-    code, table = _codes(size, rng), _normal_table()
-    out = buffers.empty((size,))
-    for start in range(0, size, _CODES_AT_ONCE):
-        part = slice(start, start + _CODES_AT_ONCE)
-        np.take(table, code[part], mode="clip", out=out[part])
-    tail = np.flatnonzero(code + np.uint16(1) <= 1)  # the first and the last code
-    sign = np.where(code[tail] == 0, 1.0, -1.0)
-    out[tail] = sign * ndtri((1.0 - rng.random(len(tail))) / 65536)
-    return out.reshape(shape)
+
+    codes: NDArray[np.uint16]
+    tail: NDArray[np.intp]
+    tail_values: F32
+
+    @property
+    def _row_size(self) -> int:
+        return math.prod(self.codes.shape[1:])
+
+    def __getitem__(self, rows: slice) -> NormalField:
+        """Return the variates of some rows."""
+        start, stop, _ = rows.indices(len(self.codes))
+        first, last = np.searchsorted(self.tail, (start * self._row_size, stop * self._row_size))
+        tail = self.tail[first:last] - start * self._row_size
+        return NormalField(codes=self.codes[start:stop], tail=tail, tail_values=self.tail_values[first:last])
+
+    def of_pixels(self, pixels: NDArray[np.intp]) -> NormalField:
+        """Return the variates of the pixels with the flat indices intp[row, n], arranged like the indices."""
+        channels = self.codes.shape[2]
+        codes = np.take(self.codes.reshape(-1, channels), pixels, axis=0)
+        tail = _outermost(codes)
+        place, channel = np.divmod(tail, channels)
+        known = np.searchsorted(self.tail, pixels.reshape(-1)[place] * channels + channel)
+        return NormalField(codes=codes, tail=tail, tail_values=self.tail_values[known])
+
+    def at(self, places: NDArray[np.intp]) -> F32:
+        """Return the variates at ascending flat indices, float32[n]."""
+        codes = np.take(self.codes.reshape(-1), places, mode="clip")  # a third of the time of indexing
+        out = np.take(_normal_table(), codes, mode="clip")
+        # places and tail ascend, so those of the tail that are among the places lie where they would be inserted
+        place = np.searchsorted(places, self.tail)
+        inside = place < len(places)
+        known = np.flatnonzero(inside)[places[place[inside]] == self.tail[inside]]
+        out[place[known]] = self.tail_values[known]
+        return out
+
+    def values(self) -> F32:
+        """Return the variates, float32[y, x, ...]."""
+        codes, table = self.codes.reshape(-1), _normal_table()
+        out = buffers.empty(codes.shape)
+        for start in range(0, codes.size, _CODES_AT_ONCE):
+            part = slice(start, start + _CODES_AT_ONCE)
+            np.take(table, codes[part], mode="clip", out=out[part])
+        out[self.tail] = self.tail_values
+        return out.reshape(self.codes.shape)
+
+
+def draw_normals(shape: tuple[int, ...], rng: np.random.Generator) -> NormalField:
+    """Draw standard normal variates by the inverse distribution function of 16 bit uniform numbers."""
+    codes = _codes(math.prod(shape), rng)
+    tail = _outermost(codes)
+    sign = np.where(codes[tail] == 0, 1.0, -1.0)
+    values = sign * ndtri((1.0 - rng.random(len(tail))) / 65536)
+    return NormalField(codes=codes.reshape(shape), tail=tail, tail_values=values.astype(np.float32))
+
+
+def normal_field(shape: tuple[int, ...], rng: np.random.Generator) -> F32:
+    """Return the values of `draw_normals`, float32 of a shape."""
+    return draw_normals(shape, rng).values()
+
+
+def variates_of(codes: NDArray[np.uint16]) -> F32:
+    """Return the variates of 16 bit uniform numbers that are not the outermost ones, float32 of their shape."""
+    return _normal_table()[codes]
+
+
+def _outermost(codes: NDArray[np.uint16]) -> NDArray[np.intp]:
+    """Return the flat indices of the first and of the last uniform number, intp[n], ascending."""
+    flat = codes.reshape(-1)
+    parts = range(0, flat.size, _CODES_AT_ONCE)
+    found = [np.flatnonzero(flat[i : i + _CODES_AT_ONCE] + np.uint16(1) <= 1) + i for i in parts]
+    return np.concatenate(found) if found else np.zeros(0, dtype=np.intp)
 
 
 def _codes(size: int, rng: np.random.Generator) -> NDArray[np.uint16]:

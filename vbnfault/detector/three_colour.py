@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, ClassVar
 
 import cv2
@@ -20,28 +21,28 @@ from numpy.typing import NDArray
 from ..core.quantities import LUMINANCE, RGBI, Electrons, Irradiance, RawDN
 from .blocks import blockwise, pool
 from .efficiency import QuantumEfficiency, white_balance
-from .noise import normal_field, poisson_on_dark
+from .noise import NormalField, draw_normals, poisson_on_dark
+from .unlit import Limits, noise_limits, values_to_develop
 
 F32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Noise:
-    """Hold the variates of one exposure for shot and read noise, float32[y, x, 3] each, standard normal."""
+    """Hold the variates of one exposure for shot and read noise, [y, x, 3] each, standard normal."""
 
-    shot: F32
-    read: F32
+    shot: NormalField
+    read: NormalField
 
     @classmethod
     def draw(cls, shape: tuple[int, int], shot: np.random.Generator, read: np.random.Generator) -> Noise:
         """Draw two fields of normal variates for a (height, width) sensor, in two threads."""
-        fields = pool().map(lambda rng: normal_field((*shape, 3), rng), (shot, read))
+        fields = pool().map(lambda rng: draw_normals((*shape, 3), rng), (shot, read))
         return cls(shot=next(fields), read=next(fields))
 
     def of_pixels(self, pixels: NDArray[np.intp]) -> Noise:
         """Return the variates of the pixels with the flat indices intp[row, n], arranged like the indices."""
-        shot, read = (np.take(field.reshape(-1, 3), pixels, axis=0) for field in (self.shot, self.read))
-        return Noise(shot=shot, read=read)
+        return Noise(shot=self.shot.of_pixels(pixels), read=self.read.of_pixels(pixels))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,12 +109,12 @@ class ThreeColourDetector:
 
     def electrons(self, expected: Electrons, exposure_s: float, noise: Noise | None) -> Electrons:
         """Return the collected electrons: add dark current, draw shot noise, clip at the full well."""
-        shot = None if noise is None else noise.shot
+        shot = None if noise is None else noise.shot.values()
         return expected.with_array(blockwise(self._collector(exposure_s), expected.array, shot))
 
     def raw_dn(self, electrons: Electrons, noise: Noise | None) -> RawDN:
         """Return digital numbers: apply the gain, add read noise and bias, round, clip to the converter's range."""
-        read = None if noise is None else noise.read
+        read = None if noise is None else noise.read.values()
         return RawDN(array=blockwise(self._convert, electrons.array, read).astype(np.uint16))
 
     def rgbi(self, raw: RawDN, exposure_s: float) -> RGBI:
@@ -146,16 +147,39 @@ class ThreeColourDetector:
     def develop(self, expected: Electrons, exposure_s: float, noise: Any, acts: Any = None) -> RGBI:
         """Return the 8 bit image of the expected photo-electrons.
 
-        All later steps run block by block, so that intermediate results stay in the cache. `noise` comes from
-        `draw_noise`; None gives a noise-free image.
+        All steps run block by block, so that intermediate results stay in the cache. Where a block is mostly sky,
+        only the values that show anything but the mean dark signal are developed. `noise` comes from `draw_noise`;
+        None gives a noise-free image.
         """
         collect, show = self._collector(exposure_s), self._shower(exposure_s)
+        limits = None if noise is None else self._noise_limits(exposure_s)
+        unlit_dn = np.float32(0)  # with noise, what is not developed is black
+        if noise is None:
+            unlit_dn = self._convert(collect(np.zeros(1, dtype=np.float32), None), None)[0]
 
-        def step(signal: F32, shot: F32 | None, read: F32 | None) -> NDArray[np.uint8]:
-            return show(self._convert(collect(signal, shot), read))
+        def step(signal: F32, shot: NormalField | None, read: NormalField | None) -> NDArray[np.uint8]:
+            some = values_to_develop(signal, shot, read, limits)
+            if some is None:
+                variates = [None if field is None else field.values() for field in (shot, read)]
+                return show(self._convert(collect(signal, variates[0]), variates[1]))
+            if not len(some):
+                word = show(np.full((1, 1, 3), unlit_dn)).view(np.uint32).item()  # four channels of 8 bits
+                return np.full((*signal.shape[:2], 1), word, dtype=np.uint32).view(np.uint8)
+            variates = [None if field is None else field.at(some) for field in (shot, read)]
+            electrons = collect(np.take(signal.reshape(-1), some), variates[0])
+            dn = np.full(signal.shape, unlit_dn)
+            dn.reshape(-1)[some] = self._convert(electrons, variates[1])
+            return show(dn)
 
         shot, read = (None, None) if noise is None else (noise.shot, noise.read)
         return RGBI(array=blockwise(step, expected.array, shot, read))
+
+    def _noise_limits(self, exposure_s: float) -> Limits | None:
+        """Return the codes of the variates with which unlit values are 0; None if they are few."""
+        show = self._shower(exposure_s)
+        return noise_limits(
+            self._collector(exposure_s), lambda counts, read: show(self._convert(counts, read))[..., :3], 3
+        )
 
     def _collector(self, exposure_s: float) -> Callable[[F32, F32 | None], F32]:
         """Return the function that computes the collected electrons of a block."""
@@ -188,13 +212,27 @@ class ThreeColourDetector:
         luminance = LUMINANCE.reshape(1, 3).astype(np.float64)
 
         def show(dn: F32) -> NDArray[np.uint8]:
-            # OpenCV rounds to even and saturates at 0 and 255 as it converts
-            rgb = cv2.multiply(dn - black, (*scale.tolist(), 0.0), dtype=cv2.CV_8U)
+            # OpenCV rounds to even and saturates at 0 and 255 as it converts; planes take half the time of a scalar
+            light, factors = dn - black, _in_each_pixel(tuple(scale.tolist()), dn.shape)
+            rgb = cv2.multiply(light, factors, dtype=cv2.CV_8U)
             intensity = cv2.transform(rgb, luminance).reshape(rgb.shape[:2])
             out = cv2.cvtColor(rgb, cv2.COLOR_RGB2RGBA)
             return np.asarray(cv2.insertChannel(intensity, out, 3))
 
         return show
+
+
+def _in_each_pixel(values: tuple[float, ...], shape: tuple[int, ...]) -> F32:
+    """Return the same values, one for each channel, in each pixel of a shape, float32[y, x, channel], read-only."""
+    pixels = shape[0] * shape[1]
+    return _repeated(values, 1 << (pixels - 1).bit_length())[: pixels * len(values)].reshape(shape)
+
+
+@lru_cache(maxsize=32)
+def _repeated(values: tuple[float, ...], times: int) -> F32:
+    out = np.tile(np.asarray(values, dtype=np.float32), times)
+    out.flags.writeable = False
+    return out
 
 
 def electron_rate_weights(
