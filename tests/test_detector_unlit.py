@@ -10,6 +10,7 @@ import pytest
 from vbnfault.core.quantities import Electrons
 from vbnfault.detector import Noise, ThreeColourDetector
 from vbnfault.detector.noise import NormalField, draw_normals
+from vbnfault.detector.three_colour import noise_limits_of
 
 EXPOSURE_S = 0.02
 
@@ -82,8 +83,7 @@ def test_most_of_the_sky_is_not_developed(noisy: bool, monkeypatch: pytest.Monke
     detector, shape = ThreeColourDetector(), (256, 256)
     noise = draw(3, shape) if noisy else None
     expected = Electrons(array=np.zeros((*shape, 3), np.float32), white_e=detector.white_e)
-    limits = detector._noise_limits(EXPOSURE_S)
-    monkeypatch.setattr(ThreeColourDetector, "_noise_limits", lambda *_: limits)
+    noise_limits_of(detector, EXPOSURE_S)  # kept for all images of an exposure
     monkeypatch.setattr(ThreeColourDetector, "_convert", counted)
     image = detector.develop(expected, EXPOSURE_S, noise).array
     # red, with the greatest white balance, is not black beyond 1.4 σ of the read noise, which is 8 % of the values
@@ -94,5 +94,5 @@ def test_most_of_the_sky_is_not_developed(noisy: bool, monkeypatch: pytest.Monke
 def test_a_long_exposure_develops_all_of_the_sky() -> None:
     # the mean of the dark current is subtracted, so its noise is seen in half of the values
     detector = ThreeColourDetector(dark_current_e_s=1e6)
-    assert detector._noise_limits(EXPOSURE_S) is None
-    assert ThreeColourDetector()._noise_limits(EXPOSURE_S) is not None
+    assert noise_limits_of(detector, EXPOSURE_S) is None
+    assert noise_limits_of(ThreeColourDetector(), EXPOSURE_S) is not None

@@ -33,8 +33,9 @@ def release_unused(coming_bytes: int = 0, *, always: bool = False) -> None:
         Release it also if the process holds little.
     """
     for release in (_trim, _forget, _flush):  # what drjit keeps serves the next wavefront, so it is released last
-        if always or _resident_bytes() + coming_bytes >= _MOST:
-            release()
+        if not always and _resident_bytes() + coming_bytes < _MOST:
+            return
+        release()
 
 
 def _forget() -> None:

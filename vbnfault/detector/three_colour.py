@@ -152,7 +152,7 @@ class ThreeColourDetector:
         None gives a noise-free image.
         """
         collect, show = self._collector(exposure_s), self._shower(exposure_s)
-        limits = None if noise is None else self._noise_limits(exposure_s)
+        limits = None if noise is None else noise_limits_of(self, exposure_s)
         unlit_dn = np.float32(0)  # with noise, what is not developed is black
         if noise is None:
             unlit_dn = self._convert(collect(np.zeros(1, dtype=np.float32), None), None)[0]
@@ -173,13 +173,6 @@ class ThreeColourDetector:
 
         shot, read = (None, None) if noise is None else (noise.shot, noise.read)
         return RGBI(array=blockwise(step, expected.array, shot, read))
-
-    def _noise_limits(self, exposure_s: float) -> Limits | None:
-        """Return the codes of the variates with which unlit values are 0; None if they are few."""
-        show = self._shower(exposure_s)
-        return noise_limits(
-            self._collector(exposure_s), lambda counts, read: show(self._convert(counts, read))[..., :3], 3
-        )
 
     def _collector(self, exposure_s: float) -> Callable[[F32, F32 | None], F32]:
         """Return the function that computes the collected electrons of a block."""
@@ -220,6 +213,15 @@ class ThreeColourDetector:
             return np.asarray(cv2.insertChannel(intensity, out, 3))
 
         return show
+
+
+@lru_cache(maxsize=64)
+def noise_limits_of(detector: ThreeColourDetector, exposure_s: float) -> Limits | None:
+    """Return the codes of the variates with which unlit values of an exposure are 0; None if they are few."""
+    show = detector._shower(exposure_s)
+    return noise_limits(
+        detector._collector(exposure_s), lambda counts, read: show(detector._convert(counts, read))[..., :3], 3
+    )
 
 
 def _in_each_pixel(values: tuple[float, ...], shape: tuple[int, ...]) -> F32:
