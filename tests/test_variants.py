@@ -281,6 +281,13 @@ def test_a_dataset_of_variants_through_the_store_and_back(tmp_path: Path) -> Non
             assert np.array_equal(
                 view[members], np.broadcast_to(view[members][0], view[members].shape), equal_nan=True
             )
+    # the file of a shard, here of one view, holds once what its samples share
+    opened = store.open_store(path)
+    for name in ("depth_m", "radiance", "image"):
+        chunks = list(opened.chunk(name, 0).values())
+        assert name == "image" or len({*chunks}) <= 4 - first[0].sum() + 1
+        size = (path / opened.file_name(name, 0)).stat().st_size
+        assert size == sum(map(len, {*chunks})) + codec.index_size(4)
     images = of_views(data["image"].values, 4)
     for view in images:
         assert len({image.tobytes() for image in view}) == 4
