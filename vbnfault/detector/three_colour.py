@@ -205,9 +205,8 @@ class ThreeColourDetector:
         luminance = LUMINANCE.reshape(1, 3).astype(np.float64)
 
         def show(dn: F32) -> NDArray[np.uint8]:
-            # OpenCV rounds to even and saturates at 0 and 255 as it converts; planes take half the time of a scalar
-            light, factors = dn - black, _in_each_pixel(tuple(scale.tolist()), dn.shape)
-            rgb = cv2.multiply(light, factors, dtype=cv2.CV_8U)
+            # OpenCV multiplies with 64 bits, rounds to even and saturates at 0 and 255 as it converts
+            rgb = cv2.multiply(dn - black, (*scale.tolist(), 0.0), dtype=cv2.CV_8U)
             intensity = cv2.transform(rgb, luminance).reshape(rgb.shape[:2])
             out = cv2.cvtColor(rgb, cv2.COLOR_RGB2RGBA)
             return np.asarray(cv2.insertChannel(intensity, out, 3))
@@ -222,19 +221,6 @@ def noise_limits_of(detector: ThreeColourDetector, exposure_s: float) -> Limits 
     return noise_limits(
         detector._collector(exposure_s), lambda counts, read: show(detector._convert(counts, read))[..., :3], 3
     )
-
-
-def _in_each_pixel(values: tuple[float, ...], shape: tuple[int, ...]) -> F32:
-    """Return the same values, one for each channel, in each pixel of a shape, float32[y, x, channel], read-only."""
-    pixels = shape[0] * shape[1]
-    return _repeated(values, 1 << (pixels - 1).bit_length())[: pixels * len(values)].reshape(shape)
-
-
-@lru_cache(maxsize=32)
-def _repeated(values: tuple[float, ...], times: int) -> F32:
-    out = np.tile(np.asarray(values, dtype=np.float32), times)
-    out.flags.writeable = False
-    return out
 
 
 def electron_rate_weights(
