@@ -73,10 +73,13 @@ def values_to_develop(
     """
     height, width, _ = signal.shape
     chosen = signal.reshape(height, -1) != 0
+    if np.count_nonzero(chosen) > _MOST_CHOSEN * chosen.size:
+        return None
     if shot is not None and read is not None:
         if limits is None:
             return None
         chosen |= shot.codes.reshape(height, -1) > limits.shot
         chosen |= read.codes.reshape(height, -1) > np.tile(limits.read, width)  # flat rows need no broadcasting
-    many = np.count_nonzero(chosen) > _MOST_CHOSEN * chosen.size
-    return None if many else np.flatnonzero(chosen)
+        if np.count_nonzero(chosen) > _MOST_CHOSEN * chosen.size:
+            return None
+    return np.flatnonzero(chosen)
