@@ -447,3 +447,22 @@ def test_the_brightest_ghosts_are_listed_without_the_work_for_the_others(
         assert few[:6] == every[:6]
         assert bundles == [6 + irradiance._SPARE] * 3
         assert lens.ghosts(11.0, 20.0, most=1000) == lens.ghosts(11.0, 20.0)
+
+
+def test_the_peak_of_a_ghost_does_not_depend_on_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Bundles are evaluated some at a time, which must show neither in their order nor in the last of them."""
+    made = model(load_lens("nikkor_28_f2p8"), wavelength_nm=np.array([550.0]))
+    tracer, rays, _ = made._boxes(11.0, 0.0)
+    sizes: list[int] = []
+    highest = ghosts._highest
+
+    def counted(x: np.ndarray, *more: Any) -> Any:
+        sizes.append(len(x))
+        return highest(x, *more)
+
+    monkeypatch.setattr(ghosts, "_highest", counted)
+    found = ghosts.peaks(tracer, rays, 11.0)
+    assert sum(sizes) == len(rays) > max(sizes) == ghosts._IN_CACHE > sizes[-1] > 0
+    monkeypatch.setattr(ghosts, "_IN_CACHE", len(rays))
+    np.testing.assert_array_equal(found, ghosts.peaks(tracer, rays, 11.0))
+    assert len(np.unique(found)) > 30

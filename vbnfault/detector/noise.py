@@ -134,7 +134,12 @@ def _codes(size: int, rng: np.random.Generator) -> NDArray[np.uint16]:
     whole = size % 4 == 0 and rng.bit_generator.state.get("has_uint32") == 0 and sys.byteorder == "little"
     if not whole:
         return np.frombuffer(rng.bytes(2 * size), dtype=np.uint16)
-    return rng.integers(0, 2**64 - 1, size // 4, dtype=np.uint64, endpoint=True).view(np.uint16)
+    out = buffers.empty((size,), np.uint16)
+    for start in range(0, size, _CODES_AT_ONCE):  # their memory is in the cache, and that of `out` is kept
+        part = out[start : start + _CODES_AT_ONCE]
+        words = rng.integers(0, 2**64 - 1, part.size // 4, dtype=np.uint64, endpoint=True)
+        part[:] = words.view(np.uint16)
+    return out
 
 
 @lru_cache(maxsize=1)

@@ -30,6 +30,7 @@ FINE = 768  # rays across a box, to compute flux and position
 FINE_OF_FOUR = 192
 _STEEP = 0.3  # rise of the relative radius over a cell, above which neighbouring rays ended at different rims
 _PEAK = 64  # rays across a box, to locate the peak
+_IN_CACHE = 8  # bundles of which the peaks are located at a time: a third of the time of all at once
 _TOGETHER = 1 << 22  # rays traced at a time, to limit memory
 _SHARP = 1e-3  # default width of soft edges while boxes are located
 _LEAST_SPREAD = 0.25  # fraction of a ghost's image that is magnified less than `Arrivals.magnification`
@@ -434,16 +435,24 @@ def peaks(made: Tracer, rays: Rays, sun_deg: float) -> F64:
     x, y, fraction, radius = (
         v.numpy().reshape(len(rays), _PEAK, _PEAK) for v in (spots.x_mm, spots.y_mm, spots.fraction, spots.radius)
     )
+    cell = 4 * rays.box_mm[:, 2] * rays.box_mm[:, 3] / _PEAK**2
+    most = np.zeros(len(rays))
+    for first in range(0, len(rays), _IN_CACHE):
+        part = slice(first, first + _IN_CACHE)
+        most[part] = _highest(x[part], y[part], fraction[part], radius[part], cell[part])
+    return most * float(np.cos(np.radians(sun_deg)))
+
+
+def _highest(x: F64, y: F64, fraction: F64, radius: F64, cell: F64) -> F64:
+    """Return the greatest light per area of each lattice of rays, [bundle]; `cell` is the area at the entrance."""
     ux, uy = (np.diff(v, axis=2)[:, 1:] for v in (x, y))
     vx, vy = (np.diff(v, axis=1)[:, :, 1:] for v in (x, y))
     passes = radius <= 1
     whole = passes[:, 1:, 1:] & passes[:, 1:, :-1] & passes[:, :-1, 1:]
-    cell = 4 * rays.box_mm[:, 2] * rays.box_mm[:, 3] / _PEAK**2
     with np.errstate(divide="ignore", invalid="ignore"):
         density = np.where(whole, fraction[:, 1:, 1:] * cell[:, None, None] / np.abs(ux * vy - uy * vx), 0)
     # a ghost of only a few rays has no whole cell, and its peak is 0
-    most = np.asarray(np.nan_to_num(density, posinf=0.0).max(axis=(1, 2)), dtype=np.float64)
-    return most * float(np.cos(np.radians(sun_deg)))
+    return np.asarray(np.nan_to_num(density, posinf=0.0).max(axis=(1, 2)))
 
 
 def surface_interactions_per_second(
