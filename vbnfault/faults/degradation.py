@@ -30,6 +30,7 @@ from .contract import Fault
 from .fields import Interval, Severity, bounds, flag
 
 _LEAST_SIGMA_PX = 0.4
+_ROWS_AT_ONCE = 128  # the fastest for kernels of 11 pixels: two thirds of the time of half a frame at once
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,23 +102,23 @@ def _odd_bounds(interval: Interval) -> tuple[int, int]:
 def _blur(
     array: NDArray[np.float32], white_e: NDArray[np.float32], kernel: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """Return the image clipped to white and filtered by the separable kernel, in two threads."""
+    """Return the image clipped to white and filtered by the separable kernel, strip by strip in two threads."""
     height, width = array.shape[:2]
     white_row = np.tile(white_e, width)  # flat rows of width · channels values: far faster than broadcasting
     reach = len(kernel) // 2
     out = buffers.empty(array.shape)
 
-    def filter_rows(start: int, stop: int) -> None:
-        if start == stop:
-            return
+    def filter_rows(start: int) -> None:
+        stop = min(height, start + step)
         # `reach` extra rows on either side make the result equal to that of the whole image
         lo, hi = max(0, start - reach), min(height, stop + reach)
         clipped = np.minimum(array[lo:hi].reshape(hi - lo, -1), white_row).reshape(hi - lo, width, -1)
         blurred = cv2.sepFilter2D(clipped, -1, kernel, kernel, borderType=cv2.BORDER_REFLECT_101)
         out[start:stop] = blurred[start - lo : stop - lo].reshape(stop - start, width, -1)
 
-    # OpenCV filters in one thread. Each half needs more rows than `reach`, or it cannot be mirrored at the edge.
-    middle = height // 2 if height // 2 > reach else 0
+    # OpenCV filters in one thread. A strip and its extra rows stay in the cache, and are more rows than `reach`, or
+    # they could not be mirrored at the edge.
+    step = max(_ROWS_AT_ONCE, 4 * reach)
     with ThreadPoolExecutor(2) as pool:
-        list(pool.map(filter_rows, (0, middle), (middle, height)))
+        list(pool.map(filter_rows, range(0, height, step)))
     return out
