@@ -332,7 +332,7 @@ def _differing_pixels(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray
     """Return the flat indices of the pixels in which any channel differs, intp[n]."""
     height, width = a.shape[:2]
     step, parts = 64, []
-    for start in range(0, height, step):  # blocks of rows stay in the cache
+    for start in range(0, max(1, height), step):  # blocks of rows stay in the cache
         differ = _differ(a[start : start + step], b[start : start + step])
         parts.append(np.flatnonzero(differ))
         parts[-1] += start * width
