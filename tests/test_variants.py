@@ -310,6 +310,26 @@ def test_a_dataset_of_variants_through_the_store_and_back(tmp_path: Path) -> Non
         vbnfault.build(scene, path, progress=False, append=3)
 
 
+def test_damage_to_a_shared_chunk_concerns_all_that_share_it(tmp_path: Path) -> None:
+    scene = scene_with(4, 8, dataset={"shard_samples": 8, "layers": ["depth_m"]}, plan={"faulty_fraction": 1.0})
+    path = tmp_path / "one.zarr"
+    before = vbnfault.build(scene, path, progress=False).digest
+    opened = store.open_store(path)
+    chunks = opened.chunk("depth_m", 0)
+    assert opened.chunk("depth_m", 0, [1, 3]) == {k: chunks[k] for k in (1, 3)}
+    file = path / opened.file_name("depth_m", 0)
+    ranges = codec.chunk_ranges(file.read_bytes()[-codec.index_size(8) :], 8)
+    sharing = [k for k, (start, _) in ranges.items() if start == ranges[0][0]]
+    assert 1 < len(sharing) < 8
+    assert sharing == [k for k, chunk in chunks.items() if chunk == chunks[0]]
+    flip(file, ranges[0][0] + 40)
+    assert store.problem_samples(path) == sharing
+    again = vbnfault.build(scene, path, progress=False)
+    assert (again.built, again.digest) == (len(sharing), before)
+    assert store.verify(path) == []
+    assert opened.chunk("depth_m", 0) == chunks
+
+
 def test_rows_of_a_table_of_poses_are_seen_several_times() -> None:
     scene = config.load_scene("navcam67p", {"dataset.variants_per_view": 2, "dataset.shard_samples": 8})
     row = {

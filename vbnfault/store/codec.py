@@ -22,7 +22,6 @@ from .compressors import compressor
 from .schema import StoreSpec
 
 _ABSENT = 2**64 - 1  # marks a missing chunk in a shard's index (Zarr v3 specification)
-_LEAST_HELD_ONCE = 1024  # bytes of a chunk
 
 _Packed = tuple[bytes, int, bytes]  # chunk, CRC-32C and sha256 of an array
 
@@ -47,25 +46,20 @@ def join_shard(chunks: Mapping[int, bytes], count: int) -> bytes:
     """Return a shard file of `count` chunks; its index marks those missing from `chunks` as absent.
 
     Equal chunks, such as the depth in the samples of one view, are held once, and the index points to them several
-    times. Small ones, such as empty masks, are not compared.
+    times.
     """
     index = np.full((count, 2), _ABSENT, dtype="<u8")
-    parts: list[bytes] = []
-    held: dict[tuple[int, int], list[tuple[bytes, int]]] = {}  # chunks and their positions by length and CRC-32C
+    held: dict[bytes, int] = {}  # chunks in their order, each with its position
     position = 0
     for i in sorted(chunks):
         chunk = chunks[i]
-        key = len(chunk), google_crc32c.value(chunk) if len(chunk) >= _LEAST_HELD_ONCE else -1 - i
-        alike = held.setdefault(key, [])
-        start = next((start for known, start in alike if known == chunk), None)
+        start = held.get(chunk)
         if start is None:
-            start = position
-            alike.append((chunk, start))
-            parts.append(chunk)
+            start = held[chunk] = position
             position += len(chunk)
         index[i] = start, len(chunk)
     table = index.tobytes()
-    return b"".join([*parts, table, struct.pack("<I", google_crc32c.value(table))])
+    return b"".join([*held, table, struct.pack("<I", google_crc32c.value(table))])
 
 
 def index_size(count: int) -> int:
