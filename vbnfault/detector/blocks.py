@@ -30,7 +30,7 @@ if hasattr(os, "register_at_fork"):  # threads do not survive in a forked proces
 def blockwise(step: Callable[..., NDArray[Any]], array: NDArray[Any], *more: Any) -> NDArray[Any]:
     """Return `step(block, *blocks of more)` of all blocks of rows, joined.
 
-    `more` are arrays, or whatever yields a block for a slice of rows; None stays None.
+    `more` are arrays, or each a `NormalField`, which yields a block for a slice of rows, too; None stays None.
     """
 
     def of_block(start: int) -> NDArray[Any]:

@@ -40,7 +40,7 @@ _SUMMED_AT_ONCE = 1 << 15
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class NormalField:
-    """Hold standard normal variates as 16 bit uniform numbers, from which `values` looks them up.
+    """Hold standard normal variates as 16 bit uniform numbers, from which `values` and `at` look them up.
 
     Each number stands for the median of its bin. The two outermost bins, 4.2 standard deviations from the mean, are
     drawn again within the bin, so the tails are complete. A variate is a monotonic function of its number.
@@ -64,7 +64,9 @@ class NormalField:
         return math.prod(self.codes.shape[1:])
 
     def __getitem__(self, rows: slice) -> NormalField:
-        """Return the variates of some rows."""
+        """Return the variates of contiguous rows. Raises ValueError if the slice has a step other than 1."""
+        if rows.step not in (None, 1):
+            raise ValueError(f"step = {rows.step}: must be 1, rows of variates are contiguous")
         start, stop, _ = rows.indices(len(self.codes))
         first, last = np.searchsorted(self.tail, (start * self._row_size, stop * self._row_size))
         tail = self.tail[first:last] - start * self._row_size

@@ -148,8 +148,8 @@ class ThreeColourDetector:
         """Return the 8 bit image of the expected photo-electrons.
 
         All steps run block by block, so that intermediate results stay in the cache. Where a block is mostly sky,
-        only the values that show anything but the mean dark signal are developed. `noise` comes from `draw_noise`;
-        None gives a noise-free image.
+        only the values that may show anything but the mean dark signal are developed. `noise` comes from
+        `draw_noise`; None gives a noise-free image.
         """
         collect, show = self._collector(exposure_s), self._shower(exposure_s)
         limits = None if noise is None else noise_limits_of(self, exposure_s)

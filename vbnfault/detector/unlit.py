@@ -23,9 +23,6 @@ _MOST_CHOSEN = 0.4
 _CODES = np.arange(63, 65472, 64, dtype=np.uint16)  # tried as limits
 _MOST_COUNTS = 8  # of dark electrons, tried as limits
 
-# Above this count, rounding may give a lower variate a count that is greater by one.
-_COUNTED_EXACTLY = 30
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Limits:
@@ -54,10 +51,11 @@ def noise_limits(
     read = np.repeat(variates[None, :, None], channels, axis=2)
     best, fewest = None, _MOST_CHOSEN
     for count in np.unique(counts)[:_MOST_COUNTS]:
-        most = count + np.float32(count > _COUNTED_EXACTLY)
+        # No variate up to the limit gives a greater count. Below the full well, these few counts hold enough values
+        # only where the mean is a few electrons; `poisson_on_dark` then counts steps, so no count decreases.
         shot = np.count_nonzero(counts <= count)
         # 0 up to its limit, since no value decreases with its variate
-        zeros = np.count_nonzero(rgb(np.full_like(read, most), read)[0] == 0, axis=0)
+        zeros = np.count_nonzero(rgb(np.full_like(read, count), read)[0] == 0, axis=0)
         chosen = 1 - zeros.mean() / len(_CODES) * shot / len(_CODES)
         if zeros.min() > 0 and chosen < fewest:
             best, fewest = Limits(shot=_CODES[shot - 1], read=_CODES[zeros - 1]), chosen
@@ -67,9 +65,10 @@ def noise_limits(
 def values_to_develop(
     signal: F32, shot: NormalField | None, read: NormalField | None, limits: Limits | None
 ) -> NDArray[np.intp] | None:
-    """Return the flat indices of the values that may be lit or differ from 0, intp[n]; None if they are too many.
+    """Return the flat indices of the values that may be lit or differ from 0, intp[n]; None to develop all values.
 
-    Without variates these are the lit values.
+    Without variates these are the lit values. All are developed if those chosen are too many, or if there are
+    variates but no limits for them.
     """
     height, width, _ = signal.shape
     chosen = signal.reshape(height, -1) != 0
