@@ -116,8 +116,8 @@ def _blur(
         blurred = cv2.sepFilter2D(clipped, -1, kernel, kernel, borderType=cv2.BORDER_REFLECT_101)
         out[start:stop] = blurred[start - lo : stop - lo].reshape(stop - start, width, -1)
 
-    # OpenCV filters in one thread. A strip and its extra rows stay in the cache, and are more rows than `reach`, or
-    # they could not be mirrored at the edge.
+    # OpenCV filters in one thread. A strip and its extra rows stay in the cache, and the extra rows are at most
+    # half as many as the rows.
     step = max(_ROWS_AT_ONCE, 4 * reach)
     with ThreadPoolExecutor(2) as pool:
         list(pool.map(filter_rows, range(0, height, step)))
