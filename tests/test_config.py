@@ -16,6 +16,7 @@ from scipy import stats
 from vbnfault import faults
 from vbnfault.core import resources, tables
 from vbnfault.core.errors import InputError
+from vbnfault.detector import ThreeColourDetector
 from vbnfault.scene import config, keyed_random
 from vbnfault.scene.config import Scene, load_scene, parse_scene
 from vbnfault.scene.hashing import content_hash
@@ -95,6 +96,9 @@ TITLE = 'title = "t"\n'
         (TITLE + '[camera]\narchitectures = ["cmoss"]', ["camera.architectures", "'cmoss'", "'cmos'"]),
         (TITLE + '[body]\nreflectance = "foo"', ["reflectance = 'foo':", "67p"]),
         (TITLE + '[dataset]\nlayers = ["foo"]', ["dataset.layers", "'foo'", "depth_m", "without_"]),
+        # a converter without a code above that of no light
+        (TITLE + "[camera]\nadc_bits = 8\nbias_dn = 300", ["bias_dn = 300:", "from 0 to 254", "adc_bits = 8"]),
+        (TITLE + "[camera]\nadc_bits = 9\nbias_dn = 511", ["bias_dn = 511:", "from 0 to 510", "adc_bits = 9"]),
         # reversed bounds
         (TITLE + "[geometry]\nx_m = [3, 1]", ["geometry.x_m = [3, 1]:", "reversed"]),
         (
@@ -202,6 +206,12 @@ def test_every_number_is_accepted_at_its_bounds() -> None:
                 extra |= {"detector": "x"} if key in ("individuals", "detector_temperature_K") else {}
                 scene = parse_scene({"title": "t", table: {key: value, **extra}}, source="here")
                 assert getattr(getattr(scene, table), key) == value
+
+
+@pytest.mark.parametrize(("bits", "bias"), [(8, 254), (10, 1000)])
+def test_a_bias_below_the_largest_number_leaves_a_gain(bits: int, bias: int) -> None:
+    camera = parse_scene({"title": "t", "camera": {"adc_bits": bits, "bias_dn": bias}}, source="here").camera
+    assert ThreeColourDetector(adc_bits=camera.adc_bits, bias_dn=camera.bias_dn).gain_dn_per_e > 0
 
 
 @settings(max_examples=60)  # the first example loads what the faults need

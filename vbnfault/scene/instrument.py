@@ -189,6 +189,9 @@ class CameraTable(Table):
             if getattr(self, key) != CameraTable.model_fields[key].default:
                 why = "the detector has its own; leave one out" if self.detector else "needs detector"
                 raise ValueError(f"{key} = {getattr(self, key)!r}: {why}")
+        if self.bias_dn >= 2**self.adc_bits - 1:
+            most = 2**self.adc_bits - 2
+            raise ValueError(f"bias_dn = {self.bias_dn}: must be from 0 to {most} with adc_bits = {self.adc_bits}")
         if self.exposure_min_s > self.exposure_max_s:
             raise ValueError(
                 f"exposure_min_s = {self.exposure_min_s:g}, "
