@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from pathlib import Path
 
@@ -97,3 +98,20 @@ def test_the_command_writes_figures_and_names_a_folder_without_pairs(tmp_path: P
         "classifier.json",
         *(f"confident_{place}.png" for place in flight_classifier.PLACES),
     }
+
+
+def test_draws_are_those_of_the_seeds_that_follow(tmp_path: Path) -> None:
+    for name, real, rendered in pairs(blur_px=0.6):
+        for which, image in (("real", real), ("rendered", rendered)):
+            cv2.imwrite(str(tmp_path / f"{name}_{which}.png"), image)
+
+    def figures(*more: str) -> dict[str, list[float]]:
+        few = ["--size", "16", "--patches", "3", "--splits", "2", *more]
+        flight_classifier.main(["--pairs", str(tmp_path), "--out", str(tmp_path / "out"), *few])
+        return dict(json.loads((tmp_path / "out/classifier.json").read_text())["body"])
+
+    both, first, second = figures("--draws", "2", "--seed", "5"), figures("--seed", "5"), figures("--seed", "6")
+    drawn = [one["all features"][0] for one in (first, second)]
+    assert both["all features, mean of draws"] == pytest.approx([np.mean(drawn), min(drawn), max(drawn)])
+    assert drawn[0] != drawn[1]
+    assert "all features, mean of draws" not in first

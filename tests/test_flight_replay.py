@@ -103,8 +103,8 @@ def test_an_image_moves_by_whole_pixels_and_continues_as_its_mirror_image() -> N
 def test_raw_images_are_stretched_by_a_root_and_halved() -> None:
     raw = np.full((12, 12), 4200, dtype=np.uint16)  # above the top code over black
     raw[6:] = 104
-    # over the bias: 255 and 3.985 √4 = 7.97, not yet in whole numbers; next to the edge a neighbour weighs 0.035
-    column = [255, 255, round(0.965 * 255 + 0.035 * 7.97), round(0.965 * 7.97 + 0.035 * 255), 8, 8]
+    # over the bias: 255 and 3.985 √4 = 7.97, not yet in whole numbers; next to the edge a neighbour weighs 0.0325
+    column = [255, 255, round(0.9675 * 255 + 0.0325 * 7.97), round(0.9675 * 7.97 + 0.0325 * 255), 8, 8]
     assert flight_replay.developed(raw, 100.0).tolist() == [[value] * 6 for value in column]
     assert flight_replay.developed(raw.T, 100.0).T.tolist() == [[value] * 6 for value in column]
     # 3.985 √2 = 5.64 and 3.985 √3 = 6.90 have the mean 6.27; rounded first, 6 and 7 would give 7

@@ -41,8 +41,8 @@ _SHORTEST_FACETS = 1.8  # wavelength of the shortest octave, in the smallest fac
 # number, and the longest in longest octaves. Level ground and cascade were chosen together with the texture of the
 # flight replay (`benchmarks`), by a classifier of its patches.
 _ROUGH_RANGE = (0.25, 2.5)
-_LEVEL, _LEVEL_DEG, _MEAN_COVERED = 0.2, (6.0, 36.0), 0.6
-_CASCADE, _CASCADE_STEPS, _CASCADE_LONGEST = 0.5, 3, 4.0
+_LEVEL, _LEVEL_DEG, _MEAN_COVERED = 0.03, (10.0, 38.0), 0.6
+_CASCADE, _CASCADE_STEPS, _CASCADE_LONGEST = 0.65, 3, 4.0
 
 _TERRACE_M = (5.5, 2.6)  # height of a step, and of the smaller steps between them
 # (cell width, height per unit of block noise) of the broken ground, in metres
