@@ -65,11 +65,12 @@ pixel blur what the camera resolves. Next come the edges, which rounded waves la
 | `GROUND`  | 0.807  | 0.35, 0.51, 0.73, 0.92, 0.84 of the real    | 99.4 % | 94.9 % | 73.8 % |
 | `TEXTURE` | 0.736  | 0.93, 0.90, 0.99, 1.12, 1.03 of the real    | 74.8 % | 74.3 % | 72.5 % |
 
-The last three columns are the patches that the classifier tells, with `--splits 4` and for `TEXTURE` `--draws 4`; 50 %
-would be none. The settings were chosen by it on the same frames, so others may be told somewhat more often.
-What had given the images away most were mottled plains and a core of the point spread that was too wide: the real
-ground is either smooth or rough, and boulders and shadows on it are sharp. Obliquely lit ground is still too rough in
-its smoothest tenth, and real scarps throw thin dark lines where ours throw spots.
+The last three columns are the patches that the classifier tells, with `--splits 4` and for `TEXTURE` `--draws 4`;
+50 % would be none. Single draws of `TEXTURE` are 73 to 76 % for body and limb. The settings were chosen by it on
+the same frames, so others may be told more often. What had given the images away most were mottled plains and
+a core of the point spread that was too wide: real ground is either smooth or rough, and boulders and shadows on it
+are sharp. Obliquely lit ground is still too rough in its smoothest tenth, and real scarps throw thin dark lines
+where ours throw spots.
 
 The sky of 31 frames is the sum of six parts, fitted by least squares to means over 8 px: the halo of the limb;
 light scattered farther, 0.5 % of that of the body (0.4 to 0.8 % in four fifths of the frames; the wings of the
