@@ -22,6 +22,7 @@ from .compressors import compressor
 from .schema import StoreSpec
 
 _ABSENT = 2**64 - 1  # marks a missing chunk in a shard's index (Zarr v3 specification)
+_LEAST_HELD_ONCE = 1024  # bytes of a chunk
 
 _Packed = tuple[bytes, int, bytes]  # chunk, CRC-32C and sha256 of an array
 
@@ -46,20 +47,25 @@ def join_shard(chunks: Mapping[int, bytes], count: int) -> bytes:
     """Return a shard file of `count` chunks; its index marks those missing from `chunks` as absent.
 
     Equal chunks, such as the depth in the samples of one view, are held once, and the index points to them several
-    times.
+    times. Smaller ones than 1 KiB, such as empty masks, are not compared.
     """
     index = np.full((count, 2), _ABSENT, dtype="<u8")
-    held: dict[bytes, int] = {}  # chunks in their order, each with its position
+    parts: list[bytes] = []
+    held: dict[bytes, int] = {}  # large chunks, each with its position
     position = 0
     for i in sorted(chunks):
         chunk = chunks[i]
-        start = held.get(chunk)
+        large = len(chunk) >= _LEAST_HELD_ONCE
+        start = held.get(chunk) if large else None
         if start is None:
-            start = held[chunk] = position
+            start = position
+            if large:
+                held[chunk] = start
+            parts.append(chunk)
             position += len(chunk)
         index[i] = start, len(chunk)
     table = index.tobytes()
-    return b"".join([*held, table, struct.pack("<I", google_crc32c.value(table))])
+    return b"".join([*parts, table, struct.pack("<I", google_crc32c.value(table))])
 
 
 def index_size(count: int) -> int:
