@@ -73,7 +73,7 @@ class NormalField:
         return NormalField(codes=self.codes[start:stop], tail=tail, tail_values=self.tail_values[first:last])
 
     def of_pixels(self, pixels: NDArray[np.intp]) -> NormalField:
-        """Return the variates of the pixels with the flat indices intp[row, n], arranged like the indices."""
+        """Return the variates of some pixels, given by their flat indices intp[row, n] and arranged like them."""
         channels = self.codes.shape[2]
         codes = np.take(self.codes.reshape(-1, channels), pixels, axis=0)
         tail = _outermost(codes)
@@ -113,17 +113,17 @@ def draw_normals(shape: tuple[int, ...], rng: np.random.Generator) -> NormalFiel
 
 
 def normal_field(shape: tuple[int, ...], rng: np.random.Generator) -> F32:
-    """Return the values of `draw_normals`, float32 of a shape."""
+    """Draw standard normal variates as `draw_normals` does and return their values, float32 of the given shape."""
     return draw_normals(shape, rng).values()
 
 
 def variates_of(codes: NDArray[np.uint16]) -> F32:
-    """Return the variates of 16 bit uniform numbers that are not the outermost ones, float32 of their shape."""
+    """Return the standard normal variates of 16 bit uniform numbers, none outermost, float32 of their shape."""
     return _normal_table()[codes]
 
 
 def _outermost(codes: NDArray[np.uint16]) -> NDArray[np.intp]:
-    """Return the flat indices of the first and of the last uniform number, intp[n], ascending."""
+    """Return the flat indices at which a code is the smallest or the largest possible, intp[n], ascending."""
     flat = codes.reshape(-1)
     parts = range(0, flat.size, _CODES_AT_ONCE)
     found = [np.flatnonzero(flat[i : i + _CODES_AT_ONCE] + np.uint16(1) <= 1) + i for i in parts]

@@ -51,8 +51,9 @@ def noise_limits(
     read = np.repeat(variates[None, :, None], channels, axis=2)
     best, fewest = None, _MOST_CHOSEN
     for count in np.unique(counts)[:_MOST_COUNTS]:
-        # No variate up to the limit gives a greater count. Below the full well, these few counts hold enough values
-        # only where the mean is a few electrons; `poisson_on_dark` then counts steps, so no count decreases.
+        # No variate up to the limit gives a greater count, if counts never decrease with the variate. That is sure
+        # where `poisson_on_dark` counts steps, at means of a few electrons. At greater means, so few variates give
+        # the eight lowest counts that there are no limits, except where the full well bounds the counts.
         shot = np.count_nonzero(counts <= count)
         # 0 up to its limit, since no value decreases with its variate
         zeros = np.count_nonzero(rgb(np.full_like(read, count), read)[0] == 0, axis=0)
