@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 import zarr
 from damage import SAMPLES, mend, sample, spec
+from zarr.storage import LocalStore
 
 from vbnfault import store as st
 from vbnfault.core.errors import InputError, VbnfaultError
@@ -313,6 +314,35 @@ def test_readers_beside_a_writer_never_see_a_wrong_sample_that_is_done(store: Pa
         for thread in readers:
             thread.join()
     assert wrong == []
+
+
+@pytest.mark.parametrize("times", [1, 2, 3])
+def test_a_file_replaced_between_its_index_and_a_chunk_is_read_again(
+    store: Path, monkeypatch: pytest.MonkeyPatch, times: int
+) -> None:
+    """zarr opens a file once for the index and once for the chunk, and between the two the chunks change places; a
+    sample that cannot be decoded three times in a row counts as damaged."""
+    wanted = {name: layer.tobytes() for name, layer in sample(3).layers.items()}
+    opened, get, reads = st.open_store(store), LocalStore.get, []
+    file = opened.file("depth_m", 1)
+    whole = file.read_bytes()
+
+    async def get_and_replace(self: LocalStore, key: str, *args: Any, **kwargs: Any) -> Any:
+        part = await get(self, key, *args, **kwargs)
+        if key.startswith("depth_m/c/"):
+            reads.append(key)
+            between = len(reads) % 2 and len(reads) < 2 * times
+            file.write_bytes(bytes(whole[::-1]) if between else whole)
+        return part
+
+    monkeypatch.setattr(LocalStore, "get", get_and_replace)
+    if times == 3:
+        with pytest.raises(VbnfaultError, match="depth_m of samples 3-3 cannot be read"):
+            opened.read_sample(3)
+    else:
+        got = opened.read_sample(3).layers
+        assert {name: got[name].tobytes() for name in wanted} == wanted
+    assert len(reads) == 2 * min(3, times + 1)
 
 
 def test_a_reader_in_the_middle_of_a_change_of_the_attributes_sees_no_damage(

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 # errors that mean a damaged or missing file; any other OSError may be temporary
 _DAMAGE = (ValueError, FileNotFoundError, NotADirectoryError, disk.Misplaced)
-# a sample counts as damaged after so many reads that do not match the checksums although nothing was rewritten
+# a sample counts as damaged after so many reads that fail or do not match, although nothing was rewritten
 _READS = 3
 
 
@@ -162,20 +162,26 @@ class Store:
         chosen = [name for name in self.spec.pixel_layers if layers is None or name in layers]
         compared = [k for k, name in enumerate(self.spec.checked) if name in chosen or name not in self.spec.arrays]
         file = self.file_name("done", index // self.spec.shard_samples)
+        problem: VbnfaultError | None = None
         mismatches = 0
         while mismatches < _READS:
             stamp = self.files.stamp(file)
             if not self.read("done", index, index + 1)[0]:
                 raise InputError(f"{self.path}: sample {index} is not finished yet; the build command resumes")
-            crcs = self.read("crc32c", index, index + 1)[0].tolist()
-            arrays = {name: self.read(name, index, index + 1)[0] for name in chosen}
-            scalars = self._scalars(index)
-            crcs_of_layers = [crc32c(layer) if layer.size else 0 for layer in arrays.values()]
-            if [*crcs_of_layers, crc_of_scalars(scalars)] == [crcs[k] for k in compared]:
-                return Sample(index=index, layers=arrays, scalars=scalars)
+            problem = None
+            try:
+                crcs = self.read("crc32c", index, index + 1)[0].tolist()
+                arrays = {name: self.read(name, index, index + 1)[0] for name in chosen}
+                scalars = self._scalars(index)
+            except VbnfaultError as error:  # as if damaged, where a file was replaced between two reads of it
+                problem = error
+            else:
+                crcs_of_layers = [crc32c(layer) if layer.size else 0 for layer in arrays.values()]
+                if [*crcs_of_layers, crc_of_scalars(scalars)] == [crcs[k] for k in compared]:
+                    return Sample(index=index, layers=arrays, scalars=scalars)
             # a process that rewrites the sample replaces the file of `done` first
             mismatches += self.files.stamp(file) == stamp
-        raise VbnfaultError(
+        raise problem or VbnfaultError(
             f"{self.path}: sample {index} does not match its stored crc32c; the build command repairs it"
         )
 
