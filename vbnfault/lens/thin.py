@@ -23,6 +23,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..core import buffers
 from ..core.quantities import Irradiance, Radiance
 from ..core.sundisc import Pinhole
 from .halo import Halo
@@ -105,7 +106,9 @@ class ThinLens:
 
     def on_axis(self, radiance: Radiance) -> Irradiance:
         """Return the irradiance of radiance of any shape, which does not depend on the position in the image."""
-        return Irradiance(array=radiance.array * self._solid_angle, wavelength_nm=radiance.wavelength_nm)
+        array = buffers.empty(radiance.array.shape, np.result_type(radiance.array, np.float32))
+        np.multiply(radiance.array, self._solid_angle, out=array)
+        return Irradiance(array=array, wavelength_nm=radiance.wavelength_nm)
 
     def on_frame(self, radiance: Radiance) -> Radiance:
         """Return the radiance itself: the image has the grid of the render."""
