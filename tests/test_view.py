@@ -359,6 +359,28 @@ def test_the_grid_shows_filters_and_goes(page: Page, served: Served) -> None:
 
 
 @needs_browser
+@pytest.mark.parametrize("width_px", [1440, 1024, 700])
+def test_the_key_g_reaches_the_field_of_the_number_in_windows_of_any_width(
+    page: Page, served: Served, width_px: int
+) -> None:
+    try:
+        page.look(width_px, 768)
+        ready(page, served)
+        page.press("g")
+        assert page.evaluate("document.activeElement.id") == "number"
+        page.type("5")
+        page.press("Enter")
+        assert page.evaluate("document.activeElement.dataset.index") == "5"
+        field, key = (
+            page.evaluate(f"document.querySelector('{element}').getBoundingClientRect().top")
+            for element in ("#number", "#go kbd")
+        )
+        assert abs(field - key) < 20  # px: both are in one line
+    finally:
+        page.look(1366, 768)
+
+
+@needs_browser
 def test_one_sample_by_mouse_and_by_keys(page: Page, served: Served) -> None:
     ready(page, served)
     data = served.store
