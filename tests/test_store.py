@@ -258,6 +258,13 @@ def test_digest_ignores_time_and_layout_and_nothing_else(finished_store: Path, t
     assert st.digest(other) != want
 
 
+def test_no_store_is_created_within_another(finished_store: Path) -> None:
+    for name in ("inner.zarr", "image/c/x.zarr"):
+        with pytest.raises(InputError, match=r"x?\.zarr: lies in the store .*, and would be lost with it; choose"):
+            st.create(finished_store / name, make_spec(), 4)
+        assert not (finished_store / name).exists()
+
+
 def test_create_leaves_foreign_folders_alone(whole: st.Store, tmp_path: Path) -> None:
     foreign = tmp_path / "photos"
     foreign.mkdir()

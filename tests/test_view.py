@@ -82,11 +82,15 @@ def test_files_of_the_store_are_served_by_byte_ranges(served: Served) -> None:
         ("7-", 7, size),
         ("-16", size - 16, size),
         (f"0-{10 * size}", 0, size),
+        (f"0-{2**40}", 0, size),
+        (f"3-{10**30}", 3, size),
+        (f"-{10**30}", 0, size),
     ):
         status, body, headers = served.ask(f"/store/{name}", Range=f"bytes={asked}")
         assert (status, body) == (206, content[start:stop])
         assert headers["Content-Range"] == f"bytes {start}-{stop - 1}/{size}"
-    for asked in ("bytes=9-5", f"bytes={size}-", "bytes=-", "lines=1-2", "bytes=1-2,4-5"):
+    beyond = (f"bytes={10**30}-", f"bytes={10**30}-{10**31}", f"bytes={size}-{2 * size}")
+    for asked in ("bytes=9-5", *beyond, f"bytes={size}-", "bytes=-0", "bytes=-", "lines=1-2", "bytes=1-2,4-5"):
         assert served.ask(f"/store/{name}", Range=asked)[0] == 416
     status, body, headers = served.ask(f"/store/{name}", "HEAD")
     assert (status, body, headers["Content-Length"]) == (200, b"", str(size))
@@ -107,6 +111,7 @@ def test_files_of_the_store_are_served_by_byte_ranges(served: Served) -> None:
         "/api/sample/-1",
         "/api/layer/split/0",
         "/api/small/0?side=100000",
+        "/api/small/0?side=" + "9" * 5000,
     ],
 )
 def test_nothing_else_is_served(path: str, served: Served) -> None:
@@ -242,6 +247,19 @@ def test_a_fault_is_more_severe_by_the_number_that_its_levels_change(finished_st
 def test_numbers_that_neither_json_nor_a_browser_holds_are_sent_otherwise() -> None:
     assert _plain(np.array([np.inf, -np.inf, np.nan, 1.5])) == [None, None, None, 1.5]
     assert [_exact(str(n)) for n in (2**53 - 1, 2**53, -(2**53))] == [2**53 - 1, str(2**53), str(-(2**53))]
+
+
+def test_numbers_without_end_in_parameters_are_shown(tmp_path: Path) -> None:
+    store = st.create(tmp_path / "s.zarr", make_spec(layers=()), 1)
+    sample = fake_sample(store.spec, 0)
+    sample.scalars["parameters"] = '{"vignetting": {"a": NaN, "b": [1e999, -Infinity], "c": 0.5}}'
+    st.write_samples(store, [sample])
+    one = Served(store)
+    try:
+        values = one.json("/api/sample/0")["values"]
+    finally:
+        one.stop()
+    assert values["parameters"] == {"vignetting": {"a": "NaN", "b": ["1e999", "-Infinity"], "c": 0.5}}
 
 
 def test_a_stratum_without_a_name_is_a_question_mark(tmp_path: Path) -> None:

@@ -103,8 +103,10 @@ def read_parts(
     """
     file, size = _opened(path)
     try:
-        ranges = choose(os.pread(file, tail, max(0, size - tail)))
-        return [(start, os.pread(file, length, start)) for start, length in ranges]
+        ranges = choose(os.pread(file, min(tail, size), max(0, size - tail)))
+        # os.pread reserves what it may read, and takes no place beyond 2^63
+        within = [(start, min(length, size - start)) for start, length in ranges]
+        return [(start, os.pread(file, length, start) if length > 0 else b"") for start, length in within]
     finally:
         os.close(file)
 

@@ -46,7 +46,7 @@ def create(path: str | os.PathLike[str] | Url, spec: StoreSpec, samples: int, *,
     old = is_store(target)
     if old and not overwrite:
         raise InputError(f"{target}: exists already; resume it, or give --overwrite to replace it")
-    why = "" if old else files.why_occupied(name for name, _ in group_files(spec, samples))
+    why = "" if old else files.why_occupied(name for name, _ in group_files(spec, samples)) or _why_within(target)
     if why:
         raise InputError(f"{target}: {why}")
     try:
@@ -54,6 +54,12 @@ def create(path: str | os.PathLike[str] | Url, spec: StoreSpec, samples: int, *,
     except OSError as error:
         raise InputError(f"{target}: no store can be created here: {error.strerror or error}") from error
     return open_store(target, "r+")
+
+
+def _why_within(target: Location) -> str:
+    """Return why no store can be created at a path within another one, as a clause; "" if it is not within one."""
+    above = [] if isinstance(target, Url) else [path for path in target.resolve().parents if is_store(path)]
+    return f"lies in the store {above[0]}, and would be lost with it; choose another --out" if above else ""
 
 
 def group_files(spec: StoreSpec, samples: int) -> Iterator[tuple[str, bytes]]:

@@ -48,6 +48,7 @@ _HEADERS = {
     "Referrer-Policy": "no-referrer",
 }
 _RANGE = re.compile(r"bytes=(?:(\d+)-(\d*)|-(\d+))")
+_LAST = 2**62  # no file has so many bytes
 _SIDES_PX = (160, 240, 320)  # of the small images
 _JPEG_QUALITY = 82
 _MOST_SMALL = 3000  # small images that are kept, of some 10 kB each
@@ -192,7 +193,9 @@ class Viewer:
                 values[name] = {"value": values[name], "units": row.units}
         for name in ("parameters", "proposal"):
             try:
-                values[name] = json.loads(values.get(name) or "{}", parse_int=_exact)
+                values[name] = json.loads(
+                    values.get(name) or "{}", parse_int=_exact, parse_float=_finite, parse_constant=str
+                )
             except (ValueError, RecursionError):
                 damaged.append(name)
         names = {"site": spec.site_names, "lens": spec.lens_names, "detector_individual": spec.detector_names}
@@ -222,8 +225,8 @@ class Viewer:
 
     def small(self, rest: str, query: dict[str, str]) -> bytes:
         """Return a small image of a sample as JPEG, of 160, 240 or 320 px, with its masks if `masks` is 1."""
-        side = int(query.get("side", "240")) if query.get("side", "240").isdecimal() else 240
-        if side not in _SIDES_PX:
+        sides = {str(side): side for side in _SIDES_PX}
+        if (side := sides.get(query.get("side", "240"))) is None:
             raise _Missing
         return self._small(_index(rest, self.store.samples), side, query.get("masks") == "1")
 
@@ -255,7 +258,9 @@ class Viewer:
         asked = _RANGE.fullmatch(header or "bytes=0-")
         if asked is None:
             raise ValueError(header)
-        first, last, suffix = (int(group) if group else None for group in asked.groups())
+        first, last, suffix = (min(int(group), _LAST) if group else None for group in asked.groups())
+        if suffix == 0:
+            raise ValueError(header)
         files, end = self.store.files, b""
 
         def choose(tail: bytes) -> list[tuple[int, int]]:
@@ -302,6 +307,11 @@ def _index(text: str, samples: int) -> int:
 def _exact(digits: str) -> int | str:
     """Return a whole number, as text where a browser's numbers would round it."""
     return int(digits) if abs(int(digits)) < 2**53 else digits
+
+
+def _finite(digits: str) -> float | str:
+    """Return a number, as text where it is beyond all floats."""
+    return float(digits) if math.isfinite(float(digits)) else digits
 
 
 def _plain(value: Any) -> Any:
