@@ -5,7 +5,8 @@
 
 Contact sheets show samples of a dataset with their masks. Their samples are 512 pixels wide, over terrain as coarse
 as quickstart's; the sheets are then shrunk. The figures of `flares`, `navcam67p`, `paper_example` and `physical67p`
-show single samples, rendered at the scene's own size and then shrunk.
+show single samples, rendered at the scene's own size and then shrunk. A figure without colour is written as a grey
+PNG, whose file is smaller.
 """
 
 from __future__ import annotations
@@ -43,7 +44,10 @@ SHEET_TRIANGLES = 800_000
 SHEET_WIDTH_PX = 1080
 NARROW_PX = {"approach": 700, "earth_observation": 700}  # sheets that pages of the documentation show
 # Samples with many fault classes; several share a site, whose terrain is then built once.
-FLARES, NAVCAM, PHYSICAL = (1, 2, 3), (5, 6, 12, 15), (7, 4)
+# Those of NAVCAM have all nine classes of the scene between them, most of them visible in a small figure.
+FLARES, NAVCAM, PHYSICAL = (1, 2, 3), (2, 7, 13, 15), (7, 4)
+NAVCAM_TILE_PX = 304  # keeps the file below 250 kB
+GAP_PX = 4  # white, between images whose own edges may be black
 
 
 def frames(scene: str, samples: tuple[int, ...], overrides: dict[str, Any] | None = None) -> list[Frame]:
@@ -71,6 +75,21 @@ def grid(rows: list[list[U8]], tile_px: int) -> U8:
     return np.vstack([np.hstack(row) for row in shrunk])
 
 
+def spaced(rows: list[list[U8]], tile_px: int) -> U8:
+    """Return images in rows as `grid` does, with white gaps between them, uint8[y, x, 3]."""
+    tiles = grid(rows, tile_px)
+    for axis in (0, 1):
+        cuts = range(tile_px, tiles.shape[axis], tile_px)
+        tiles = np.insert(tiles, np.repeat(list(cuts), GAP_PX), 255, axis=axis)
+    return tiles
+
+
+def without_colour(figure: U8) -> U8:
+    """Return one channel of a figure whose channels are equal, uint8[y, x]; other figures as they are."""
+    grey = figure[..., :1]
+    return grey[..., 0] if (figure == grey).all() else figure
+
+
 def flares() -> U8:
     """Draw three samples with each of the three models of straylight, one row a model."""
     models: list[dict[str, Any]] = [
@@ -85,7 +104,7 @@ def flares() -> U8:
 def navcam67p() -> U8:
     """Draw four samples of a dataset of 16."""
     images = [rgb(frame, "image") for frame in frames("navcam67p", NAVCAM, {"dataset.samples": 16})]
-    return grid([images[:2], images[2:]], 540)
+    return spaced([images[:2], images[2:]], NAVCAM_TILE_PX)
 
 
 def paper_example() -> U8:
@@ -135,7 +154,7 @@ def main() -> None:
     for scene in given.scenes or known:
         path = given.out / f"{scene}.png"
         figure = sheet(scene) if scene in SHEETS else SINGLE[scene]()
-        write_png(path, figure, smallest=True)
+        write_png(path, without_colour(figure), smallest=True)
         print(f"{path}: {path.stat().st_size / 1e3:.0f} kB", flush=True)
 
 

@@ -110,13 +110,23 @@ def test_a_reader_that_leaves_ends_a_command_in_silence_and_a_full_disk_with_a_s
         assert capsys.readouterr().err == before.err + said
 
 
+@pytest.mark.parametrize("name", ["verify", "digest", "flare", "detector"])
+def test_progress_is_shown_on_a_terminal_alone(
+    name: str, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(monkeypatch, *arguments(name, folder)) == 0
+    assert capsys.readouterr().err == ""
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    assert run(monkeypatch, *arguments(name, folder)) == 0
+    assert "100%" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("opened", [nobody_reads, full])
 def test_messages_that_nobody_reads_change_nothing(
     opened: Callable[[], Any], folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for words, code in (
-        (arguments("digest", folder), 0),  # a line of progress
-        (arguments("describe", folder), 0),
+        (arguments("describe", folder), 0),  # a warning
         (["list", "nothing"], 2),  # an error's sentence
         (["list"], 2),  # one of the parser
     ):

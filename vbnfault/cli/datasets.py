@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -21,6 +20,7 @@ from .options import (
     SceneValues,
     StoreArgument,
     grouped,
+    progress_bar,
     shard_range,
     whole,
     writing,
@@ -169,7 +169,7 @@ def verify(store: StoreArgument) -> None:
     from .. import store as stores
 
     opened = stores.open_store(store)
-    with typer.progressbar(length=opened.samples, label="samples", file=sys.stderr) as bar:
+    with progress_bar(opened.samples, "samples") as bar:
         report = dataset.verify(opened, progress=bar.update)
     for problem in report.problems:
         typer.echo(f"{store}: {problem}", err=True)
@@ -193,7 +193,7 @@ def digest(store: StoreArgument) -> None:
     from .. import store as stores
 
     opened = stores.open_store(store)
-    with typer.progressbar(length=opened.samples, label="samples", file=sys.stderr) as bar:
+    with progress_bar(opened.samples, "samples") as bar:
         typer.echo(stores.digest(opened, progress=bar.update))
 
 
@@ -214,7 +214,7 @@ def migrate(
     if out is not None:
         stores.check_target(opened, out)
         length = opened.samples
-    with typer.progressbar(length=length, label="samples", file=sys.stderr, hidden=not length) as bar:
+    with progress_bar(length, "samples") as bar:
         migrated = migrate_store(store, out, progress=bar.update)
     typer.echo(f"{migrated.path}: {migrated.samples} samples, format {migrated.spec.format_version}, was {before}")
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -19,6 +18,7 @@ from .options import (
     grouped,
     load_plugins,
     number,
+    progress_bar,
     whole,
     writing,
 )
@@ -179,7 +179,7 @@ def flare(
         white=white,
         **vars(options),
     )
-    with typer.progressbar(length=request.steps, label="ghosts and picture", file=sys.stderr) as bar:
+    with progress_bar(request.steps, "ghosts and image") as bar:
         result = flare_images.compute(request, bar.update)
     if result.ghosts:
         _print_ghosts(request.lens.name, result.ghosts)
@@ -255,7 +255,7 @@ def detector(
     _ = request.device  # a sensor file that is refused leaves no folder behind
     with writing(out):  # before the work
         out.mkdir(parents=True, exist_ok=True)
-    with typer.progressbar(length=request.images, label=f"{request.images} images", file=sys.stderr) as bar:
+    with progress_bar(request.images, f"{request.images} images") as bar:
         report = sensor_report.measure(request, bar.update)
     typer.echo(report.title)
     for line in report.lines():

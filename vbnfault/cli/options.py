@@ -8,6 +8,7 @@ import functools
 import inspect
 import math
 import re
+import sys
 import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -179,6 +180,15 @@ def load_plugins(names: list[str] | None) -> None:
     from ..core import path_checks
 
     faults.load_plugins([path_checks.absolute(n, "--plugin") if n.endswith(".py") else n for n in names or ()])
+
+
+def progress_bar(length: int, label: str) -> Any:
+    """Return a progress bar on standard error, a context whose `update` takes the steps that were done.
+
+    Without a length, or where standard error is no terminal, it shows nothing; click would print the label alone.
+    """
+    hidden = not length or not sys.stderr.isatty()
+    return typer.progressbar(length=length, label=label, file=sys.stderr, hidden=hidden)
 
 
 @contextlib.contextmanager
