@@ -12,6 +12,7 @@ import typer.main
 from typer.testing import CliRunner
 
 from vbnfault import cli
+from vbnfault.core.errors import InputError
 from vbnfault.output.flare_images import RANGES
 
 COMMANDS: dict[str, Any] = typer.main.get_command(cli.app).commands  # type: ignore[attr-defined]
@@ -68,6 +69,22 @@ def test_the_flares_options_have_the_limits_of_the_library() -> None:
     for name, low, high in RANGES:
         assert limits.pop(name) == (low, high), name
     assert set(limits) == {"wavelength_nm", "focal_length_mm", "reflections"}
+
+
+def test_a_path_to_write_is_no_url() -> None:
+    """A path `s3://bucket/x` would make a folder `s3:` here."""
+    stores = ("build", "merge", "retake", "migrate")  # their --out may be a URL, or is checked with the store
+    seen = 0
+    for command, option in options():
+        if option.name in ("out", "json_", "toml") and command not in stores and not option.is_flag:
+            for url in ("s3://bucket/x.png", "file:///tmp/x"):
+                shown = CliRunner().invoke(cli.app, [command, option.opts[0], url])
+                assert isinstance(shown.exception, InputError), (command, option.name)
+                start = f"{option.opts[0]} {url.split(':')[0]}://"
+                assert re.fullmatch(rf"{start}.*: is a URL; must be a path on this machine", str(shown.exception))
+            seen += 1
+    assert seen == 14
+    assert not Path("s3:").exists()
 
 
 def test_every_option_is_named_in_a_test() -> None:

@@ -20,6 +20,7 @@ from .options import (
     SceneValues,
     StoreArgument,
     grouped,
+    local_path,
     progress_bar,
     shard_range,
     whole,
@@ -131,7 +132,7 @@ def describe(scene: SceneArgument, options: SceneOptions) -> None:
 @grouped
 def render(
     scene: SceneArgument,
-    out: Annotated[Path, typer.Option(help="Folder for the files.")],
+    out: Annotated[Path, local_path("Folder for the files.")],
     options: SceneOptions,
     sample: Annotated[int, whole(0, 100 * MOST_SAMPLES, "Index of the sample, counted from 0.")] = 0,
     append: Annotated[
@@ -222,7 +223,7 @@ def migrate(
 @app.command(rich_help_panel=_PANEL)
 def preview(
     store: StoreArgument,
-    out: Annotated[Path, typer.Option(help="PNG file to write.")],
+    out: Annotated[Path, local_path("PNG file to write.")],
     samples: Annotated[int, whole(1, 400, "Largest number of samples to show.")] = 16,
     masks: Annotated[bool, typer.Option(help="Draw the masks of the faults over the images.")] = True,
 ) -> None:

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from .app import app
-from .options import StoreArgument, whole
+from .options import StoreArgument, local_path, whole
 
 _PANEL = "Datasets"
 
@@ -21,7 +21,7 @@ def export(
         str,
         typer.Option(metavar="FORMAT", help="One of coco, exr, huggingface, png, webdataset and yolo."),
     ],
-    out: Annotated[Path, typer.Option(help="Folder for the files; an interrupted export in it is resumed.")],
+    out: Annotated[Path, local_path("Folder for the files; an interrupted export in it is resumed.")],
     workers: Annotated[int, whole(1, 64, "Number of threads; the files do not depend on it.")] = 2,
 ) -> None:
     """Write a finished store in the format of other tools, with its splits, classes and a card."""
@@ -59,7 +59,7 @@ def card(store: StoreArgument) -> None:
 @app.command(rich_help_panel=_PANEL)
 def report(
     store: StoreArgument,
-    out: Annotated[Path, typer.Option(help="Page to write; its name ends in .html.")],
+    out: Annotated[Path, local_path("Page to write; its name ends in .html.")],
     samples: Annotated[int, whole(1, 200, "Largest number of samples in the gallery.")] = 36,
     pixels: Annotated[int, whole(1, 1_000_000, "Largest number of samples whose pixels are read.")] = 400,
 ) -> None:

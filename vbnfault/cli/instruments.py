@@ -17,6 +17,7 @@ from .options import (
     check_image_path,
     grouped,
     load_plugins,
+    local_path,
     number,
     progress_bar,
     whole,
@@ -72,14 +73,14 @@ def lens(
     options: LensOptions,
     out: Annotated[
         Path | None,
-        typer.Option(help="PNG file for the drawing.", show_default="the lens's name, in the working folder"),
+        local_path("PNG file for the drawing.", unset="the lens's name, in the working folder"),
     ] = None,
     json_: Annotated[
         Path | None,
-        typer.Option("--json", help="JSON file for the table; null stands for a value that is infinite."),
+        local_path("JSON file for the table; null stands for a value that is infinite.", "--json"),
     ] = None,
     toml: Annotated[
-        Path | None, typer.Option(help="TOML file for the prescription with all changes, such as a relative.")
+        Path | None, local_path("TOML file for the prescription with all changes, such as a relative.")
     ] = None,
 ) -> None:
     """Print a lens's focal length, pupils and f-number, and draw it with the numbers of its rows."""
@@ -137,7 +138,7 @@ class FlareOptions:
 @grouped
 def flare(
     lens: LensArgument,
-    out: Annotated[Path, typer.Option(help="Image file: .png, or .exr with every band and no exposure.")],
+    out: Annotated[Path, local_path("Image file: .png, or .exr with every band and no exposure.")],
     options: FlareOptions,
     wavelength_nm: Annotated[
         float | None,
@@ -165,7 +166,7 @@ def flare(
         ),
     ] = None,
     json_: Annotated[
-        Path | None, typer.Option("--json", help="JSON file with every ghost; null stands for an undefined value.")
+        Path | None, local_path("JSON file with every ghost; null stands for an undefined value.", "--json")
     ] = None,
 ) -> None:
     """Compute ghosts, starburst and glare of the Sun in a lens, as an image and as a table of every ghost."""
@@ -235,7 +236,7 @@ class DetectorOptions:
 @grouped
 def detector(
     detector: Annotated[str, typer.Argument(help="Path of a sensor file, or name of a packaged detector.")],
-    out: Annotated[Path, typer.Option(help="Folder for emva1288.json and emva1288.png.")],
+    out: Annotated[Path, local_path("Folder for emva1288.json and emva1288.png.")],
     options: DetectorOptions,
     plugins: PluginOption = None,
 ) -> None:

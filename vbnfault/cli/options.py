@@ -58,6 +58,19 @@ def number(low: float, high: float, text: str, *names: str, unset: str | None = 
     return typer.Option(*names, callback=finite, min=low, max=high, help=text, show_default=unset or True)
 
 
+def on_this_machine(param: typer.CallbackParam, value: Path | None) -> Path | None:
+    """Return an option's path. Refuses a URL, of which a folder such as `s3:` would be made. Raises InputError."""
+    scheme, colon, rest = str(value or "").partition(":/")  # a path keeps one of two slashes
+    if colon and re.fullmatch(r"[A-Za-z][A-Za-z0-9+.-]+", scheme):
+        raise InputError(f"{param.opts[0]} {scheme}://{rest}: is a URL; must be a path on this machine")
+    return value
+
+
+def local_path(text: str, *names: str, unset: str | None = None) -> Any:
+    """Return an option that takes the path of a file or folder to write; `unset` as `number` says it."""
+    return typer.Option(*names, callback=on_this_machine, help=text, show_default=unset or True)
+
+
 def replaced(what: str, example: str) -> Any:
     """Return the option that replaces values of a file: of what, and an example."""
     text = f"Replace a value of the {what}, such as {example}; may be repeated."

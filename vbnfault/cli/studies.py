@@ -9,7 +9,17 @@ from typing import Annotated
 import typer
 
 from .app import app
-from .options import MOST_PROCESSES, SceneArgument, check_image_path, grouped, number, overrides, replaced, writing
+from .options import (
+    MOST_PROCESSES,
+    SceneArgument,
+    check_image_path,
+    grouped,
+    local_path,
+    number,
+    overrides,
+    replaced,
+    writing,
+)
 
 _PANEL = "Studies"
 
@@ -19,7 +29,7 @@ def study(
     name: Annotated[
         str, typer.Argument(help="Path of a study file, or name of a packaged study.", metavar="STUDY")
     ],
-    out: Annotated[Path, typer.Option(help="Folder for the results, to make or to continue.")],
+    out: Annotated[Path, local_path("Folder for the results, to make or to continue.")],
     workers: Annotated[int, typer.Option(min=1, max=MOST_PROCESSES, help="Number of processes.")] = 1,
     threads: Annotated[
         int | None,
@@ -90,7 +100,7 @@ class _SeverityOptions:
 @grouped
 def severity(
     scene: SceneArgument,
-    out: Annotated[Path, typer.Option(help="TOML file to write.")],
+    out: Annotated[Path, local_path("TOML file to write.")],
     tested: _SeverityOptions,
     metric: Annotated[str, typer.Option(help="Metric of navigation that is the error.")] = "matches_lost",
     quantile: Annotated[float, number(0, 1, "Quantile of the error over the views.")] = 0.5,

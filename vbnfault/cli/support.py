@@ -15,7 +15,7 @@ import typer
 from .. import __version__
 from ..core.errors import InputError
 from .app import app
-from .options import PluginOption, load_plugins
+from .options import PluginOption, load_plugins, local_path
 
 _PANEL = "Getting started"
 _LIBRARIES = ("mitsuba", "drjit", "numpy", "zarr", "trimesh", "OpenEXR", "colour-science", "dask")
@@ -148,7 +148,7 @@ def new(
         str,
         typer.Argument(help="Name of the new thing and, with .toml or .py behind it, of its file.", metavar="NAME"),
     ],
-    out: Annotated[Path, typer.Option(help="Folder for the file.")] = Path("."),
+    out: Annotated[Path, local_path("Folder for the file.")] = Path("."),
     overwrite: Annotated[bool, typer.Option(help="Replace a file of this name.")] = False,
 ) -> None:
     """Write a commented file that works as it is, to start your own from."""
@@ -160,9 +160,9 @@ def new(
 @app.command(rich_help_panel=_PANEL)
 def shape(
     body: Annotated[str, typer.Argument(help="Name of a packaged body (`vbnfault list bodies`).", metavar="BODY")],
-    out: Annotated[
-        Path, typer.Option(help="Folder for the file and for shapes.lock, which keeps its checksum.")
-    ] = (Path(".")),
+    out: Annotated[Path, local_path("Folder for the file and for shapes.lock, which keeps its checksum.")] = (
+        Path(".")
+    ),
     url: Annotated[
         str | None, typer.Option(help="Another address, such as that of a mirror.", show_default="the body's")
     ] = None,
