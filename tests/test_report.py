@@ -20,7 +20,7 @@ from vbnfault.core.images import indexed_png
 from vbnfault.output.report import Limits, write_report
 from vbnfault.output.report.charts import Histogram, boxes, number, ticks
 from vbnfault.output.report.gallery import parameter_table, pick
-from vbnfault.output.report.measure import Drawn, key_bounds, read_drawn, read_pixels, read_scalars
+from vbnfault.output.report.measure import Drawn, key_bounds, key_unit, read_drawn, read_pixels, read_scalars
 
 
 @pytest.fixture(scope="module")
@@ -189,6 +189,22 @@ def test_bounds_belong_to_the_key_of_the_parameter() -> None:
     assert of("glare.index") is None
     assert of("index") == (1.0, 10.0)
     assert of("nothing") is None
+
+
+@pytest.mark.parametrize(
+    ("fault", "model", "name", "unit"),
+    [
+        ("dust_on_optics", "gaussian", "sigma_xx", "grid units²"),
+        ("dust_on_optics", "gaussian", "x_px", ""),  # drawn, no key
+        ("straylight", "texture", "flares.radius", "image widths"),
+        ("straylight", "texture", "glare.radius", "image widths"),
+        ("dust_on_optics", "not_loaded", "sigma_xx", ""),
+        ("not_loaded", "gaussian", "sigma_xx", ""),
+    ],
+)
+def test_a_drawn_parameter_has_the_unit_of_its_key(fault: str, model: str, name: str, unit: str) -> None:
+    drawn = Drawn(fault=fault, name=name, values=np.zeros(0), split=np.zeros(0, int))
+    assert key_unit({fault: model}, drawn) == unit
 
 
 def test_a_histogram_holds_every_value_once() -> None:

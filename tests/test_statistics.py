@@ -18,7 +18,7 @@ from vbnfault import store as st
 from vbnfault.dataset import card, from_scene
 from vbnfault.dataset.build import BuildOptions
 from vbnfault.dataset.identity import stored_plan
-from vbnfault.dataset.statistics import statistics
+from vbnfault.dataset.statistics import key_of, statistics
 from vbnfault.scene import config
 
 
@@ -63,6 +63,13 @@ def test_statistics_are_those_of_the_arrays(data: st.Store) -> None:
     assert numbers["parameters"][fault]["x"]["count"] == 2 * len(with_fault)
     assert numbers["parameters"][fault]["model"] == {"values": {"made_up": len(with_fault)}}
     assert numbers["bounds"]["dust_on_optics"]["count"] == [30, 100]
+
+
+def test_a_parameter_of_a_glare_has_not_the_bounds_of_the_flares() -> None:
+    keys = {"radius", "brightness", "index", "glare_radius"}
+    assert [key_of(name, keys) for name in ("flares.radius", "glare.radius", "glare.index", "index", "x")] == [
+        *("radius", "glare_radius", "", "index", "")
+    ]
 
 
 def test_statistics_of_a_store_whose_plan_is_unknown(finished_store: Path) -> None:

@@ -9,7 +9,7 @@ import json
 import math
 import os
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -208,8 +208,22 @@ class Statistics:
 
     def _bounds(self, fault: str, name: str) -> str:
         """Return the bounds that the scene gives for a parameter as text, "" if it gives none of this name."""
-        low_high = self.bounds.get(fault, {}).get(name.rpartition(".")[2])
+        keys = self.bounds.get(fault, {})
+        low_high = keys.get(key_of(name, keys))
         return f"{low_high[0]:g} to {low_high[1]:g}" if low_high else ""
+
+
+def key_of(parameter: str, keys: Collection[str]) -> str:
+    """Return the key of the scene file that a drawn parameter belongs to, or "" if none of `keys` is its key.
+
+    A parameter `glare.radius` belongs to the key `glare_radius`, and `flares.radius` to `radius` unless a key
+    begins with `flares_`.
+    """
+    table, _, name = parameter.rpartition(".")
+    joined = parameter.replace(".", "_")
+    if joined in keys or not table or any(key.startswith(f"{table}_") for key in keys):
+        return joined if joined in keys else ""
+    return name if name in keys else ""
 
 
 def _numbers(one: Range) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.errors import VbnfaultError
-from ...dataset.statistics import is_seed
+from ...dataset.statistics import is_seed, key_of
+from ...faults import registry
 from ...store import SPLITS, STRATA, Store
 
 F64 = NDArray[np.float64]
@@ -210,17 +212,21 @@ def _numbers(drawn: Any, name: str = "") -> Iterator[tuple[str, F64]]:
 
 
 def key_bounds(bounds: Mapping[str, Mapping[str, tuple[float, float]]], drawn: Drawn) -> tuple[float, float] | None:
-    """Return the bounds that the scene gives for a parameter; None if it has none under the parameter's name.
-
-    A parameter `glare.radius` belongs to the key `glare_radius`, and `flares.radius` to `radius` unless a key
-    begins with `flares_`.
-    """
+    """Return the bounds that the scene gives for a parameter; None if it has none under the parameter's name."""
     keys = bounds.get(drawn.fault, {})
-    table, _, name = drawn.name.rpartition(".")
-    joined = drawn.name.replace(".", "_")
-    if joined in keys or not table or any(key.startswith(f"{table}_") for key in keys):
-        return keys.get(joined)
-    return keys.get(name)
+    return keys.get(key_of(drawn.name, keys))
+
+
+def key_unit(models: Mapping[str, str], drawn: Drawn) -> str:
+    """Return the unit of the key that a parameter belongs to; "" without one, and for a model that is not loaded.
+
+    `models` holds the model of each fault class of a store.
+    """
+    model = registry().get(drawn.fault, {}).get(models.get(drawn.fault, ""))
+    if model is None:
+        return ""
+    units = {field.name: str(field.metadata.get("unit", "")) for field in dataclasses.fields(model)}
+    return units.get(key_of(drawn.name, units), "")
 
 
 def geometry_bounds(store: Store, name: str) -> list[tuple[str, tuple[float, float]]]:

@@ -24,6 +24,7 @@ from .measure import (
     Scalars,
     geometry_bounds,
     key_bounds,
+    key_unit,
     read_drawn,
     read_pixels,
     read_scalars,
@@ -107,7 +108,8 @@ def _page(store: Store, scalars: Scalars, limits: Limits) -> Page:
         sections += [_balance(store, scalars, numbers), _together(store, scalars)]
     sections += [_sun(scalars), _view(store, scalars)]
     if drawn:
-        sections.append(_parameters(scalars, drawn, numbers.bounds if numbers else {}, read))
+        models = store.attributes.get("fault_models", {})
+        sections.append(_parameters(scalars, drawn, numbers.bounds if numbers else {}, models, read))
     sections.append(_exposure(store, scalars, pixels))
     if store.spec.faults:
         sections.append(_areas(store, scalars, pixels))
@@ -179,7 +181,7 @@ def _balance(store: Store, scalars: Scalars, numbers: Statistics | None) -> Sect
             splits.append((name, int(injected[inside, k].sum()), asked, int(inside.sum())))
         rows.append((fault, f"var(--f{k})", splits))
     mark = (
-        "The mark is the planned fraction."
+        "The mark is the planned fraction. The number over a histogram is the fraction of its highest bin."
         if planned
         else "The plan is not known, because the scene in the store cannot be planned here."
     )
@@ -256,7 +258,9 @@ def _sun(scalars: Scalars) -> Section:
             title="distance of the Sun", unit="au", groups=scalars.by_split(scalars.columns["sun_distance_au"])
         ),
     ]
-    how = "One dot a sample; those on the far side are faint. Drag a sphere, or focus it and use the arrow keys."
+    how = (
+        "Each dot is a sample; those on the far side are faint. Drag a sphere, or focus it and use the arrow keys."
+    )
     histograms = "".join(histogram.markup() for histogram in small)
     globes = f'<div class="globes">{drawn}<div class="stack">{histograms}</div></div>'
     return Section("sun", "Sun geometry", _how(how) + charts.legend(scalars.split_names) + globes)
@@ -288,7 +292,11 @@ def _view(store: Store, scalars: Scalars) -> Section:
 
 
 def _parameters(
-    scalars: Scalars, drawn: Sequence[Drawn], bounds: Mapping[str, Mapping[str, tuple[float, float]]], read: int
+    scalars: Scalars,
+    drawn: Sequence[Drawn],
+    bounds: Mapping[str, Mapping[str, tuple[float, float]]],
+    models: Mapping[str, str],
+    read: int,
 ) -> Section:
     """Return the histograms of the drawn parameters of the faults."""
     some = "" if read == len(scalars.samples) else f" They are from {grouped_digits(read)} samples, evenly spaced."
@@ -307,7 +315,7 @@ def _parameters(
                 pair is None or pair[0] == pair[1]
             ):
                 continue  # a constant
-            histograms.append(_histogram(one.name, groups, pair))
+            histograms.append(_histogram(one.name, groups, pair, unit=key_unit(models, one)))
         if histograms:
             short = "".join(histogram.markup() for histogram in histograms)
             parts.append(f'<h3>{escaped(fault.replace("_", " "))}</h3><div class="charts">{short}</div>')
