@@ -113,13 +113,13 @@ def paper_example() -> U8:
     local = ("straylight", "dust_on_optics", "broken_pixels", "broken_lines")
     masks = [mask(frame, name) for name in local]
     pictures = [rgb(frame, "image"), rgb(frame, "without_straylight"), annotated(frame, "straylight")]
-    return grid([[*pictures, masks[0]], [*masks[1:], mask(frame, *local)]], 400)
+    return spaced([[*pictures, masks[0]], [*masks[1:], mask(frame, *local)]], 400)
 
 
 def physical67p() -> U8:
     """Draw two samples, each with and without its faults."""
     taken = frames("physical67p", PHYSICAL)
-    return grid([[rgb(frame, "image"), rgb(frame, "clean")] for frame in taken], 540)
+    return spaced([[rgb(frame, "image"), rgb(frame, "clean")] for frame in taken], 540)
 
 
 SINGLE = {"flares": flares, "navcam67p": navcam67p, "paper_example": paper_example, "physical67p": physical67p}
