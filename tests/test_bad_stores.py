@@ -1,6 +1,6 @@
 """Every command on what is no store of this version, is not finished, or lies in a bucket that refuses.
 
-One sentence, no traceback, and nothing that was there is lost.
+One sentence, no traceback, and nothing that was there is lost. A store without fault classes is sound.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import xarray
 from s3_server import BUCKET, S3Server, in_environment
+from synthetic import filled
 from test_cli import run
 from test_export import tree
 
@@ -51,6 +52,14 @@ def said(capsys: pytest.CaptureFixture[str]) -> str:
     lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("vbnfault: ")]
     assert len(lines) == 1, lines
     return lines[0].removeprefix("vbnfault: ")
+
+
+@pytest.mark.parametrize("command", ["digest", "preview", "export", "report", "stats", "card"])
+def test_every_command_takes_a_store_without_fault_classes(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    store = filled(tmp_path / "s.zarr", 2, faults=(), mask_any_faults=(), layers=("depth_m",))
+    assert run(monkeypatch, *COMMANDS[command](store.path, tmp_path, tmp_path)) == 0, capsys.readouterr().err
 
 
 # --- on a disk --------------------------------------------------------------------------------------------

@@ -161,7 +161,7 @@ def _tile(store: Store, index: int, short: Mapping[str, str], masks: bool) -> U8
     # a shrunk mask is True where any of its pixels is, so that a single broken pixel stays visible
     rgb = resized(read("image")[..., :3], size)
     injected = read("injected").astype(bool)
-    if masks:
+    if masks and spec.faults:
         small = np.stack([resized_mask(m, size) for m in read("mask")])
         localised = [fault in (spec.localised_faults or ()) for fault in spec.faults]
         rgb = overlay(rgb, small, injected.tolist(), localised)
