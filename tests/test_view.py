@@ -27,6 +27,7 @@ from vbnfault.output.viewer import Viewer
 from vbnfault.output.viewer.listing import NOT_KNOWN, Listing, _keys, _measure
 from vbnfault.output.viewer.server import _exact, _plain
 from vbnfault.scene.names import STRATA
+from vbnfault.store import codec
 
 
 class Served:
@@ -449,6 +450,37 @@ def test_one_sample_by_mouse_and_by_keys(page: Page, served: Served) -> None:
     assert all(
         u.startswith((served.viewer.url, "blob:", "data:", "about:")) for u in page.requests if "file:" not in u
     )
+
+
+@needs_browser
+def test_samples_that_share_a_chunk_are_read_in_the_page(page: Page, tmp_path: Path) -> None:
+    store = st.create(tmp_path / "s.zarr", make_spec(32, layers=("depth_m",)), 4)
+    samples = [fake_sample(store.spec, i) for i in range(4)]
+    seen_from, shared = np.random.default_rng(2), (0, 2, 3)
+    for i, sample in enumerate(samples):
+        alike = i in shared[1:]
+        noise = seen_from.random(sample.layers["depth_m"].shape, dtype=np.float32)
+        sample.layers["depth_m"] = samples[0].layers["depth_m"] if alike else noise
+    st.write_samples(store, samples)
+    ranges = codec.chunk_ranges(store.file("depth_m", 0).read_bytes()[-codec.index_size(4) :], 4)
+    assert [i for i in range(4) if ranges[i] == ranges[0]] == list(shared)
+    one = Served(st.open_store(store.path))
+    try:
+        ready(page, one)
+        page.click('.tile[data-index="0"]')
+        for i in range(4):
+            page.wait(f"document.getElementById('name').textContent === 'Sample {i}'")
+            page.press("d")
+            page.wait("window.vbnfault.view.layer === 'depth_m' && document.getElementById('message').hidden")
+            page.wait(
+                f"window.vbnfault.view.index === {i} && window.vbnfault.view.pixels?.layer.name === 'depth_m'"
+            )
+            shown = page.evaluate("[...window.vbnfault.view.pixels.data]")
+            np.testing.assert_array_equal(np.float32(shown), samples[i].layers["depth_m"].ravel())
+            page.press("ArrowRight")
+        assert page.evaluate("window.vbnfault.sources.server") == 0
+    finally:
+        one.stop()
 
 
 @needs_browser
