@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import dataclasses
 import json
 import os
 import re
+import resource
 import struct
 import subprocess
 import sys
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
@@ -23,12 +25,18 @@ from vbnfault import cli
 from vbnfault.body import load_shape
 from vbnfault.body.shape import signed_volume
 from vbnfault.cli.options import finite
-from vbnfault.core import path_checks, resources, spice, user_files
+from vbnfault.core import html_page, images, path_checks, resources, spice, user_files
 from vbnfault.core.errors import InputError, VbnfaultError, shown
+from vbnfault.dataset.lock import locked
 from vbnfault.detector.sensor import load_sensor
 from vbnfault.faults import from_dict, registry
+from vbnfault.faults.levels import Levels
 from vbnfault.lens import load_lens
+from vbnfault.lens.prescription_file import write_lens
+from vbnfault.output.json_files import write_json
+from vbnfault.output.template_files import write_template
 from vbnfault.scene import config
+from vbnfault.study.severity import write_table
 from vbnfault.world.spacecraft import load_spacecraft
 
 TITLE = 'title = "t"\n'
@@ -419,6 +427,71 @@ def test_a_full_disk_and_a_lost_folder_are_told_in_a_sentence(tmp_path: Path) ->
     )
     assert done.returncode == 2
     assert done.stderr == "vbnfault: the working folder does not exist any more; change to another one\n"
+
+
+@contextlib.contextmanager
+def _files_of_at_most(size: int) -> Iterator[None]:
+    """Let no file that is written become larger than this number of bytes, as on a full disk."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def test_a_lock_that_cannot_be_written_is_named_and_removed(tmp_path: Path) -> None:
+    with (
+        _files_of_at_most(0),
+        pytest.raises(VbnfaultError, match=r"\.s\.zarr\.lock: cannot be written: File too large"),
+        locked(tmp_path / "s.zarr"),
+    ):
+        pass
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_page_shows_a_file_name_that_is_no_unicode(tmp_path: Path) -> None:
+    facts = {"store": os.fsdecode(b"x\xff.zarr")}
+    html_page.Page(title="t", description="", facts=facts, sections=()).write(tmp_path / "p.html")
+    assert "x?.zarr" in (tmp_path / "p.html").read_text(encoding="utf-8")
+
+
+def _writers() -> dict[str, Callable[[Path], object]]:
+    """By the name of a file, a function that writes it."""
+    page = html_page.Page(title="t", description="", facts={}, sections=())
+    lens = load_lens("tessar_50_f2p8")
+    levels = Levels().table
+    noise = np.random.default_rng(1).integers(0, 256, (32, 32, 3), dtype=np.uint8)
+    return {
+        "own.toml": lambda path: write_template("scene", path.stem, path.parent, overwrite=True),
+        "page.html": page.write,
+        "table.json": lambda path: write_json(path, list(range(100))),
+        "lens.toml": lambda path: write_lens(lens, path),
+        "levels.toml": lambda path: write_table(path, levels),
+        "image.png": lambda path: images.write_png(path, noise),
+    }
+
+
+@pytest.mark.parametrize("name", ["own.toml", "page.html", "table.json", "lens.toml", "levels.toml", "image.png"])
+def test_a_file_that_cannot_be_written_keeps_its_content(name: str, tmp_path: Path) -> None:
+    path, write = tmp_path / name, _writers()[name]
+    path.write_text("mine")
+    with _files_of_at_most(16), pytest.raises((OSError, InputError)):
+        write(path)
+    assert path.read_text() == "mine"
+    assert [p.name for p in tmp_path.iterdir()] == [name]
+    link = tmp_path / f"link{path.suffix}"
+    link.symlink_to(name)
+    if name != "own.toml":
+        write(link)
+        assert link.is_symlink()
+        assert path.read_bytes() != b"mine"
+
+
+def test_texts_of_the_command_line_that_are_no_unicode_are_refused() -> None:
+    for key in ("title", "body.shape", "dataset.citation"):
+        with pytest.raises(InputError, match=rf"{key} = .*udcff.*: must be text in UTF-8"):
+            config.load_scene("quickstart", {key: os.fsdecode(b"x\xff")})
 
 
 def numeric_options() -> list[tuple[str, str, Any, set[type]]]:

@@ -8,12 +8,13 @@ from __future__ import annotations
 import base64
 import html
 import json
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Any
+
+from .whole_files import write_whole
 
 
 @dataclass(frozen=True)
@@ -68,13 +69,7 @@ class Page:
 
     def write(self, path: Path) -> None:
         """Write the page, at once under its name. Raises OSError if the file cannot be written."""
-        temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
-        try:
-            temporary.write_text(self.markup(), encoding="utf-8")
-            temporary.replace(path)
-        except OSError:
-            temporary.unlink(missing_ok=True)
-            raise
+        write_whole(path, self.markup())
 
 
 def common_style() -> str:

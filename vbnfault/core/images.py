@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .errors import VbnfaultError
+from .whole_files import write_whole
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 # Channels of OpenCV's order B, G, R, alpha in the order R, G, B, alpha, and back.
@@ -88,7 +89,7 @@ def write_png(path: Path, image: NDArray[Any], *, smallest: bool = False) -> Pat
     done, data = cv2.imencode(".png", np.ascontiguousarray(_swapped(image)), options)
     if not done:
         raise VbnfaultError(f"{path}: the image cannot be encoded as PNG")
-    path.write_bytes(data.tobytes())
+    write_whole(path, data.tobytes())
     return path
 
 

@@ -50,7 +50,8 @@ def toml_text(table: Mapping[str, Any]) -> str:
 
 
 def check_plain(table: Mapping[str, Any], source: str) -> None:
-    """Check that plain data is nested at most 24 deep and holds no whole number of more than 64 bits.
+    """Check that plain data is nested at most 24 deep and holds neither a whole number of more than 64 bits
+    nor a text that is no Unicode, which the command line may give.
 
     Raises InputError; the message begins with `source`.
     """
@@ -67,11 +68,23 @@ def check_plain(table: Mapping[str, Any], source: str) -> None:
                     raise InputError(
                         f"{source}: {path} = {shown(value)}: must be a whole number of at most 64 bits"
                     )
+                elif isinstance(value, str) and not _is_unicode(value):
+                    path = f"{where}{_shown_key(key)}"
+                    raise InputError(f"{source}: {path} = {shown(value)}: must be text in UTF-8")
         level = below
         if not level:
             return
     where = level[0][0].rstrip(".")
     raise InputError(f"{source}: {where}: nested deeper than {_DEEPEST_TABLE} tables or lists")
+
+
+def _is_unicode(text: str) -> bool:
+    """Return whether a text can be written as UTF-8."""
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def _shown_key(key: object) -> str:

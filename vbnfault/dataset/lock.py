@@ -199,9 +199,12 @@ def _lock_file(path: Path, file: Path, stack: contextlib.ExitStack) -> bool:
                 named = os.stat(path if stat.S_ISDIR(status.st_mode) else file)
                 if (named.st_dev, named.st_ino) == (status.st_dev, status.st_ino):
                     if not stat.S_ISDIR(status.st_mode):
-                        os.ftruncate(handle, 0)
-                        os.write(handle, json.dumps(this_process()).encode())
                         undo.callback(file.unlink, missing_ok=True)  # before it is closed
+                        os.ftruncate(handle, 0)
+                        try:
+                            os.write(handle, json.dumps(this_process()).encode())
+                        except OSError as error:
+                            raise VbnfaultError(f"{file}: cannot be written: {error.strerror}") from None
                     stack.push(undo.pop_all())
                     return True
             # the file was removed by its owner between our opening and our locking it: try again

@@ -17,6 +17,7 @@ from pydantic import Discriminator, Field, Tag, model_validator
 from ..core import resources, tables, toml_files
 from ..core.errors import InputError
 from ..core.tables import Fraction, Table
+from ..core.whole_files import write_whole
 from .coating import Layer
 from .glass import AIR, CLEAR, D_NM, GLASSES, Glass, Transmittance, check_index, from_abbe, from_coefficients
 from .prescription import Hood, Prescription, Surface, facing_air
@@ -394,4 +395,4 @@ def _keys_of(glass: Glass) -> dict[str, Any]:
 
 def write_lens(lens: Prescription, path: Path) -> None:
     """Write a prescription, as it is now scaled, as a TOML file that `load_lens` reads; see `to_table`."""
-    path.write_text(toml_files.toml_text(to_table(lens)), encoding="utf-8")
+    write_whole(path, toml_files.toml_text(to_table(lens)))

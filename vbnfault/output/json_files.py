@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from ..core.whole_files import write_whole
+
 
 def plain(value: Any) -> Any:
     """Return a value as JSON can hold it.
@@ -28,4 +30,4 @@ def plain(value: Any) -> Any:
 
 def write_json(path: Path, value: Any, *, indent: int = 2) -> None:
     """Write a value as JSON, null where a number is not finite; see `plain`."""
-    path.write_text(json.dumps(plain(value), indent=indent, allow_nan=False) + "\n", encoding="utf-8")
+    write_whole(path, json.dumps(plain(value), indent=indent, allow_nan=False) + "\n")

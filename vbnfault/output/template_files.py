@@ -9,6 +9,7 @@ from pathlib import Path
 
 from .. import faults, reflectance
 from ..core.errors import InputError, shown
+from ..core.whole_files import write_whole
 from ..detector import effects
 
 _FOLDER = Path(__file__).parent / "templates"
@@ -78,7 +79,7 @@ def write_template(kind: str, name: str, folder: Path, *, overwrite: bool = Fals
         raise InputError(f"{path}: exists already; --overwrite replaces it, or choose another name")
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        path.write_text(text.replace(f"My{kind.capitalize()}", class_name), encoding="utf-8")
+        write_whole(path, text.replace(f"My{kind.capitalize()}", class_name))
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from None
     return path

@@ -24,6 +24,7 @@ from ..core import environment, toml_files
 from ..core.errors import InputError, VbnfaultError, shown
 from ..core.interrupts import Stopped, exit_code, interruptible
 from ..core.tables import did_you_mean
+from ..core.whole_files import write_whole
 from ..dataset import BuildOptions
 from ..dataset.errors import Interrupted
 from ..dataset.processes import Pool
@@ -415,7 +416,7 @@ def merged(path: Path, table: SeverityTable) -> SeverityTable:
 
 def write_table(path: Path, table: SeverityTable) -> None:
     """Write a table of levels, with `nan` for levels that do not exist."""
-    path.write_text(toml_files.toml_text(table.model_dump(mode="python")), encoding="utf-8")
+    write_whole(path, toml_files.toml_text(table.model_dump(mode="python")))
 
 
 def lines_of(table: SeverityTable) -> list[str]:
