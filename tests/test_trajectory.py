@@ -392,7 +392,26 @@ def test_the_description_shows_names_dates_and_distances(tmp_path: Path, sphere:
     assert "samples: 5 at 3 of 3 sites, 1 to 2 at each" in text
     assert "trajectory: 5 of 5 rows of poses.csv, from near to last; a site stands for 2 rows side by side" in text
     assert "nearest ground: 99.6 to 29500 m from the camera" in text
+    assert "look past the body" not in text
     assert "Sun: 2.5 to 3.1 au away, dates 2457000.50000 to 2457001.25000 TDB" in text
+
+
+@pytest.mark.parametrize(
+    ("camera_from_T", "looks_past"),
+    [
+        ((0.5, 0.5, 0.5, -0.5), False),  # from +x at the body: boresight −x
+        ((0.5, 0.5, -0.5, 0.5), True),  # boresight +x
+        ((-0.5, 0.5, 0.5, 0.5), True),  # the first one with w last
+    ],
+)
+def test_the_description_warns_of_rows_that_look_past_the_body(
+    camera_from_T: tuple[float, ...], looks_past: bool, tmp_path: Path, sphere: str
+) -> None:
+    turned = dict(zip(("w", "x", "y", "z"), camera_from_T, strict=True))
+    values = {f"camera_from_T_{name}": value for name, value in turned.items()}
+    path = scene_file(tmp_path, sphere, [row("far", (30000.0, 0.0, 0.0), **values)])
+    text = "\n".join(dataset.describe_scene(config.load_scene(path), source="flown"))
+    assert ("1 of 1 rows look past the body, the first is far" in text) == looks_past
 
 
 def test_a_scene_made_in_python_has_the_samples_of_its_table(tmp_path: Path, sphere: str) -> None:

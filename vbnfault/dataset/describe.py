@@ -217,6 +217,26 @@ def _trajectory(session: Session, table: Trajectory) -> list[str]:
         f"{_span(*(ground.pixel_rad(session.scene) * range_m[[range_m.argmin(), range_m.argmax()]]))} m a pixel; "
         f"phase angle at the centre of mass {_span(min(phase), max(phase))} deg",
         f"Sun: {_span(distance.min(), distance.max())} au away, dates {date.min():.5f} to {date.max():.5f} TDB",
+        *_rows_that_miss_the_body(session, table, count),
+    ]
+
+
+def _rows_that_miss_the_body(session: Session, table: Trajectory, count: int) -> list[str]:
+    """Return a line about the rows in whose frames the sphere around the body cannot be; none without such rows."""
+    camera, body = session.scene.camera, session.body
+    half_width = np.tan(np.radians(camera.fov_deg) / 2)
+    half_diagonal = np.arctan(half_width * np.hypot(1, camera.height_px / camera.width_px))
+    radius_m = np.linalg.norm(body.vertices_m - body.centre_of_mass_T_m, axis=1).max()
+    to_body_m = body.centre_of_mass_T_m - table.camera_position_T_m[:count]
+    distance_m = np.maximum(np.linalg.norm(to_body_m, axis=1), radius_m)
+    boresight = np.stack([table.pose(k).T_from_C[:, 2] for k in range(count)])
+    cosine = np.clip((to_body_m * boresight).sum(axis=1) / distance_m, -1, 1)
+    past = np.flatnonzero(np.arccos(cosine) > half_diagonal + np.arcsin(radius_m / distance_m))
+    if not past.size:
+        return []
+    return [
+        f"warning: {len(past)} of {count} rows look past the body, the first is {table.name[past[0]]}; "
+        "camera_from_T takes the components of a vector from T to the camera's axes, w first"
     ]
 
 
