@@ -139,10 +139,11 @@ class ThinLens:
 
         Its power is E☉ T A cos θ at every field angle, the flux that the pupil admits.
         """
-        as_scene = self.on_axis(radiance)
-        shape = as_scene.array.shape[1:]
+        as_scene = self.on_axis(radiance).array
+        shape = as_scene.shape[1:]
         cos4 = cos4_map((int(shape[0]), int(shape[1])), self.focal_length_mm * 1e3 / pixel_pitch_um)
-        array = as_scene.array * cos4
+        array = buffers.empty(as_scene.shape, as_scene.dtype)
+        np.multiply(as_scene, cos4, out=array)
         if self.halo is not None:
             # in float64: the rounding errors of the Sun's disc may be as bright as the scene
             array = np.asarray(self.halo.applied(array.astype(np.float64), self.pixel_rad), dtype=np.float32)
