@@ -231,6 +231,13 @@ def test_dry_run_touches_nothing(tmp_path: Path) -> None:
     assert summary.lines()[1].startswith("estimated time: 2.0 h, ")
 
 
+def test_one_site_is_no_plural(tmp_path: Path) -> None:
+    values = {"path": tmp_path / "s.zarr", "finished": 0, "estimated_bytes": 10, "free_bytes": 100}
+    one, two = (bd.Summary(samples=n, shards=n, sites=n, **values).outlook()[0] for n in (1, 2))
+    assert ": 1 sample at 1 site in 1 shard, " in one
+    assert ": 2 samples at 2 sites in 2 shards, " in two
+
+
 @pytest.mark.parametrize("workers", [1, 2])
 def test_the_work_is_announced_and_stages_are_named(
     workers: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]

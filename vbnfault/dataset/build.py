@@ -242,7 +242,9 @@ class Summary:
 
     def outlook(self) -> list[str]:
         """Return lines that say what there is to do."""
-        head = f"{self._where}: {self.samples} samples at {self.sites} sites in {self.shards} shards"
+        numbers = ((self.samples, "sample"), (self.sites, "site"), (self.shards, "shard"))
+        samples, sites, shards = (f"{number} {noun}{'s' * (number != 1)}" for number, noun in numbers)
+        head = f"{self._where}: {samples} at {sites} in {shards}"
         size = f"about {size_text(self.estimated_bytes)}"
         if self.free_bytes != sys.maxsize:
             size += f", {size_text(self.free_bytes)} free"
