@@ -488,6 +488,12 @@ def test_a_file_that_cannot_be_written_keeps_its_content(name: str, tmp_path: Pa
         assert path.read_bytes() != b"mine"
 
 
+@pytest.mark.parametrize("key", ["body.shape", "body.albedo_map.file", "trajectory.file", "severity.file"])
+def test_a_file_without_a_name_is_not_the_working_folder(key: str) -> None:
+    with pytest.raises(InputError, match=rf"{key} = '': must be a string that is not empty"):
+        config.load_scene("quickstart", {key: ""})
+
+
 def test_texts_of_the_command_line_that_are_no_unicode_are_refused() -> None:
     for key in ("title", "body.shape", "dataset.citation"):
         with pytest.raises(InputError, match=rf"{key} = .*udcff.*: must be text in UTF-8"):

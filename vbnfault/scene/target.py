@@ -52,10 +52,11 @@ class AlbedoMapTable(Table):
     """
 
     file: str = Field(
+        min_length=1,
         description="PNG or TIFF file, grey or RGB, 8, 16 or 32 bits, twice as wide as high if it is "
         "equirectangular; or 'earth': a "
         "procedural Earth with oceans, continents, ice and clouds, sharp at any distance, whose mean albedo is "
-        "that of [body]"
+        "that of [body]",
     )
     projection: Literal["equirectangular", "cylindrical_equal_area"] = Field(
         "equirectangular",
@@ -109,6 +110,7 @@ class BodyTable(Table):
     )
     shape: str = Field(
         "embedded",
+        min_length=1,
         description="'embedded', 'ellipsoid', or a shape file: OBJ, PLY, STL, GLB, PDS TAB, ICQ, WRL, BDS",
     )
     unit: Literal["auto", "m", "km"] = Field("auto", description="of the shape file; auto: from its size")
