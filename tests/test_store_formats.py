@@ -252,6 +252,9 @@ def test_the_command_says_what_it_did_and_refuses_in_one_sentence(
     assert capsys.readouterr().out == f"{old}: 5 samples, format 3, was 2\n"
     assert run(monkeypatch, "migrate", old) == 0
     assert capsys.readouterr().out == f"{old}: 5 samples, format 3, was 3\n"
+    shutil.rmtree(old / "done" / "c")
+    assert run(monkeypatch, "migrate", old) == 0
+    assert capsys.readouterr().out == f"{old}: 5 samples, 0 finished, format 3, was 3\n"
 
 
 # --- codecs -------------------------------------------------------------------------------------------------

@@ -217,7 +217,9 @@ def migrate(
         length = opened.samples
     with progress_bar(length, "samples") as bar:
         migrated = migrate_store(store, out, progress=bar.update)
-    typer.echo(f"{migrated.path}: {migrated.samples} samples, format {migrated.spec.format_version}, was {before}")
+    finished = migrated.finished()
+    samples = f"{migrated.samples} samples" + ("" if finished == migrated.samples else f", {finished} finished")
+    typer.echo(f"{migrated.path}: {samples}, format {migrated.spec.format_version}, was {before}")
 
 
 @app.command(rich_help_panel=_PANEL)
