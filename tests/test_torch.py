@@ -182,6 +182,15 @@ def test_a_state_of_another_order_is_refused(finished_store: Path) -> None:
         Loader(batches(finished_store, batch_size=3)).load_state_dict(state)
 
 
+@pytest.mark.parametrize("epoch", [-1, 10**30, 1.0, "x", None, True])
+def test_an_epoch_that_is_none_is_refused_at_once(finished_store: Path, epoch: Any) -> None:
+    made = data(finished_store)
+    for of in (made, ShardSampler(made), batches(finished_store), Loader(batches(finished_store))):
+        with pytest.raises(InputError, match=r"^epoch = .*: must be a whole number from 0 to 2⁶³ - 1$"):
+            of.set_epoch(epoch)
+        of.set_epoch(np.int64(3))
+
+
 def test_options_that_belong_elsewhere_are_refused(finished_store: Path) -> None:
     with pytest.raises(InputError, match="shuffle: a Loader takes it from its BatchDataset; give it there"):
         Loader(batches(finished_store), shuffle=True)

@@ -116,8 +116,9 @@ def test_a_state_continues_its_own_order_only() -> None:
     ):
         with pytest.raises(InputError, match=says):
             order(**changes).position(state)
-    with pytest.raises(InputError, match="must hold epoch and batch"):
-        order().position({"epoch": -1})
+    for wrong in ({"epoch": -1, "batch": 0}, {"epoch": 10**30, "batch": 0}, {"epoch": 0, "batch": True}, {}):
+        with pytest.raises(InputError, match="must hold epoch and batch"):
+            order().position(state | {"epoch": None} | wrong)
 
 
 # --- selection ----------------------------------------------------------------------------------------------

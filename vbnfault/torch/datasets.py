@@ -21,6 +21,7 @@ from ..core import environment
 from ..core.errors import InputError, shown
 from ..store import open_store
 from ..train import Columns, Order, SampleReader, Targets, select
+from ..train.order import checked_epoch
 from ..train.selection import Where
 from .slots import Slots
 
@@ -105,8 +106,11 @@ class SampleDataset(Dataset[Batch]):
         return self.targets.classes
 
     def set_epoch(self, epoch: int, seed: int = 0) -> None:
-        """Say which epoch begins, for the random numbers of `transform`; `ShardSampler` and `Loader` do so."""
-        self._epoch[0], self.seed = epoch, seed
+        """Say which epoch begins, for the random numbers of `transform`; `ShardSampler` and `Loader` do so.
+
+        Raises InputError if it is no whole number from 0 to 2⁶³ - 1, as in the other classes.
+        """
+        self._epoch[0], self.seed = checked_epoch(epoch), seed
 
     def __len__(self) -> int:
         """Return the number of samples."""
@@ -220,7 +224,7 @@ class ShardSampler(Sampler[list[int]]):
 
     def set_epoch(self, epoch: int) -> None:
         """Choose the order of an epoch."""
-        self.epoch, self._start = epoch, 0
+        self.epoch, self._start = checked_epoch(epoch), 0
 
     def state_dict(self, batches: int) -> dict[str, Any]:
         """Return the state after the training loop has used `batches` batches of this epoch.
@@ -280,7 +284,7 @@ class BatchDataset(IterableDataset[Batch]):
 
     def set_epoch(self, epoch: int, batch: int = 0) -> None:
         """Choose the epoch, and its first batch, of the next iteration."""
-        self._position[0], self._position[1] = epoch, batch
+        self._position[0], self._position[1] = checked_epoch(epoch), batch
 
     def state_dict(self, batches: int = 0) -> dict[str, Any]:
         """Return the state after the training loop has used `batches` batches since `set_epoch`."""

@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from ..core.errors import InputError, VbnfaultError, shown
+from ..train.order import checked_epoch
 from .datasets import Batch, BatchDataset
 from .slots import Failure, Packed, Slots, slot_size
 
@@ -88,7 +89,7 @@ class Loader:
 
     def set_epoch(self, epoch: int) -> None:
         """Choose the epoch of the next iteration."""
-        self.epoch, self._next, self._resumes = epoch, 0, False
+        self.epoch, self._next, self._resumes = checked_epoch(epoch), 0, False
 
     def state_dict(self) -> dict[str, Any]:
         """Return plain data from which `load_state_dict` continues with the batch after the last one received."""

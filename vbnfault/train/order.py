@@ -15,7 +15,7 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
@@ -129,8 +129,8 @@ class Order:
     def position(self, state: Mapping[str, Any]) -> tuple[int, int]:
         """Return epoch and next batch of a state. Raises InputError if it is of another order."""
         epoch, batch = state.get("epoch"), state.get("batch")
-        if not (isinstance(epoch, int) and isinstance(batch, int) and epoch >= 0 and batch >= 0):
-            raise InputError("state: it must hold epoch and batch, whole numbers of at least 0")
+        if not (is_count(epoch) and is_count(batch)):
+            raise InputError("state: it must hold epoch and batch, whole numbers from 0 to 2⁶³ - 1")
         for name in _OF_STATE:
             saved, own = state.get(name), getattr(self, name)
             if saved != own:
@@ -138,3 +138,16 @@ class Order:
                     raise InputError("state: it belongs to other samples; choose the same store, split and filter")
                 raise InputError(f"state: its {name} = {shown(saved)}, but here {name} = {shown(own)}")
         return epoch, batch
+
+
+def is_count(value: object) -> TypeGuard[int]:
+    """Return whether a value is a whole number of at least 0 that fits 64 bits, as epochs and batches are."""
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**63
+
+
+def checked_epoch(epoch: int) -> int:
+    """Return the number of an epoch. Raises InputError if it is no whole number from 0 to 2⁶³ - 1."""
+    number = int(epoch) if isinstance(epoch, np.integer) else epoch
+    if not is_count(number):
+        raise InputError(f"epoch = {shown(epoch)}: must be a whole number from 0 to 2⁶³ - 1")
+    return number
