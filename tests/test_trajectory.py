@@ -414,6 +414,22 @@ def test_the_description_warns_of_rows_that_look_past_the_body(
     assert ("1 of 1 rows look past the body, the first is far" in text) == looks_past
 
 
+@pytest.mark.parametrize(("radii", "looks_past"), [(0.8, False), (1.2, True)])
+def test_a_row_that_shows_the_rim_of_the_body_looks_not_past_it(
+    radii: float, looks_past: bool, tmp_path: Path, sphere: str
+) -> None:
+    """The body's centre lies so many of its angular radii beyond the corner of the frame."""
+    corner = np.arctan(np.tan(np.radians(40.0 / 2)) * np.hypot(1, 32 / 40))
+    half = 0.5 * (corner + radii * np.arcsin(RADIUS_M / 8000.0))
+    w, x, y, z = 0.5, 0.5, 0.5, -0.5  # from +x at the body, then turned about the camera's y
+    c, s = np.cos(half), np.sin(half)
+    turned = {"w": c * w - s * y, "x": c * x + s * z, "y": c * y + s * w, "z": c * z - s * x}
+    values = {f"camera_from_T_{name}": float(value) for name, value in turned.items()}
+    path = scene_file(tmp_path, sphere, [row("near", (8000.0, 0.0, 0.0), **values)])
+    text = "\n".join(dataset.describe_scene(config.load_scene(path), source="flown"))
+    assert ("1 of 1 rows look past the body" in text) == looks_past
+
+
 def test_a_scene_made_in_python_has_the_samples_of_its_table(tmp_path: Path, sphere: str) -> None:
     path = scene_file(tmp_path, sphere)
     scene = small(sphere).model_copy(update={"trajectory": config.load_scene(path).trajectory})
