@@ -508,3 +508,9 @@ def test_an_interrupt_keeps_the_sample_that_is_being_encoded(tmp_path: Path) -> 
         )
     assert built == [0]
     assert store.done(0) == {0: True, 1: True, 2: False, 3: False}
+
+
+def test_the_root_of_the_file_system_has_no_held_lock(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It has no name, so its lock is named ..lock; a random command line with `--out /` ended in a traceback."""
+    monkeypatch.setattr(os, "listdir", lambda _: ["..lock", "bin"])
+    assert list(lock._held_locks(Path("/"))) == []

@@ -378,6 +378,21 @@ def test_unknown_metrics_and_columns_of_one_name_are_refused(tmp_path: Path) -> 
             run.run_study(kit.spec(**tables), tmp_path / "s", QUIET, report=False, evaluator=kit.Function)
 
 
+def test_a_folder_that_holds_something_else_is_left_alone(tmp_path: Path) -> None:
+    """What a study leaves that was killed as it began is no hindrance."""
+    folder = tmp_path / "s"
+    (folder / "rows").mkdir(parents=True)
+    for name in ("study.toml", ".identity.json.1.partial", "rows/.0.1.partial"):
+        (folder / name).touch()
+    (folder / "photos").mkdir()
+    with pytest.raises(InputError, match=r"s: holds something else than a study of vbnfault, so it is left alone"):
+        run.run_study(kit.spec(), folder, QUIET, report=False, evaluator=kit.Function)
+    assert len(list(folder.rglob("*"))) == 5
+    (folder / "photos").rmdir()
+    run.run_study(kit.spec(), folder, QUIET, report=False, evaluator=kit.Function)
+    assert (folder / "identity.json").exists()
+
+
 def test_a_folder_of_another_study_is_refused(spec: StudySpec, reference: Path) -> None:
     other = spec.model_copy(update={"design": spec.design.model_copy(update={"n": 64})})
     with pytest.raises(InputError, match=r"holds another study: design.n = 32 \(now 64\); choose another --out"):

@@ -121,15 +121,16 @@ class _HeldLock(NamedTuple):
 def _held_locks(path: Path) -> Iterator[_HeldLock]:
     """Yield the locks of the store at `path` that a process holds, this one's too, and remove abandoned files."""
     own = re.compile(rf"\.{re.escape(path.name)}(?:\.shards-(\d+)-(\d+))?\.(lock|owner)")
+    folder = path.absolute().parent
     try:
-        names = sorted(os.listdir(path.absolute().parent))
+        names = sorted(os.listdir(folder))
     except OSError:  # a folder that this user may not list: only the lock of the whole is taken there
         return
     for name in names:
         match = own.fullmatch(name)
         if match is None:
             continue
-        file = path.absolute().with_name(name)
+        file = folder / name
         is_held = _is_locked(file) if match[3] == "lock" else not has_ended(_read_owner(file))
         if is_held:
             yield _HeldLock(range(int(match[1]), int(match[2])) if match[1] else None, file)

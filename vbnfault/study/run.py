@@ -353,9 +353,16 @@ def _identity(
 
 def _prepare_folder(path: Path, spec: StudySpec, identity: Mapping[str, Any]) -> None:
     """Make the folder of a study, or check that it holds this study. Raises InputError."""
+    record = path / "identity.json"
     with _writing(path):
+        if path.is_dir() and not record.exists():
+            own = {"rows", "study.toml", *(file.name for file in results.partial_files(path))}  # of a begun study
+            if any(entry.name not in own for entry in path.iterdir()):
+                raise InputError(
+                    f"{path}: holds something else than a study of vbnfault, so it is left alone; choose another "
+                    "--out"
+                )
         (path / "rows").mkdir(parents=True, exist_ok=True)
-        record = path / "identity.json"
         if record.exists():
             try:
                 stored = json.loads(record.read_text(encoding="utf-8"))
