@@ -77,7 +77,7 @@ def test_a_path_to_write_is_no_url() -> None:
     seen = 0
     for command, option in options():
         if option.name in ("out", "json_", "toml") and command not in stores and not option.is_flag:
-            for url in ("s3://bucket/x.png", "file:///tmp/x"):
+            for url in ("s3://bucket/x.png", "file:///data/x"):
                 shown = CliRunner().invoke(cli.app, [command, option.opts[0], url])
                 assert isinstance(shown.exception, InputError), (command, option.name)
                 start = f"{option.opts[0]} {url.split(':')[0]}://"

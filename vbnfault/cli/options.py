@@ -59,7 +59,7 @@ def number(low: float, high: float, text: str, *names: str, unset: str | None = 
 
 
 def on_this_machine(param: typer.CallbackParam, value: Path | None) -> Path | None:
-    """Return an option's path. Refuses a URL, of which a folder such as `s3:` would be made. Raises InputError."""
+    """Return the path that an option was given. Raises InputError for a URL such as s3://bucket."""
     scheme, colon, rest = str(value or "").partition(":/")  # a path keeps one of two slashes
     if colon and re.fullmatch(r"[A-Za-z][A-Za-z0-9+.-]+", scheme):
         raise InputError(f"{param.opts[0]} {scheme}://{rest}: is a URL; must be a path on this machine")
@@ -196,7 +196,7 @@ def load_plugins(names: list[str] | None) -> None:
 
 
 def progress_bar(length: int, label: str) -> Any:
-    """Return a progress bar on standard error, a context whose `update` takes the steps that were done.
+    """Return a progress bar on standard error: a context manager whose `update` takes the steps just done.
 
     Without a length, or where standard error is no terminal, it shows nothing; click would print the label alone.
     """

@@ -50,8 +50,10 @@ def toml_text(table: Mapping[str, Any]) -> str:
 
 
 def check_plain(table: Mapping[str, Any], source: str) -> None:
-    """Check that plain data is nested at most 24 deep and holds neither a whole number of more than 64 bits
-    nor a text that is no Unicode, which the command line may give.
+    """Check that plain data can be written as TOML.
+
+    It must be nested at most 24 deep, its whole numbers must fit 64 bits, and its texts must be Unicode. A text of
+    the command line may be none.
 
     Raises InputError; the message begins with `source`.
     """

@@ -222,7 +222,7 @@ def _trajectory(session: Session, table: Trajectory) -> list[str]:
 
 
 def _rows_that_miss_the_body(session: Session, table: Trajectory, count: int) -> list[str]:
-    """Return a line about the rows in whose frames the sphere around the body cannot be; none without such rows."""
+    """Return a warning of the rows whose frames cannot show the sphere around the body; [] if there are none."""
     camera, body = session.scene.camera, session.body
     half_width = np.tan(np.radians(camera.fov_deg) / 2)
     half_diagonal = np.arctan(half_width * np.hypot(1, camera.height_px / camera.width_px))

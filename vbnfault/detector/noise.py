@@ -118,7 +118,7 @@ def normal_field(shape: tuple[int, ...], rng: np.random.Generator) -> F32:
 
 
 def variates_of(codes: NDArray[np.uint16]) -> F32:
-    """Return the standard normal variates of 16 bit uniform numbers, none outermost, float32 of their shape."""
+    """Return the normal variates of 16 bit uniform numbers, which exclude the least and the greatest, float32."""
     return _normal_table()[codes]
 
 

@@ -66,7 +66,7 @@ def noise_limits(
 def values_to_develop(
     signal: F32, shot: NormalField | None, read: NormalField | None, limits: Limits | None
 ) -> NDArray[np.intp] | None:
-    """Return the flat indices of the values that may be lit or differ from 0, intp[n]; None to develop all values.
+    """Return the flat indices of the values that must be developed, intp[n]; None for all values.
 
     Without variates these are the lit values. All are developed if those chosen are too many, or if there are
     variates but no limits for them.

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
-import uuid
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -17,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..core.errors import InputError
+from ..core.whole_files import replacing
 from .designs import Design
 from .distributions import Categorical
 from .spec import DUMMY, Metric
@@ -151,33 +150,6 @@ def open_indices(folder: str | Path) -> xr.Dataset:
         raise InputError(f"{path}: no such folder; a study writes it when it is complete")
     with xr.open_zarr(path, consolidated=False) as stored:
         return stored.load()
-
-
-class replacing:
-    """Write a file or folder under a temporary name beside it, and rename it at the end of a `with` block."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.partial")
-
-    def __enter__(self) -> Path:
-        return self._temporary
-
-    def __exit__(self, kind: Any, *_: object) -> None:
-        if kind is not None:
-            remove(self._temporary)
-            return
-        if self._path.is_dir():
-            shutil.rmtree(self._path)
-        os.replace(self._temporary, self._path)
-
-
-def remove(path: Path) -> None:
-    """Remove a file or a folder, if it exists."""
-    if path.is_dir():
-        shutil.rmtree(path, ignore_errors=True)
-    else:
-        path.unlink(missing_ok=True)
 
 
 # --- finished rows, chunk by chunk ------------------------------------------------------------------------------

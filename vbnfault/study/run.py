@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .. import __version__
-from ..core import environment, file_contents, tables, toml_files
+from ..core import environment, file_contents, tables, toml_files, whole_files
 from ..core.errors import InputError, VbnfaultError, shown
 from ..core.interrupts import Stopped, exit_code, finishing, interruptible
 from ..dataset import BuildOptions
@@ -372,11 +372,10 @@ def _prepare_folder(path: Path, spec: StudySpec, identity: Mapping[str, Any]) ->
             if different:
                 raise InputError(f"{path}: holds another study: {different}; choose another --out")
         for partial_file in results.partial_files(path):
-            results.remove(partial_file)
+            whole_files.remove(partial_file)
         if not record.exists():
-            (path / "study.toml").write_text(toml_files.toml_text(spec.resolved()), encoding="utf-8")
-            with results.replacing(record) as temporary:
-                temporary.write_text(json.dumps(identity, indent=1), encoding="utf-8")
+            whole_files.write_whole(path / "study.toml", toml_files.toml_text(spec.resolved()))
+            whole_files.write_whole(record, json.dumps(identity, indent=1))
 
 
 @contextlib.contextmanager

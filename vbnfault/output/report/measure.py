@@ -218,7 +218,7 @@ def key_bounds(bounds: Mapping[str, Mapping[str, tuple[float, float]]], drawn: D
 
 
 def key_unit(models: Mapping[str, str], drawn: Drawn) -> str:
-    """Return the unit of the key that a parameter belongs to; "" without one, and for a model that is not loaded.
+    """Return the unit of the key that a parameter belongs to; "" if it has none or the model is not loaded.
 
     `models` holds the model of each fault class of a store.
     """
