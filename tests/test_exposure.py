@@ -120,3 +120,14 @@ def test_electrons_of_a_second_are_the_rate() -> None:
     quarter = camera.detector.electrons_expected(camera.lens.image(light), 0.25)
     np.testing.assert_allclose(quarter.array, 0.25 * rate.array, rtol=1e-6)
     assert dataclasses.replace(camera, exposure_s=9.0).expose(light, 0.25).array.max() == quarter.array.max()
+
+
+@pytest.mark.parametrize("detector", ["", "cmv4000"])
+def test_a_view_without_ground_is_foreseen_at_the_references_exposure(detector: str) -> None:
+    """The ground of a view whose frame is all sky has no pixels, which both detectors must accept."""
+    scene = parsed(camera={"detector": detector} if detector else {})
+    camera = assemble.base_camera(scene)
+    sky = SimpleNamespace(semantic=np.full((32, 32), SKY, dtype=np.uint8))
+    view = SimpleNamespace(intrinsics=(40.0, 40.0, 16.0, 16.0), width_px=32, height_px=32)
+    foreseen = exposure.foreseen_exposure_s(scene, camera, sky, view, facet(scene))
+    assert foreseen == exposure.reference_exposure_s(scene, camera)

@@ -243,6 +243,8 @@ def electrons_of(irradiance: Irradiance, weights: F32) -> F32:
             for band, weight in zip(energy[1:], row[1:], strict=True):
                 total += band * weight
             colours.append(total)
+        if not colours[0].size:  # of a frame without ground; OpenCV refuses empty arrays
+            return np.empty((*colours[0].shape, len(colours)), dtype=np.float32)
         return cv2.merge(colours).reshape(*colours[0].shape, len(colours))
 
     return np.asarray(blockwise(step, np.moveaxis(irradiance.array, 0, 1)))
