@@ -333,3 +333,21 @@ def test_site_bounds() -> None:
             choose_sites(body, *arguments)
     with pytest.raises(InputError, match="max_slope_deg"):
         choose_sites(body, 1, 0, max_slope_deg=120.0)
+
+
+@pytest.mark.parametrize(
+    ("period_s", "slope_deg", "must_say"),
+    [
+        (60.0, 35.0, ["spin is faster than gravity holds", "rotation_period_h = 0.0166667", "density_kg_m3 = 500"]),
+        (1e6, 0.01, ["slope by more than 0.01 degrees; smooth the shape"]),
+    ],
+)
+def test_ground_that_is_nowhere_level_is_refused_with_its_reason(
+    period_s: float, slope_deg: float, must_say: list[str]
+) -> None:
+    """A fast body lifts its ground off; on a slow one the facets themselves are too steep."""
+    vertices, faces = box()
+    body = Body(name="brick", vertices_m=vertices, faces=faces, density_kg_m3=500.0, rotation_period_s=period_s)
+    with pytest.raises(InputError) as caught:
+        choose_sites(body, 4, seed=1, max_slope_deg=slope_deg)[2]
+    assert [words for words in ["brick: none of 1000", "site 2", *must_say] if words not in str(caught.value)] == []

@@ -144,6 +144,7 @@ def choose_sites(body: Body, count: int, seed: int, *, max_slope_deg: float = MA
 
 def _draw(body: Body, index: int, seed: int, normals: Float64, cumulative: Float64, cos_bound: float) -> Site:
     """Return the first drawn position of a site whose facet is not too steep."""
+    lifted = 0  # draws where the spin throws off what lies there
     for attempt in range(_ATTEMPTS):
         rng = np.random.Generator(np.random.Philox(np.random.SeedSequence((seed, _STREAM, index, attempt))))
         pick, u, v = rng.random(3)
@@ -151,8 +152,17 @@ def _draw(body: Body, index: int, seed: int, normals: Float64, cumulative: Float
         root = np.sqrt(u)
         weights = np.array([1.0 - root, root * (1.0 - v), root * v])
         site = site_at(body, index, np.sum(weights[:, None] * body.vertices_m[body.faces[face]], axis=0))
-        if -np.sum(normals[face] * site.T_from_L[:, 2]) >= cos_bound:
+        up = -float(np.sum(normals[face] * site.T_from_L[:, 2]))
+        if up >= cos_bound:
             return site
-    raise InputError(
-        f"{body.name}: no place for site {index} in {_ATTEMPTS} draws; raise max_slope_deg (at most 90)."
+        lifted += up < 0
+    found = (
+        f"{body.name}: none of {_ATTEMPTS} random positions is level enough for site {index}: all slope by more "
+        f"than {np.degrees(np.arccos(cos_bound)):g} degrees"
     )
+    if 2 * lifted > _ATTEMPTS:
+        raise InputError(
+            f"{found}, since at {lifted} of them the spin is faster than gravity holds: body.rotation_period_h = "
+            f"{body.rotation_period_s / 3600:g}, body.density_kg_m3 = {body.density_kg_m3:g}; raise one of them"
+        )
+    raise InputError(f"{found}; smooth the shape")
