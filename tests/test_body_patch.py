@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
 from scipy import stats
 
-from vbnfault.body import Body, Patch, PatchSpec, Site, boulders, build_patch, choose_sites, load_body
+from vbnfault.body import Body, Patch, PatchSpec, Site, boulders, build_patch, choose_sites, load_body, refine
 from vbnfault.body.boulders import PER_KM2, SizeLaw, scatter, smallest_at
 from vbnfault.body.shape import check_mesh, signed_volume
 from vbnfault.core.errors import InputError
@@ -268,3 +269,27 @@ def test_real_shape_patch_is_closed() -> None:
     assert signed_volume(patch.vertices_L_m, patch.faces[~patch.face_is_boulder]) == pytest.approx(
         real.volume_m3, rel=2e-3
     )
+
+
+@pytest.mark.parametrize("radius_m", [40.0, 400.0, 1e8])
+def test_fine_facets_all_over_a_body_are_foreseen_without_making_them(
+    radius_m: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The default facets over 4e6 m² or more would be 6e8 triangles: the limit grows, and no mesh is that large."""
+    made: list[int] = []
+    refined = refine.refine
+
+    def counted(*model: Any) -> Any:
+        mesh = refined(*model)
+        made.append(len(mesh[2]))
+        return mesh
+
+    monkeypatch.setattr(refine, "refine", counted)
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=600.0)
+    points = np.array(ball.vertices) - [600.0, 0.0, 0.0]
+    model = (points, np.array(ball.vertices) / 600.0, np.array(ball.faces))
+    budget = 50_000
+    limit = refine.affordable(refine.EdgeLimit(0.12, radius_m), model, budget)
+    assert max(made) < 10 * budget
+    # edges are halved, so that the number of triangles goes by steps of up to a factor of two on either side
+    assert budget / 2 < len(refined(*model, limit)[2]) < 2 * budget

@@ -16,6 +16,7 @@ LIMIT_PER_TARGET = 1.6
 # number of triangles per octave of distance then falls as the distance to the power -0.2, until the body ends.
 GROWTH_POWER = 1.1
 _PROBE = 4.0  # the number of triangles is predicted with facets coarser by this factor, which is much faster
+_PROBE_BUDGETS = 4.0  # or by a larger one, if that could take more than this many times the triangles allowed
 # A midpoint may leave the chord by at most this fraction of the edge, so that cliffs do not bulge.
 _MAX_BULGE = 0.06
 
@@ -49,13 +50,40 @@ class EdgeLimit:
 
 
 def affordable(limit: EdgeLimit, model: tuple[Float64, Float64, Int32], budget: int) -> EdgeLimit:
-    """Return the limit itself, or a coarser one that keeps the ground within about `budget` triangles."""
-    coarse = EdgeLimit(_PROBE * limit.facet_m, limit.radius_m)
+    """Return the limit itself, or a coarser one that keeps the ground within about `budget` triangles.
+
+    The prediction itself takes a few times `budget` triangles at most, however small the facets are.
+    """
     before = len(model[2])
-    added = (len(refine(*model, coarse)[2]) - before) * _PROBE**2
-    if before + added <= budget:
+    excess = _most_triangles(limit, model) / (_PROBE**2 * _PROBE_BUDGETS * budget)
+    probe = _PROBE * 2.0 ** max(int(np.ceil(np.log2(max(excess, 1.0)) / 2)), 0)
+    while True:
+        coarse = EdgeLimit(probe * limit.facet_m, limit.radius_m)
+        added = len(refine(*model, coarse)[2]) - before
+        if probe <= _PROBE or added > budget:
+            break
+        probe /= 2  # these facets are too coarse to predict the number of finer ones
+    wanted = added * probe**2
+    if before + wanted <= budget:
         return limit
-    return EdgeLimit(limit.facet_m * float(np.sqrt(added / (budget - before))), limit.radius_m)
+    return EdgeLimit(limit.facet_m * float(np.sqrt(wanted / (budget - before))), limit.radius_m)
+
+
+def _most_triangles(limit: EdgeLimit, model: tuple[Float64, Float64, Int32]) -> float:
+    """Return a number of triangles that refining a model hardly exceeds.
+
+    All of a face gets facets as small as those at its point nearest the site.
+    """
+    points, _, faces = model
+    corners = points[faces]
+    centre = corners.mean(axis=1)
+    extent = np.sqrt(np.max(np.sum((corners - centre[:, None]) ** 2, axis=2), axis=1))
+    nearest = np.maximum(np.sqrt(np.sum(centre**2, axis=1)) - extent, 0.0)
+    area = 0.5 * np.sqrt(
+        np.sum(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) ** 2, axis=1)
+    )
+    facet = limit.facet_at(np.column_stack([nearest, np.zeros((len(nearest), 2))]))
+    return float(np.sum(area / (np.sqrt(3) / 4 * facet**2)))
 
 
 def refine(points: Float64, normals: Float64, faces: Int32, limit: EdgeLimit) -> tuple[Float64, Float64, Int32]:
