@@ -151,7 +151,7 @@ def test_another_scene_is_refused_and_says_what_differs(tmp_path: Path) -> None:
     before = st.digest(out)
     scene = {
         "scene": {"body": {"name": "1P"}, "samples": 10, "sun": {"deg": [1, 2]}},
-        "scene_hash": "xyz",
+        "fault_models": {"straylight": "xyz"},
         "seed": 7,
     }
     with pytest.raises(InputError) as e:
@@ -171,13 +171,32 @@ def test_another_scene_is_refused_and_says_what_differs(tmp_path: Path) -> None:
         run(tmp_path / "b.zarr", spec=make_spec(attributes=nested))
     assert "detector.effects[0].level is 1 in the store and 2 now" in str(deep.value)
     assert "and whose end is another' now" in str(deep.value)
-    assert str(e.value).index("scene.body") < str(e.value).index("scene_hash")
+    assert str(e.value).index("scene.body") < str(e.value).index("fault_models")
     with pytest.raises(InputError, match="height is 24 in the store and 32 now"):
         run(out, spec=make_spec(32, width=32))
     run(out, spec=make_spec(attributes={**make_spec().attributes, "created": "2031"}))
     assert st.digest(out) == before
     run(out, spec=make_spec(attributes=scene), overwrite=True)
     assert st.digest(out) != before
+
+
+def test_free_texts_of_a_scene_do_not_hinder_a_resume(tmp_path: Path) -> None:
+    def attributes(text: str, **tables: object) -> dict[str, object]:
+        texts = dict.fromkeys(("title", "description", "licence", "citation", "scene_hash"), text)
+        scene = {"title": text, "description": text, "dataset": {"seed": 7, "licence": text, "citation": text}}
+        return {**texts, "scene": {**scene, **tables}, "seed": 7}
+
+    def retaken(text: str, **tables: object) -> dict[str, object]:
+        return {**attributes(text), "retake": {"repeats": 1, "source": attributes(text, **tables)}}
+
+    out = tmp_path / "s.zarr"
+    with pytest.raises(bd.BuildFailed):
+        run(out, Session(raises=frozenset({5})), spec=make_spec(attributes=retaken("before")))
+    for others in (retaken("now", camera={"fov_deg": 9}), {**retaken("now"), "fault_models": {"adc": "now"}}):
+        with pytest.raises(InputError, match=r"holds another dataset: [^;]*; choose another --out"):
+            run(out, spec=make_spec(attributes=others))
+    assert run(out, spec=make_spec(attributes=retaken("now"))).built == 1
+    assert st.open_store(out).attributes["scene"]["title"] == "before"
 
 
 def test_a_store_of_other_versions_is_completed_on_request_and_says_by_whom(

@@ -69,7 +69,7 @@ def check_same_scene(
     `accept_versions`: other versions of the libraries are no difference.
     """
     differing = list(differences(_compared(store.spec), _compared(spec)))
-    if differing and all(d.key.startswith("versions.") or d.key == "scene_hash" for d in differing):
+    if differing and all(d.key.startswith("versions.") for d in differing):
         if not accept_versions and spec.attributes.get("versions") not in versions.known(store.attributes):
             changed = versions.differences(store.attributes, spec.attributes)
             raise InputError(
@@ -127,6 +127,10 @@ _NOT_COMPARED = {
     "format_version",
     *store_module.VOLATILE_ATTRIBUTES,
 }
+# Free texts, which no pixel depends on, and the tables that have them: the attributes themselves, their scene with
+# its table `dataset`, and, in a store that was taken again, what is known of the other store.
+_TEXTS = {"title", "description", "licence", "citation", "scene_hash"}
+_HOLDERS_OF_TEXTS = ("scene", "dataset", "retake", "source")
 
 
 _ABSENT = object()
@@ -162,7 +166,16 @@ def _part(text: str, start: int) -> str:
 def _compared(spec: StoreSpec) -> dict[str, Any]:
     """Return what a store and a scene must have in common, as plain data."""
     everything = json.loads(json.dumps({**spec.attributes, **spec.data}))
-    return {key: value for key, value in everything.items() if key not in _NOT_COMPARED}
+    return _without_texts({key: value for key, value in everything.items() if key not in _NOT_COMPARED})
+
+
+def _without_texts(attributes: dict[str, Any]) -> dict[str, Any]:
+    """Return attributes, or a table of them, without free texts and without the hash of the scene that has them."""
+    kept = {key: value for key, value in attributes.items() if key not in _TEXTS}
+    for key in _HOLDERS_OF_TEXTS:
+        if isinstance(kept.get(key), dict):
+            kept[key] = _without_texts(kept[key])
+    return kept
 
 
 def differences(stored: Any, wanted: Any, key: str = "") -> Iterator[Difference]:
