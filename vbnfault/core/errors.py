@@ -5,6 +5,9 @@ Each message is one sentence. The errors hold plain strings only, so that they c
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 # The most characters of a message and of a value. Any key, value and allowed range are shorter. A longer text, such
 # as a value in a user's file, loses its middle.
 _LONGEST_MESSAGE = 2000
@@ -29,6 +32,28 @@ class InputError(VbnfaultError):
 
 class InputChanged(VbnfaultError):
     """Report that a file has changed since the run that reads it began."""
+
+
+@contextmanager
+def in_file(source: str) -> Iterator[None]:
+    """Let every InputError of the block begin with the name of the file that is read."""
+    try:
+        yield
+    except InputError as error:
+        if f"{error}".startswith(f"{source}: "):
+            raise
+        raise InputError(f"{source}: {error}") from None
+
+
+@contextmanager
+def under_key(key: str) -> Iterator[None]:
+    """Let every InputError of the block begin with a key such as `body.shape`, or with another of its table."""
+    try:
+        yield
+    except InputError as error:
+        if f"{error}".startswith(f"{key.partition('.')[0]}."):
+            raise
+        raise InputError(f"{key}: {error}") from None
 
 
 def shown(value: object) -> str:

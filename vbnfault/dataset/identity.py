@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from .. import __version__, pipeline, reflectance, store
 from ..camera import Camera
 from ..core import file_contents, llvm, resources, user_files
-from ..core.errors import InputError, VbnfaultError
+from ..core.errors import InputError, VbnfaultError, in_file
 from ..detector import Detector
 from ..faults import Fault, belongs_here, is_packaged, plugins_of, registry
 from ..lens import load_lens
@@ -66,6 +66,12 @@ def scene_identity(session: pipeline.Session) -> dict[str, Any]:
 
     The result omits the number of samples, because the identity must not change when samples are appended.
     """
+    with in_file(session.source):
+        return _identity(session)
+
+
+def _identity(session: pipeline.Session) -> dict[str, Any]:
+    """Return what `scene_identity` does; the messages of its errors do not name the scene."""
     scene = session.scene.resolved()
     scene["body"]["shape_sha256"] = session.body.content_hash
     if session.scene.body.shape not in ("embedded", "ellipsoid"):

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..camera import Camera
+from ..core.errors import under_key
 from ..core.quantities import RGBI, Charge, Electrons, Offset, Quantity, RawMosaic, RimRows, soft_kind
 from ..core.registry import DeclarationError
 from ..detector.effects import STEPS as MOSAIC_STEPS
@@ -336,7 +337,8 @@ class LensFault(Fault):
     def validate(self) -> None:
         """Raise an error if the named lens cannot be loaded."""
         if self.lens:
-            load_lens(self.lens)
+            with under_key("lens"):
+                load_lens(self.lens)
 
 
 def with_sensor(camera: Camera, **changes: Any) -> Camera:

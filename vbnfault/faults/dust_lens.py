@@ -100,7 +100,8 @@ class DefocusedDust(LensFault):
     )
 
     def validate(self) -> None:
-        """Raise ValueError if the lens lacks the surface."""
+        """Raise an error if the named lens cannot be loaded, or lacks the surface."""
+        super().validate()
         if self.lens and self.surface >= (rows := len(load_lens(self.lens).surfaces)):
             raise ValueError(f"surface = {self.surface}: {self.lens} has rows 0 to {rows - 1}")
 

@@ -262,7 +262,7 @@ def from_dict(fault_class: str, table: Mapping[str, Any], *, source: str) -> Fau
     fault = cls(**values)
     try:
         fault.validate()
-    except ValueError as error:
+    except (ValueError, InputError) as error:
         raise InputError(f"{where}: {error}") from None
     return fault
 

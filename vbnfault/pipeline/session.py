@@ -15,7 +15,7 @@ from ..body import Body, Fractured, Patch, PatchSpec, Site, Sites, cached_patch,
 from ..body.refine import GROWTH_POWER
 from ..camera import Camera
 from ..core import activity
-from ..core.errors import InputError
+from ..core.errors import InputError, in_file, under_key
 from ..core.memory import release_unused
 from ..core.quantities import SOFT_KINDS, Sample
 from ..faults import Fault, dataset_order, from_dict, load_plugins, plugins_of
@@ -117,11 +117,12 @@ def configure_faults(scene: Scene, source: str = "scene") -> dict[str, Fault]:
                 f"{source}: faults.{name}.model = {fault.model!r}: acts inside a detector with a mosaic; name a "
                 "camera.detector"
             )
-        if fault.needs_ccd and assemble.mosaic_sensor(scene.camera).architecture == "cmos":
-            raise InputError(
-                f"{source}: faults.{name}: acts on charge that a CCD moves, and camera.detector = "
-                f"{scene.camera.detector!r} is a CMOS sensor; leave the fault out, or name a CCD"
-            )
+        with in_file(source):
+            if fault.needs_ccd and assemble.mosaic_sensor(scene.camera).architecture == "cmos":
+                raise InputError(
+                    f"faults.{name}: acts on charge that a CCD moves, and camera.detector = "
+                    f"{scene.camera.detector!r} is a CMOS sensor; leave the fault out, or name a CCD"
+                )
     _check_layers(scene, faults, source)
     return faults
 
@@ -185,7 +186,8 @@ class Session:
         if poses is not None:
             self.trajectory = as_trajectory(poses)
         elif scene.trajectory is not None:
-            self.trajectory = load_trajectory(scene.trajectory.file)
+            with in_file(source), under_key("trajectory.file"):
+                self.trajectory = load_trajectory(scene.trajectory.file)
         if self.trajectory is not None:
             self.trajectory = self.trajectory.repeated(scene.dataset.variants_per_view)
         self.scene = scene = with_rows(scene, None if poses is None else self.trajectory)
@@ -198,6 +200,7 @@ class Session:
         self.faults = configure_faults(scene, source)
         need_sun = [name for name, fault in self.faults.items() if fault.needs_sun]
         self.plan = plan.make_plan(scene, list(self.faults), blocks, need_sun=need_sun)
+        self.source = source
         self._threads = threads
         self._ground: dict[int, list[GroundDetail]] = {}  # of the rows of a site
         self._terrain: Terrain | None = None
@@ -209,28 +212,33 @@ class Session:
     @cached_property
     def base_camera(self) -> Camera:
         """Return the camera with the first architecture and readout direction of the scene, without an exposure."""
-        return assemble.base_camera(self.scene)
+        with in_file(self.source):
+            return assemble.base_camera(self.scene)
 
     @cached_property
     def body(self) -> Body:
         """Return the body, which is loaded at the first use."""
         activity.begin("shape of the body")
-        body = assemble.make_body(self.scene)
-        if self.scene.coma is not None and self.trajectory is not None:
-            for distance_au in (self.trajectory.sun_distance_au.min(), self.trajectory.sun_distance_au.max()):
-                check_coma(self.scene.coma, body, float(distance_au))
+        with in_file(self.source):
+            body = assemble.make_body(self.scene)
+            if self.scene.coma is not None and self.trajectory is not None:
+                for distance_au in (self.trajectory.sun_distance_au.min(), self.trajectory.sun_distance_au.max()):
+                    check_coma(self.scene.coma, body, float(distance_au))
         return body
 
     def warn_of_doubts(self) -> None:
         """Warn if the body has values of another, named one, and if the frame is wider than the lens's field."""
-        for sentence in (assemble.values_of_another_body(self.scene, self.body), assemble.dark_corners(self.scene)):
+        with in_file(self.source):
+            sentences = assemble.values_of_another_body(self.scene, self.body), assemble.dark_corners(self.scene)
+        for sentence in sentences:
             if sentence:
                 warnings.warn(sentence, stacklevel=2)
 
     @cached_property
     def vehicle(self) -> SpacecraftMesh | None:
         """Return the spacecraft that carries the camera, or None if the scene has none."""
-        return assemble.spacecraft(self.scene)
+        with in_file(self.source):
+            return assemble.spacecraft(self.scene)
 
     @cached_property
     def sites(self) -> Sites:
@@ -381,6 +389,11 @@ class Session:
 
         On a trajectory every view has its own date, and with a table of poses its own distance of the Sun.
         """
+        with in_file(self.source):
+            return self._spec(index)
+
+    def _spec(self, index: int) -> SampleSpec:
+        """Return what `spec` does; the messages of its errors do not name the scene."""
         site, aims = int(self.plan.site[index]), self.scene.is_aimed
         if self.trajectory is not None:
             terrain = self.flown_terrain(index)

@@ -15,7 +15,7 @@ from typing import Annotated, Any
 from pydantic import Field, model_validator
 
 from ..core import path_checks, resources, tables, toml_files
-from ..core.errors import InputError, shown
+from ..core.errors import InputError, in_file, shown
 from ..core.tables import Table
 from ..reflectance import is_packaged
 from .bodies import with_named_body
@@ -180,15 +180,11 @@ def load_scene(name_or_path: str | Path, overrides: Mapping[str, Any] | None = N
     path = resources.find("scenes", name_or_path)
     table = toml_files.read_toml(path)
     tables.replace(table, overrides or {}, source=str(path))
-    try:
+    with in_file(str(path)):
         _anchor_paths(table, path.parent, overrides or ())
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
     scene = parse_scene(table, source=str(path), overrides=tuple(overrides or ()))
-    try:
+    with in_file(str(path)):
         return with_rows(scene)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
 
 
 def parse_scene(table: Mapping[str, Any], *, source: str, overrides: Sequence[str] = ()) -> Scene:

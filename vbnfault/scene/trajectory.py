@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from ..core import file_contents, user_files
-from ..core.errors import InputError, shown
+from ..core.errors import InputError, shown, under_key
 from ..core.tables import Table
 
 if TYPE_CHECKING:
@@ -168,7 +168,8 @@ def with_rows(scene: Scene, trajectory: Trajectory | None = None) -> Scene:
     elif scene.trajectory is None:
         return scene
     else:
-        trajectory = load_trajectory(scene.trajectory.file).repeated(scene.dataset.variants_per_view)
+        with under_key("trajectory.file"):
+            trajectory = load_trajectory(scene.trajectory.file).repeated(scene.dataset.variants_per_view)
         samples = scene.dataset.samples if "samples" in scene.dataset.model_fields_set else len(trajectory)
         if samples > len(trajectory):
             raise InputError(

@@ -13,7 +13,7 @@ from .. import camera as cameras
 from ..body import Body, Site, Sites, ellipsoid, load_body, site_at
 from ..camera import Camera
 from ..core import file_contents, frames, spectra, spice
-from ..core.errors import InputError
+from ..core.errors import InputError, under_key
 from ..core.quantities import Radiance, Truth
 from ..detector import Detector, MosaicDetector, Sensor, ThreeColourDetector, load_sensor
 from ..lens import Halo, RealLens, ThinLens, closed_to, coating, load_lens, scaled_to_focal_length
@@ -65,7 +65,7 @@ def _ephemeris(
     ).J_from_T(date)
     sun_J_au = -_orbit(orbit).position_J_au(date)
     if kernels.kernels:
-        with spice.kernels(*kernels.kernels):
+        with under_key("spice.kernels"), spice.kernels(*kernels.kernels):
             et_s = spice.et_s_from_julian_date(date)
             sun_J_au = spice.sun_position_J_au(kernels.target, et_s)
             if kernels.frame:
@@ -99,7 +99,7 @@ def epoch_jd(scene: Scene, site: int, fraction: float) -> float:
 def _spacecraft_pose(table: SpiceTable, julian_date: float) -> spice.SpacecraftState:
     """Return `spacecraft_pose` from the cache, or compute it."""
     axes = None if table.camera_axes is None else np.array(table.camera_axes).reshape(3, 3)
-    with spice.kernels(*table.kernels):
+    with under_key("spice.kernels"), spice.kernels(*table.kernels):
         et_s = spice.et_s_from_julian_date(julian_date)
         return spice.pose_T(table.spacecraft, table.target, table.frame, table.camera_frame, et_s, axes)
 
@@ -289,9 +289,10 @@ def _body(scene: Scene) -> Body:
         vertices, faces = ellipsoid(table.semi_axes_m, table.relief_m)
         return Body(name=table.name, vertices_m=vertices, faces=faces, **physical)
     volume_m3 = None if table.volume_km3 is None else 1e9 * table.volume_km3
-    return load_body(
-        table.shape, unit=table.unit, name=table.name, sharpen=table.sharpen, volume_m3=volume_m3, **physical
-    )
+    with under_key("body.shape"):
+        return load_body(
+            table.shape, unit=table.unit, name=table.name, sharpen=table.sharpen, volume_m3=volume_m3, **physical
+        )
 
 
 # A shape that differs by more than these fractions in volume or longest extent belongs to another body.
@@ -393,10 +394,8 @@ def _three_colours(c: CameraTable) -> ThreeColourDetector:
 @file_contents.cached_with_contents(maxsize=4)
 def mosaic_sensor(c: CameraTable) -> Sensor:
     """Return the sensor that a camera names, at the camera's temperature. Raises InputError."""
-    try:
+    with under_key("camera.detector"):
         sensor = load_sensor(c.detector)
-    except InputError as error:
-        raise InputError(f"camera.detector: {error}") from None
     if c.detector_temperature_K is not None:
         sensor = replace(sensor, temperature_K=c.detector_temperature_K)
     return sensor
@@ -407,7 +406,7 @@ def _detector_of(scene: Scene, sensor: Sensor, individual: int, direction: str) 
     # a mosaic detector is read along its columns only
     towards = direction if direction in ("up", "down") else "up"
     seed = int(rng(scene.dataset.seed, individual, "detector", "device").integers(2**31))
-    try:
+    with under_key("camera.detector"):
         made = MosaicDetector(
             sensor=sensor,
             seed=seed,
@@ -415,8 +414,6 @@ def _detector_of(scene: Scene, sensor: Sensor, individual: int, direction: str) 
             height_px=scene.camera.height_px,
             direction=towards,
         )
-    except InputError as error:
-        raise InputError(f"camera.detector: {error}") from None
     for channel, row in zip(made.channels, made.electron_rate_weights(wavelengths_nm(scene)), strict=True):
         if not row.any():
             low, high = scene.render.band_min_nm, scene.render.band_max_nm
@@ -465,10 +462,8 @@ def real_lens(c: CameraTable, pixel_pitch_um: float) -> RealLens:
 
     Raises InputError for a file that is not a lens, and for an f-number that the lens does not reach.
     """
-    try:
+    with under_key("camera.lens"):
         prescription = load_lens(c.lens)
-    except InputError as error:
-        raise InputError(f"camera.lens: {error}") from None
     if c.lens_coating:
         if c.lens_coating not in coating.NAMES:
             known = ", ".join(coating.NAMES)
@@ -513,19 +508,20 @@ def spacecraft(scene: Scene) -> SpacecraftMesh | None:
             known = ", ".join(vehicle.hinges)
             raise InputError(f"spacecraft.pose.{unknown[0]}: the default vehicle has no such joint; it has {known}")
         return vehicle.posed({name: _pose(name, t, vehicle) for name, t in table.pose.items()}).merged()
-    return load_spacecraft(
-        Path(table.model),
-        unit=table.unit,
-        placement=ModelPlacement(
-            roll_deg=table.roll_deg,
-            pitch_deg=table.pitch_deg,
-            yaw_deg=table.yaw_deg,
-            translation_B_m=table.translation_m,
-        ),
-        materials={name: _plain(value) for name, value in table.materials.items()},
-        poses={name: _pose(name, t, None) for name, t in table.pose.items()},
-        default_material=_plain(table.default_material),
-    ).merged()
+    with under_key("spacecraft.model"):
+        return load_spacecraft(
+            Path(table.model),
+            unit=table.unit,
+            placement=ModelPlacement(
+                roll_deg=table.roll_deg,
+                pitch_deg=table.pitch_deg,
+                yaw_deg=table.yaw_deg,
+                translation_B_m=table.translation_m,
+            ),
+            materials={name: _plain(value) for name, value in table.materials.items()},
+            poses={name: _pose(name, t, None) for name, t in table.pose.items()},
+            default_material=_plain(table.default_material),
+        ).merged()
 
 
 def _plain(material: object) -> Any:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core import file_contents, user_files
-from ..core.errors import InputError
+from ..core.errors import InputError, under_key
 from ..core.images import decoded_image, image_size_px
 from ..scene.target import AlbedoMapTable
 
@@ -52,7 +52,8 @@ def load_albedo_map(table: AlbedoMapTable) -> SurfaceMap:
 def _factors(table: AlbedoMapTable) -> Float32:
     """Return the factors on the albedo, float32[row, column, channel], without filtering."""
     path = table.file
-    data = user_files.read_input(path, "texture", types=TYPES)
+    with under_key("body.albedo_map.file"):
+        data = user_files.read_input(path, "texture", types=TYPES)
     columns, rows = image_size_px(data)
     _check_values(path, rows, columns, 1)  # before decoding: a small file can hold a huge image
     image = decoded_image(data) if columns else None
