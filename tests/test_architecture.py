@@ -281,8 +281,19 @@ def test_no_fault_has_a_name_outside_faults() -> None:
 
 
 def test_modules_of_the_store_import_only_those_before_them() -> None:
-    order = ["compressors", "arrays", "formats", "schema", "codec", "counts", "disk", "bucket", "files", "layout"]
-    order += ["opened", "group", "labelled", "shards", "metadata", "migration", "check"]
+    order = [
+        "compressors",
+        "arrays",
+        "formats",
+        "attributes",
+        "schema",
+        "codec",
+        "counts",
+        "disk",
+        "bucket",
+        "files",
+    ]
+    order += ["layout", "opened", "group", "labelled", "shards", "metadata", "migration", "check"]
     inside = {module for module in sources() if module.split(".")[0] == "store"}
     assert inside == {"store", *(f"store.{name}" for name in order)}
     wrong = [

@@ -5,6 +5,8 @@ One sentence, no traceback, and nothing that was there is lost. A store without 
 
 from __future__ import annotations
 
+import copy
+import json
 import shutil
 import sys
 from collections.abc import Callable, Iterator
@@ -21,7 +23,7 @@ from test_export import tree
 
 from vbnfault import store as st
 from vbnfault.dataset.merge import join_stores
-from vbnfault.store import bucket
+from vbnfault.store import bucket, layout
 
 # What each command is given, for the store, a sound store and a folder for new files.
 COMMANDS: dict[str, Callable[[Any, Path, Path], list[Any]]] = {
@@ -114,6 +116,72 @@ def test_a_store_of_another_program_or_version_is_left_alone(
     assert sentence in text or (command in ("build", "merge into") and "no vbnfault store, so it is left" in text)
     assert tree(path) == before
     assert not [*out.iterdir()]
+
+
+def _with_attributes(path: Path, sound: Path, key: str, value: Any) -> None:
+    """Copy a store and change one root attribute in both documents, with the right checksum; None removes it."""
+    store = st.open_store(shutil.copytree(sound, path, dirs_exist_ok=True), "r+")
+    attributes = copy.deepcopy(store.root_attributes)
+    *tables, last = key.split(".")
+    table = attributes
+    for name in tables:
+        table = table[name]
+    if value is None:
+        del table[last]
+    else:
+        table[last] = value
+    attributes = layout.sealed(attributes)
+    root = json.loads((path / "zarr.json").read_text())
+    (path / "spare/zarr.json").write_bytes(layout.to_bytes(layout.group_document(attributes)))
+    (path / "zarr.json").write_bytes(layout.to_bytes({**root, "attributes": attributes}))
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_root_attributes_of_the_wrong_type_are_one_sentence(
+    command: str,
+    described_store: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    wrong: dict[str, Any] = {
+        "scene": [],
+        "scene.camera": 7,
+        "scene.faults.straylight": "x",
+        "blocks": [],
+        "versions": "x",
+        "versions_of_samples": [7],
+        "retake": {},
+        "store": 7,
+        "store.mask_kinds": 7,
+        "store.wavelength_nm": "x",
+        "store.attitude_references": ["sun"],
+    }
+    for key, value in wrong.items():
+        path = tmp_path / f"{key}.zarr"
+        _with_attributes(path, described_store, key, value)
+        assert run(monkeypatch, *COMMANDS[command](path, described_store, tmp_path)) == 2, key
+        text = said(capsys)
+        assert text.startswith(f"{path}: is no vbnfault store: its root attributes are not those of one: {key}"), (
+            text
+        )
+
+
+@pytest.mark.parametrize("key", ["scene", "scene.camera", "scene.body", "scene.dataset", "fault_models", "blocks"])
+def test_a_store_that_lacks_a_table_of_its_scene_is_one_sentence(
+    key: str,
+    described_store: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    path = tmp_path / "s.zarr"
+    _with_attributes(path, described_store, key, None)
+    for command in ("verify", "retake"):
+        assert run(monkeypatch, *COMMANDS[command](path, described_store, tmp_path)) == 2
+        assert said(capsys).startswith(f"{path}: its root attributes lack {key}, so its views are not known")
+    for command in ("digest", "preview", "export", "report", "stats", "card", "migrate"):  # these need no plan
+        assert run(monkeypatch, *COMMANDS[command](path, described_store, tmp_path)) == 0, capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

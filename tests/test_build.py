@@ -187,7 +187,10 @@ def test_free_texts_of_a_scene_do_not_hinder_a_resume(tmp_path: Path) -> None:
         return {**texts, "scene": {**scene, **tables}, "seed": 7}
 
     def retaken(text: str, **tables: object) -> dict[str, object]:
-        return {**attributes(text), "retake": {"repeats": 1, "source": attributes(text, **tables)}}
+        return {
+            **attributes(text),
+            "retake": {"repeats": 1, "samples": [], "source": {**attributes(text, **tables), "faults": []}},
+        }
 
     out = tmp_path / "s.zarr"
     with pytest.raises(bd.BuildFailed):

@@ -29,7 +29,7 @@ from .errors import BuildFailed, Interrupted
 from .lock import locked, others_at_work, prepared_by_one
 from .processes import Pool
 from .progress import Progress, duration_text, size_text
-from .resume import check_same_scene, planned_blocks, with_versions_noted
+from .resume import blocks_of, check_same_scene, planned_blocks, with_versions_noted
 from .tasks import Run, SampleMaker, SampleWorkers, SessionFactory
 from .versions import known
 from .work import run_here
@@ -42,6 +42,7 @@ __all__ = [
     "SampleMaker",
     "SessionFactory",
     "Summary",
+    "blocks_of",
     "build",
     "planned_blocks",
 ]

@@ -130,7 +130,7 @@ def build_scene(
     if not options.dry_run:
         llvm.find()  # raises VbnfaultError: without LLVM every sample would fail
     if append and samples is None and not options.overwrite and store.is_store(out):
-        samples = int(store.open_store(out).attributes["blocks"][0])
+        samples = build.blocks_of(store.open_store(out))[0]
     scene = with_rows(_with_samples(scene, samples))
     blocks = build.planned_blocks(out, scene.dataset.samples, append=append or 0, overwrite=options.overwrite)
     factory, build_plan, description = _prepared(scene, blocks, source, options)

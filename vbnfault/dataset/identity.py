@@ -319,6 +319,23 @@ def _intensity(detector: Detector) -> str:
     return "luminance of RGB, Rec. 709 weights"
 
 
+def check_described(opened: store.Store) -> None:
+    """Raise InputError unless the root attributes of a store have the tables of a scene that can be planned."""
+    attributes = opened.attributes
+    while True:
+        scene = attributes.get("scene", {})
+        lacks = [key for key in ("scene", "blocks", "fault_models") if key not in attributes]
+        lacks = lacks or [f"scene.{key}" for key in ("body", "camera", "dataset", "faults") if key not in scene]
+        if lacks:
+            raise InputError(
+                f"{opened.path}: its root attributes lack {', '.join(lacks)}, so its views are not known; it was "
+                "not built from a scene, or another program changed them"
+            )
+        if RETAKE not in attributes:
+            return
+        attributes = attributes[RETAKE]["source"]
+
+
 def is_exact(attributes: Mapping[str, Any]) -> bool:
     """Return whether a stored scene must inject every commanded fault.
 
@@ -357,7 +374,7 @@ def classes_that_need_sun(attributes: Mapping[str, Any]) -> list[str]:
     The store lists such classes of plug-ins by name. For packaged classes, the registry decides.
     """
     plugins = attributes["scene"].get("plugins", {})
-    classes = {name for plugin in plugins.values() for name in plugin["needs_sun"]}
+    classes = {name for plugin in plugins.values() for name in plugin.get("needs_sun", ())}
     for name, model in attributes["fault_models"].items():
         cls = registry().get(name, {}).get(model)
         if cls is not None and is_packaged(cls) and cls.needs_sun_with(attributes["scene"]["faults"].get(name, {})):

@@ -32,7 +32,7 @@ def planned_blocks(
             raise InputError(f"--append {append}: there is no store at {out} yet; build it first")
         return (samples,)
     store = store_module.open_store(out)
-    blocks = tuple(int(b) for b in store.attributes.get("blocks", [store.samples]))
+    blocks = blocks_of(store)
     if blocks[0] != samples:
         raise InputError(
             f"{out}: samples = {samples}, but the store was made with {blocks[0]}; use --append to add some, "
@@ -40,6 +40,11 @@ def planned_blocks(
         )
     resumes = len(blocks) > 1 and blocks[-1] == append and store.finished() < store.samples
     return (*blocks, append) if append and not resumes else blocks
+
+
+def blocks_of(store: Store) -> tuple[int, ...]:
+    """Return the sizes of the blocks of a store; a store that does not name them has one."""
+    return tuple(store.attributes.get("blocks", [store.samples]))
 
 
 def with_versions_noted(store: Store, spec: StoreSpec, expected: Planned | None, *, exact: bool) -> Store:
@@ -83,7 +88,7 @@ def check_same_scene(
             f"{store.path}: holds another dataset: {_named(differing, 'in the store', 'now')}; "
             f"choose another --out, or --overwrite to replace it"
         )
-    blocks_of_store = tuple(store.attributes.get("blocks", [store.samples]))
+    blocks_of_store = blocks_of(store)
     if blocks[: len(blocks_of_store)] != blocks_of_store:
         raise InputError(
             f"{store.path}: holds blocks of {_sum_text(blocks_of_store)} samples, not {_sum_text(blocks)}; "

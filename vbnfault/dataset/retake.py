@@ -34,6 +34,7 @@ from .from_scene import with_card
 from .identity import (
     RETAKE,
     blocks_of_plan,
+    check_described,
     earlier_views,
     plan_numbers,
     planned,
@@ -261,8 +262,7 @@ def _radiance_layer(spec: StoreSpec, attributes: Mapping[str, Any]) -> str:
 
 def _check_radiance(opened: Store) -> None:
     """Raise InputError unless a store holds the radiance before the lens and without stars."""
-    if not {"scene", "blocks", "fault_models"} <= opened.attributes.keys():
-        raise InputError(f"{opened.path}: names no scene, so its views are not known; it was not built from one")
+    check_described(opened)
     if _radiance_layer(opened.spec, opened.attributes):
         return
     has = "stores no radiance"

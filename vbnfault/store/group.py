@@ -161,6 +161,8 @@ def open_store(path: str | os.PathLike[str] | Url | Store, mode: str = "r") -> S
     _check_format(path, root.attributes.get("format_version"))
     try:
         store = Store(files, root.attributes, mode)
+    except InputError as error:
+        raise InputError(f"{path}: {_NO_STORE}: {error}") from error
     except (KeyError, TypeError, ValueError, VbnfaultError) as error:
         raise InputError(f"{path}: {_NO_STORE}") from error
     if mode == "r":

@@ -16,6 +16,7 @@ from ..core.errors import InputError, VbnfaultError
 from ..core.quantities import Sample
 from . import disk
 from .arrays import SCALARS
+from .attributes import check_attributes
 from .codec import (
     Encoded,
     chunk_ranges,
@@ -59,6 +60,7 @@ class Store:
         self.files, self.path = files, files.path
         self.root_attributes = attributes
         self.attributes = {k: v for k, v in attributes.items() if k not in OWN_ATTRIBUTES}
+        check_attributes(self.attributes)
         self.samples = int(attributes["samples"])
         self.spec = spec_from_plain(attributes["store"], self.attributes)
         self._mode: Any = mode

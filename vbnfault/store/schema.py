@@ -29,6 +29,7 @@ from .arrays import (
     soft_row,
     without_row,
 )
+from .attributes import check_plain_spec
 from .compressors import ZSTD, fitting
 from .formats import FORMAT_VERSION, in_format_2
 
@@ -366,6 +367,7 @@ class StoreSpec:
 
 def spec_from_plain(plain: Mapping[str, Any], attributes: Mapping[str, Any]) -> StoreSpec:
     """Return the StoreSpec that the result of `StoreSpec.plain` and a store's root attributes describe."""
+    check_plain_spec(plain, StoreSpec)
     known = {f.name for f in fields(StoreSpec)}
     values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in plain.items() if k in known}
     version = attributes.get("format_version", FORMAT_VERSION)

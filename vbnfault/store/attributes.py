@@ -1,0 +1,112 @@
+"""Check the types of a store's root attributes, so that what reads them may rely on these."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import fields
+from typing import Any
+
+from ..core.errors import InputError, shown
+
+# Dotted keys of the root attributes that are tables wherever they are present; * stands for every key of a table.
+_TABLES = (
+    "optics",
+    "detector",
+    "detector.sensor",
+    "detector.sensor.sources",
+    "retake",
+    "retake.source",
+    "versions",
+    "fault_models",
+    "scene",
+    "scene.faults",
+    "scene.faults.*",
+    "scene.plugins",
+    "scene.plugins.*",
+    "scene.body",
+    "scene.body.photometry",
+    *(f"scene.{table}" for table in ("camera", "dataset", "geometry", "plan", "sky", "spice")),
+)
+# Names of the elements of a tuple in the type of a field of `StoreSpec` → the types that they have in JSON.
+_ELEMENTS: dict[str, tuple[type, ...]] = {"str": (str,), "int": (int,), "float": (int, float)}
+# Fields of `StoreSpec` whose lists have this many elements.
+_LENGTHS = {"distortion_residual_px": (2,), "attitude_references": (2,), "rendered_shape": (0, 2)}
+# Fields of `StoreSpec` with one element for each class, or none.
+_OF_CLASSES = ("mask_kinds", "mask_rules", "soft_layers")
+
+
+def check_attributes(attributes: Mapping[str, Any]) -> None:
+    """Raise InputError where a root attribute of a store is not of the type that vbnfault writes."""
+    for path in _TABLES:
+        for key, value in _values_at(attributes, path.split(".")):
+            if not isinstance(value, dict):
+                raise InputError(f"{key} = {shown(value)}: must be a table")
+    _check_blocks(attributes.get("blocks", [1]))
+    notes = attributes.get("versions_of_samples", [])
+    if not isinstance(notes, list) or not all(
+        isinstance(n, dict) and {"versions", "samples"} <= {*n} for n in notes
+    ):
+        raise InputError(
+            f"versions_of_samples = {shown(notes)}: must be a list of tables with versions and samples"
+        )
+    if "retake" in attributes:
+        _check_retake(attributes["retake"])
+
+
+def _values_at(table: Mapping[str, Any], path: list[str], above: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the dotted key and the value of every entry of a table at a path, where there is one."""
+    first, *rest = path
+    for key in table if first == "*" else {first} & {*table}:
+        where, value = f"{above}{key}", table[key]
+        if not rest:
+            yield where, value
+        elif isinstance(value, dict):
+            yield from _values_at(value, rest, f"{where}.")
+
+
+def _check_blocks(blocks: Any) -> None:
+    """Raise InputError unless the blocks of a store are a list of numbers of samples."""
+    if not isinstance(blocks, list) or not blocks or not all(type(n) is int and n > 0 for n in blocks):
+        raise InputError(f"blocks = {shown(blocks)}: must be a list of whole numbers above 0")
+
+
+def _check_retake(retake: Mapping[str, Any]) -> None:
+    """Raise InputError unless `retake` says which samples of which store were taken, and how often."""
+    repeats, ranges = retake.get("repeats"), retake.get("samples")
+    if type(repeats) is not int or repeats < 1:
+        raise InputError(f"retake.repeats = {shown(repeats)}: must be a whole number above 0")
+    if not isinstance(ranges, list) or not all(
+        isinstance(r, list) and len(r) == 2 and all(type(n) is int for n in r) for r in ranges
+    ):
+        raise InputError(f"retake.samples = {shown(ranges)}: must be a list of pairs of whole numbers")
+    if not isinstance(retake.get("source"), dict) or not isinstance(retake["source"].get("faults"), list):
+        raise InputError("retake.source: must be a table with faults")
+    check_attributes(retake["source"])
+
+
+def check_plain_spec(plain: Any, spec: type) -> None:
+    """Raise InputError where the root attribute `store` is not what `StoreSpec.plain` returns."""
+    if not isinstance(plain, dict):
+        raise InputError(f"store = {shown(plain)}: must be a table")
+    for field in fields(spec):
+        if field.name not in plain:
+            continue
+        value, kind = plain[field.name], str(field.type)
+        if (value is not None or not kind.endswith("| None")) and not _is_of(kind, value):
+            raise InputError(f"store.{field.name} = {shown(value)}: must be {kind}")
+        lengths = _LENGTHS.get(field.name)
+        if field.name in _OF_CLASSES:
+            lengths = 0, len(plain.get("faults", ()))
+        if lengths is not None and len(value) not in lengths:
+            raise InputError(f"store.{field.name} = {shown(value)}: must have {lengths[-1]} elements")
+
+
+def _is_of(kind: str, value: Any) -> bool:
+    """Return whether a JSON value fits a type as it is written in `StoreSpec`."""
+    kind = kind.removesuffix(" | None")
+    if kind.startswith("tuple["):
+        types = _ELEMENTS[kind.removeprefix("tuple[").split(",")[0]]
+        return isinstance(value, list) and all(type(element) in types for element in value)
+    if kind.startswith("Mapping["):
+        return isinstance(value, dict)
+    return type(value) in _ELEMENTS[kind]
