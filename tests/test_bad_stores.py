@@ -23,7 +23,7 @@ from test_export import tree
 
 from vbnfault import store as st
 from vbnfault.dataset.merge import join_stores
-from vbnfault.store import bucket, layout
+from vbnfault.store import bucket, codec, layout
 
 # What each command is given, for the store, a sound store and a folder for new files.
 COMMANDS: dict[str, Callable[[Any, Path, Path], list[Any]]] = {
@@ -212,6 +212,21 @@ def test_a_half_finished_store_keeps_its_samples(
         assert sentence in said(capsys)
     after = tree(half.path)
     assert {name: after[name] for name in before} == before
+
+
+@pytest.mark.parametrize("command", ["preview", "export"])
+def test_an_image_with_the_chunk_of_another_sample_is_named(
+    command: str,
+    described_store: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    store = st.open_store(shutil.copytree(described_store, tmp_path / "s.zarr"), "r+")
+    chunks = store.chunk("image", 1)
+    store.file("image", 1).write_bytes(codec.join_shard({0: chunks[3], 1: chunks[3]}, 2))
+    assert run(monkeypatch, *COMMANDS[command](store.path, described_store, tmp_path)) == 1
+    assert "s.zarr: sample 2: the stored crc32c of image is another; the build command repairs it" in said(capsys)
 
 
 def test_nothing_finished_is_a_sentence(

@@ -21,6 +21,7 @@ from vbnfault.output.report import Limits, write_report
 from vbnfault.output.report.charts import Histogram, boxes, number, ticks
 from vbnfault.output.report.gallery import parameter_table, pick
 from vbnfault.output.report.measure import Drawn, key_bounds, key_unit, read_drawn, read_pixels, read_scalars
+from vbnfault.store import codec
 
 
 @pytest.fixture(scope="module")
@@ -133,9 +134,13 @@ def test_stores_of_every_kind_have_a_report(changes: dict[str, Any], tmp_path: P
 def test_damaged_samples_are_counted_and_left_out(whole: st.Store, tmp_path: Path) -> None:
     flip(whole.file("stratum", 0), 12)
     shutil.rmtree(whole.path / "image" / "c" / "1")
-    text = write_report(whole, tmp_path / "r.html").read_text()
-    assert "4 finished samples whose scalars cannot be read and 4 whose pixels cannot be read" in text
-    assert text.count('class="card"') == 2
+    chunks = whole.chunk("image", 2)
+    whole.file("image", 2).write_bytes(codec.join_shard({0: chunks[9], 1: chunks[9]}, 4))
+    sentence = r"sample 8: the stored crc32c of image is another; .* with 4 samples more; the report leaves"
+    with pytest.warns(UserWarning, match=sentence):
+        text = write_report(whole, tmp_path / "r.html").read_text()
+    assert "4 finished samples whose scalars cannot be read and 5 whose pixels cannot be read" in text
+    assert text.count('class="card"') == 1
 
 
 def test_a_large_store_is_sampled_and_the_page_says_so(described_store: Path, tmp_path: Path) -> None:

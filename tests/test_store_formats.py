@@ -24,6 +24,7 @@ from synthetic import FAULTS, filled, make_spec
 from vbnfault import cli, dataset
 from vbnfault import store as st
 from vbnfault.core.errors import InputError, VbnfaultError
+from vbnfault.store import codec
 from vbnfault.store.arrays import LAYERS, SCALARS, ZSTD
 from vbnfault.store.compressors import compressor, fitting
 from vbnfault.store.group import read_document
@@ -217,11 +218,18 @@ def test_a_copy_begun_from_another_state_of_the_source_is_begun_anew(
     assert st.migrate_copy(grown, target).samples == 6
 
 
+def _with_anothers_chunk(store: st.Store) -> None:
+    """Give sample 1 the image of sample 0, whose chunk is sound in itself."""
+    chunk = store.chunk("image", 0)[0]
+    store.file("image", 0).write_bytes(codec.join_shard({0: chunk, 1: chunk}, store.spec.shard_samples))
+
+
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
         (lambda s: s.file("raw", 1).unlink(), r"raw/c/1/0/0 is missing; the build command repairs it"),
-        (lambda s: s.file("image", 0).write_bytes(b"x" * 99), r"image/c/0/0/0/0 is damaged \(truncated"),
+        (lambda s: s.file("image", 0).write_bytes(b"x" * 99), r"image/c/0/0/0/0 is damaged: truncated"),
+        (_with_anothers_chunk, "sample 1: image in image/c/0/0/0/0 does not match its stored crc32c; the build"),
     ],
 )
 def test_a_damaged_store_is_not_copied(old: Path, tmp_path: Path, change: Any, sentence: str) -> None:

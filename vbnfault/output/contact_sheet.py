@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -152,25 +151,22 @@ def overlay(
 def _tile(store: Store, index: int, short: Mapping[str, str], masks: bool) -> U8:
     """Draw one sample with its caption."""
     spec = store.spec
-
-    def read(name: str) -> Any:
-        return store.read(name, index, index + 1)[0]
-
+    sample = store.read_sample(index, ("image", "mask") if masks and spec.faults else ("image",))
     scale = _TILE_PX / max(spec.height, spec.width)
     size = (max(1, round(spec.width * scale)), max(1, round(spec.height * scale)))
     # a shrunk mask is True where any of its pixels is, so that a single broken pixel stays visible
-    rgb = resized(read("image")[..., :3], size)
-    injected = read("injected").astype(bool)
+    rgb = resized(sample.layers["image"][..., :3], size)
+    injected = sample.scalars["injected"].astype(bool)
     if masks and spec.faults:
-        small = np.stack([resized_mask(m, size) for m in read("mask")])
+        small = np.stack([resized_mask(m, size) for m in sample.layers["mask"]])
         localised = [fault in (spec.localised_faults or ()) for fault in spec.faults]
         rgb = overlay(rgb, small, injected.tolist(), localised)
     tile = np.full((size[1] + _CAPTION_PX, size[0], 3), _PANEL, np.uint8)
     tile[: size[1]] = rgb
-    site = int(read("site"))
+    site = int(sample.scalars["site"])
     site_name = spec.site_names[site] if 0 <= site < len(spec.site_names) else f"site {site}"
     _write(tile, f"#{index}", (8, size[1] + 19), _TEXT, 0.48)
-    right = f"{STRATA[int(read('stratum'))]}  {site_name}"
+    right = f"{STRATA[int(sample.scalars['stratum'])]}  {site_name}"
     _write(tile, right, (size[0] - 8 - _text_width(right, 0.4), size[1] + 19), _FAINT, 0.4)
     x = 8
     for k in np.flatnonzero(injected):

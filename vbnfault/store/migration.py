@@ -4,6 +4,7 @@ In place only metadata and coordinates are rewritten, in the order in which `app
 then `spare`, then the root. A kill before `spare` is written leaves a store of the old format, a later one a store
 of the new format whose root is older than its copy; both open, and the same call completes the change. A copy is
 made in a hidden folder beside its final name, shard by shard, each with `done` last; the same call continues it.
+Every shard is compared with its checksums before it is copied.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from ..core.errors import InputError, VbnfaultError
 from . import disk
 from .arrays import SCALARS
 from .bucket import Url
+from .check import check_shard
 from .codec import join_shard, threads
 from .compressors import compressor
 from .files import files_of, located
@@ -27,6 +29,8 @@ from .layout import root_attributes
 from .metadata import bring_to
 from .opened import Store
 from .schema import StoreSpec
+
+_REPAIR = "the build command repairs it, then migrate again"
 
 
 def migrate(path: str | os.PathLike[str] | Url) -> Store:
@@ -108,6 +112,9 @@ def _copy_shard(source: Store, spec: StoreSpec, number: int, hidden: Path) -> No
             return
     except OSError:
         pass
+    for problem in check_shard(source, number):
+        if not problem.unfinished:
+            raise VbnfaultError(f"{source.path}: {problem.sentence}; {_REPAIR}")
     disk.write(hidden, _shard_files(source, spec, number))
     disk.write(hidden, [(name, done)])
 
@@ -138,4 +145,4 @@ def _recoded(source: Store, spec: StoreSpec, name: str, number: int) -> bytes:
 def _damaged(source: Store, file: str, error: Exception) -> VbnfaultError:
     """Return the error for a file of the source that cannot be copied."""
     why = "is missing" if isinstance(error, FileNotFoundError) else f"is damaged ({error})"
-    return VbnfaultError(f"{source.path}: {file} {why}; the build command repairs it, then migrate again")
+    return VbnfaultError(f"{source.path}: {file} {why}; {_REPAIR}")

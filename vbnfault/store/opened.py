@@ -165,6 +165,7 @@ class Store:
         compared = [k for k, name in enumerate(self.spec.checked) if name in chosen or name not in self.spec.arrays]
         file = self.file_name("done", index // self.spec.shard_samples)
         problem: VbnfaultError | None = None
+        wrong: list[str] = []
         mismatches = 0
         while mismatches < _READS:
             stamp = self.files.stamp(file)
@@ -179,12 +180,16 @@ class Store:
                 problem = error
             else:
                 crcs_of_layers = [crc32c(layer) if layer.size else 0 for layer in arrays.values()]
-                if [*crcs_of_layers, crc_of_scalars(scalars)] == [crcs[k] for k in compared]:
+                stored = [crcs[k] for k in compared]
+                found = dict(zip((*chosen, "scalars"), [*crcs_of_layers, crc_of_scalars(scalars)], strict=True))
+                wrong = [name for (name, crc), other in zip(found.items(), stored, strict=True) if crc != other]
+                if not wrong:
                     return Sample(index=index, layers=arrays, scalars=scalars)
             # a process that rewrites the sample replaces the file of `done` first
             mismatches += self.files.stamp(file) == stamp
         raise problem or VbnfaultError(
-            f"{self.path}: sample {index} does not match its stored crc32c; the build command repairs it"
+            f"{self.path}: sample {index}: the stored crc32c of {' and '.join(wrong)} is another; the build "
+            "command repairs it"
         )
 
     def _scalars(self, index: int) -> dict[str, Any]:

@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core import images
-from ...core.errors import VbnfaultError
 from ...core.html_page import data_url, escaped, grouped_digits, with_minus
+from ...core.quantities import Sample
 from ...store import Store
 from ..contact_sheet import COLOURS, resized, resized_mask
-from .measure import Scalars, parsed, spread
+from .measure import Scalars, parsed, readable, spread
 
 U8 = NDArray[np.uint8]
 
@@ -65,7 +65,8 @@ def pick(scalars: Scalars, most: int) -> list[int]:
 
 def gallery(store: Store, scalars: Scalars, most: int) -> tuple[str, int]:
     """Return the gallery as markup, and the number of its samples."""
-    picked = [sample for position in pick(scalars, most) if (sample := _read(store, scalars, position)) is not None]
+    names = [name for name in ("image", "clean", "mask") if name in store.spec.pixel_layers]
+    picked = [_picked(k, sample) for k, sample in readable(store, scalars, pick(scalars, most), names)]
     if not picked:
         return "<p>No sample could be read.</p>", 0
     files: list[_Files] = []
@@ -80,13 +81,8 @@ def gallery(store: Store, scalars: Scalars, most: int) -> tuple[str, int]:
     )
 
 
-def _read(store: Store, scalars: Scalars, position: int) -> _Picked | None:
-    """Return a sample of the gallery; None if it cannot be read."""
-    names = [name for name in ("image", "clean", "mask") if name in store.spec.pixel_layers]
-    try:
-        sample = store.read_sample(int(scalars.samples[position]), names)
-    except VbnfaultError:
-        return None
+def _picked(position: int, sample: Sample) -> _Picked:
+    """Return a sample of the gallery."""
     clean = sample.layers.get("clean")
     return _Picked(
         position=position,

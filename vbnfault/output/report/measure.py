@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Iterator, Mapping, Sequence
+import warnings
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.errors import VbnfaultError
+from ...core.quantities import Sample
 from ...dataset.statistics import is_seed, key_of
 from ...faults import registry
 from ...store import SPLITS, STRATA, Store
@@ -280,12 +282,9 @@ def read_pixels(store: Store, scalars: Scalars, most: int) -> PixelResults:
     masks = [name for name in ("mask", "mask_effect") if name in store.spec.pixel_layers and store.spec.faults]
     rows: dict[str, list[Any]] = {name: [] for name in (*images, *masks)}
     positions = []
-    for position in spread(len(scalars.samples), most).tolist():
-        index = int(scalars.samples[position])
-        try:
-            layers = store.read_sample(index, {*images, *masks}).layers
-        except VbnfaultError:
-            continue
+    chosen = spread(len(scalars.samples), most).tolist()
+    for position, sample in readable(store, scalars, chosen, {*images, *masks}):
+        layers = sample.layers
         positions.append(position)
         for image in images:
             rows[image].append(_of_image(layers[image]))
@@ -297,8 +296,25 @@ def read_pixels(store: Store, scalars: Scalars, most: int) -> PixelResults:
         saturated={name: values[:, 0] for name, values in of_images.items()},
         mean_dn={name: values[:, 1] for name, values in of_images.items()},
         areas={n: np.array(rows[n], dtype=np.float64).reshape(-1, len(store.spec.faults)) for n in masks},
-        unreadable=len(spread(len(scalars.samples), most)) - len(positions),
+        unreadable=len(chosen) - len(positions),
     )
+
+
+def readable(
+    store: Store, scalars: Scalars, positions: Sequence[int], layers: Collection[str]
+) -> Iterator[tuple[int, Sample]]:
+    """Yield position and sample, with some layers, of those that can be read; then warn of the others at once."""
+    problems = []
+    for position in positions:
+        try:
+            sample = store.read_sample(int(scalars.samples[position]), layers)
+        except VbnfaultError as error:
+            problems.append(f"{error}")
+            continue
+        yield position, sample
+    if problems:
+        more = f"; so it is with {len(problems) - 1} samples more" if len(problems) > 1 else ""
+        warnings.warn(f"{problems[-1]}{more}; the report leaves out what it cannot read", stacklevel=2)
 
 
 def _of_image(image: NDArray[Any]) -> tuple[float, float]:
