@@ -112,12 +112,54 @@ def test_a_session_keeps_what_is_costly_and_gives_any_sample() -> None:
 
 
 def test_errors_name_what_is_wrong(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="sample 3: must be from 0 to 2"):
+    with pytest.raises(InputError, match="sample 3: must be a whole number from 0 to 2"):
         vbnfault.simulate(small(), 3)
     with pytest.raises(InputError, match="nowhere"):
         vbnfault.load_scene("nowhere")
     with pytest.raises(InputError, match=r"none\.zarr: "):
         vbnfault.open_dataset(tmp_path / "none.zarr")
+
+
+@pytest.mark.parametrize("index", [-1, 3, 1.0, np.float64(1), True, None, "1", [1], np.array([1])])
+def test_a_session_refuses_what_is_no_sample_of_it(index: Any) -> None:
+    with pytest.raises(InputError, match=r"scene: sample .*: must be a whole number from 0 to 2$"):
+        vbnfault.Session(small()).simulate(index)
+
+
+@pytest.mark.parametrize("threads", [0, -1, 1.5, "2", 10**6, True])
+def test_a_session_refuses_a_number_of_threads_that_is_none(threads: Any) -> None:
+    with pytest.raises(InputError, match=r"threads = .*: must be a whole number from 1 to 1024$"):
+        vbnfault.Session(small(), threads=threads)
+
+
+def test_numbers_of_numpy_and_paths_are_settings_as_those_of_python(tmp_path: Path) -> None:
+    """A loop over numpy's arrays gives them; their type does not change the scene."""
+    shape = tmp_path / "ball.obj"
+    plain = {"dataset.samples": 3, "camera.fov_deg": 40.5, "patch.boulders": False, "body.shape": str(shape)}
+    numpy = {
+        "dataset.samples": np.int64(3),
+        "camera.fov_deg": np.float32(40.5),
+        "patch.boulders": np.bool_(False),
+        "body.shape": shape,
+        "geometry": {"height_m": np.array([5.0, 7.0]), "x_m": (np.float32(-1), np.int8(1))},
+    }
+    shape.write_text("v 0 0 0\n")
+    want = vbnfault.load_scene("quickstart", {**plain, "geometry": {"height_m": [5.0, 7.0], "x_m": [-1.0, 1.0]}})
+    assert vbnfault.load_scene("quickstart", numpy) == want
+    with pytest.raises(InputError, match=r"camera\.fov_deg = 200\.0: must be a number from 0\.01 to 140"):
+        vbnfault.load_scene("quickstart", {"camera.fov_deg": np.float32(200)})
+    options = vbnfault.BuildOptions(workers=np.int32(2), threads=np.int64(1))
+    assert (type(options.workers), options.workers, options.threads) == (int, 2, 1)
+    with pytest.raises(InputError, match=r"--samples 2\.0: must be a whole number from 1"):
+        vbnfault.build(small(), tmp_path / "s.zarr", samples=2.0)  # type: ignore[arg-type]
+    summary = vbnfault.build(small(), tmp_path / "s.zarr", samples=np.int64(2), dry_run=True, progress=False)
+    assert summary.samples == 2
+
+
+def test_a_merge_of_one_text_is_refused(tmp_path: Path) -> None:
+    """A text is a sequence, too: its letters would be taken for stores."""
+    with pytest.raises(InputError, match=r"stores = 'a\.zarr': must be a list of stores"):
+        vbnfault.merge("a.zarr", tmp_path / "out.zarr")
 
 
 def test_lens_sensor_and_flare_are_at_hand() -> None:

@@ -10,6 +10,8 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import json
+import operator
+import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache, wraps
@@ -131,9 +133,11 @@ def parse(kind: type[T], plain: Mapping[str, Any], *, source: str, overrides: Se
 def replace(table: dict[str, Any], values: Mapping[str, Any], *, source: str) -> None:
     """Replace values of plain data, given by dotted key. Raises InputError where a key leads through a value.
 
-    An entry of a list is named as in messages, `factor[0].low`, or by a dot, `factor.0.low`.
+    An entry of a list is named as in messages, `factor[0].low`, or by a dot, `factor.0.low`. A value may hold
+    numbers and arrays of numpy, tuples and paths.
     """
-    for key, value in values.items():
+    for key, given in values.items():
+        value = _as_plain(given)
         *parents, leaf = dotted(key).split(".")
         node: Any = table
         for i, parent in enumerate(parents):
@@ -147,6 +151,26 @@ def replace(table: dict[str, Any], values: Mapping[str, Any], *, source: str) ->
             node[_entry(node, leaf, ".".join(parents), f"{source}: {key} = {shown(value)}")] = value
         else:
             node[leaf] = value
+
+
+def _as_plain(value: Any) -> Any:
+    """Return a value of Python code as a file would hold it: numbers of numpy as numbers, arrays as lists."""
+    if isinstance(value, Mapping):
+        return {key: _as_plain(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_as_plain(part) for part in value]
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    as_list = getattr(value, "tolist", None)
+    return value if as_list is None else as_list()
+
+
+def whole(value: object) -> int | None:
+    """Return a whole number of Python or of numpy as an int; None for anything else, such as 2.0 or True."""
+    try:
+        return None if isinstance(value, bool) else operator.index(value)  # type: ignore[arg-type]
+    except TypeError:
+        return None
 
 
 def dotted(key: str) -> str:

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import store as store_module
-from ..core import environment
+from ..core import environment, tables
 from ..core.errors import InputError, VbnfaultError, shown
 from ..core.interrupts import Stopped, exit_code, finishing, interruptible
 from ..store import FaultCounts, Location, Planned, Store, StoreSpec, Url, files_of, located
@@ -94,9 +94,9 @@ class BuildOptions:
     recycle_shards: int = 32
 
     def __post_init__(self) -> None:
-        _check_whole("workers", self.workers)
+        object.__setattr__(self, "workers", _checked("workers", self.workers))
         if self.threads is not None:
-            _check_whole("threads", self.threads)
+            object.__setattr__(self, "threads", _checked("threads", self.threads))
         if self.recycle_shards < 1:
             raise InputError(f"recycle_shards = {self.recycle_shards}: must be at least 1")
         if self.scheduler is not None and self.workers > 1:
@@ -124,12 +124,14 @@ class BuildOptions:
         return part
 
 
-def _check_whole(option: str, value: int) -> None:
-    """Raise InputError unless an option's value is a whole number from 1 to `_MOST_PROCESSES`."""
-    if type(value) is not int or value < 1:
+def _checked(option: str, value: int) -> int:
+    """Return an option's value. Raises InputError unless it is a whole number from 1 to `_MOST_PROCESSES`."""
+    number = tables.whole(value)
+    if number is None or number < 1:
         raise InputError(f"--{option} {shown(value)}: must be at least 1, and a whole number")
-    if value > _MOST_PROCESSES:
+    if number > _MOST_PROCESSES:
         raise InputError(f"--{option} {shown(value)}: must be at most {_MOST_PROCESSES}")
+    return number
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from .. import pipeline, store
-from ..core import environment, file_contents, llvm
+from ..core import environment, file_contents, llvm, tables
 from ..core.errors import InputError, shown
 from ..core.quantities import Sample
 from ..scene import config, plan
@@ -183,9 +183,10 @@ def _with_samples(scene: Scene, samples: int | None) -> Scene:
     """Return the scene with another number of samples, if one is given. Raises InputError outside its range."""
     if samples is None:
         return scene
-    if type(samples) is not int or not 1 <= samples <= _MOST_SAMPLES:
-        raise InputError(f"--samples {shown(samples)}: must be from 1 to {_MOST_SAMPLES}")
-    return scene.model_copy(update={"dataset": scene.dataset.model_copy(update={"samples": samples})})
+    number = tables.whole(samples)
+    if number is None or not 1 <= number <= _MOST_SAMPLES:
+        raise InputError(f"--samples {shown(samples)}: must be a whole number from 1 to {_MOST_SAMPLES}")
+    return scene.model_copy(update={"dataset": scene.dataset.model_copy(update={"samples": number})})
 
 
 def describe_scene(scene: Scene, *, source: str) -> list[str]:

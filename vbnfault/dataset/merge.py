@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import store as store_module
-from ..core.errors import InputError, VbnfaultError
+from ..core.errors import InputError, VbnfaultError, shown
 from ..core.interrupts import Stopped, check, exit_code, finishing, interruptible
 from ..store import Location, SampleDigests, Store, StoreSpec, Url, located, spans
 from . import card, versions
@@ -117,6 +117,8 @@ def join_stores(
         After Ctrl-C, SIGTERM or SIGHUP; the same call resumes.
     """
     target = located(out)
+    if isinstance(stores, str | os.PathLike):
+        raise InputError(f"stores = {shown(stores)}: must be a list of stores, not one of them")
     paths = dict.fromkeys(map(located, stores))
     sources = [store_module.open_store(path) for path in paths if not _same(path, target)]
     if not sources:

@@ -14,8 +14,8 @@ import numpy as np
 from ..body import Body, Fractured, Patch, PatchSpec, Site, Sites, cached_patch, choose_sites
 from ..body.refine import GROWTH_POWER
 from ..camera import Camera
-from ..core import activity
-from ..core.errors import InputError, in_file, under_key
+from ..core import activity, tables
+from ..core.errors import InputError, in_file, shown, under_key
 from ..core.memory import release_unused
 from ..core.quantities import SOFT_KINDS, Sample
 from ..faults import Fault, dataset_order, from_dict, load_plugins, plugins_of
@@ -41,6 +41,7 @@ _TERRAIN_BYTES, _RENDER_BYTES = 400 << 20, 300 << 20
 # Leaving out the smallest boulders is usual: the packaged scenes keep at least a quarter of those that are drawn. A
 # smaller fraction than this one means that the ground takes nearly all triangles.
 _FEWEST_KEPT = 0.05
+_MOST_THREADS = 1024  # more than any machine has
 
 
 def simulate(
@@ -71,10 +72,7 @@ def simulate(
         source, scene = str(scene), config.load_scene(scene)
     else:
         source = "scene"
-    session = Session(scene, threads=threads, source=source, poses=poses)
-    if not 0 <= sample < len(session.plan):
-        raise InputError(f"{source}: sample {sample}: must be from 0 to {len(session.plan) - 1}")
-    return session.simulate(sample)
+    return Session(scene, threads=threads, source=source, poses=poses).simulate(sample)
 
 
 # --- a session: many samples of one scene ------------------------------------------------------------------
@@ -200,6 +198,8 @@ class Session:
         self.faults = configure_faults(scene, source)
         need_sun = [name for name, fault in self.faults.items() if fault.needs_sun]
         self.plan = plan.make_plan(scene, list(self.faults), blocks, need_sun=need_sun)
+        if threads is not None and not 1 <= (tables.whole(threads) or 0) <= _MOST_THREADS:
+            raise InputError(f"threads = {shown(threads)}: must be a whole number from 1 to {_MOST_THREADS}")
         self.source = source
         self._threads = threads
         self._ground: dict[int, list[GroundDetail]] = {}  # of the rows of a site
@@ -388,9 +388,17 @@ class Session:
         """Return everything that `simulate` needs for one sample.
 
         On a trajectory every view has its own date, and with a table of poses its own distance of the Sun.
+
+        Raises
+        ------
+        InputError
+            The scene plans no such sample.
         """
         with in_file(self.source):
-            return self._spec(index)
+            number = tables.whole(index)
+            if number is None or not 0 <= number < len(self.plan):
+                raise InputError(f"sample {shown(index)}: must be a whole number from 0 to {len(self.plan) - 1}")
+            return self._spec(number)
 
     def _spec(self, index: int) -> SampleSpec:
         """Return what `spec` does; the messages of its errors do not name the scene."""
