@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vbnfault.core import resources
+from vbnfault.core import resources, toml_files
 from vbnfault.core.errors import InputError
 from vbnfault.lens import load_lens, paraxial_properties, parse_lens, scaled_to_field, scaled_to_focal_length
 from vbnfault.lens import rays as trace_module
@@ -350,6 +351,22 @@ def test_the_command_draws_and_tabulates(
     assert not Path("x.json").exists()
     assert run(monkeypatch, "lens", "tessar_50_f2p8", "--json", tmp_path) == 2
     assert "cannot be written" in capsys.readouterr().err
+
+
+def test_a_lens_without_a_source_with_its_stop_behind_reads_well(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from test_cli import run
+
+    monkeypatch.chdir(tmp_path)
+    glass = {"radius_mm": 50.0, "thickness_mm": 2.0, "nd": 1.5, "diameter_mm": 10.0}
+    plane = {"radius_mm": float("inf"), "thickness_mm": 3.0, "diameter_mm": 10.0}
+    rows = [glass, plane, {"stop": True, "diameter_mm": 8.0}]
+    Path("rear.toml").write_text(toml_files.toml_text({"name": "Rear stop", "surface": rows}))
+    assert run(monkeypatch, "lens", "rear.toml") == 0
+    printed = capsys.readouterr().out
+    assert printed.startswith("Rear stop: 3 surfaces\n")  # no comma before a source that is not there
+    assert re.search(r"exit_pupil_mm +0\.0000", printed)  # not -0.0000
 
 
 # --- paraxial ghosts --------------------------------------------------------------------------------------------

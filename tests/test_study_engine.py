@@ -278,6 +278,18 @@ def test_a_study_whose_evaluations_all_fail_is_stopped(tmp_path: Path) -> None:
         )
 
 
+class Forgetful(kit.Function):
+    """Leave the metric out."""
+
+    def evaluate(self, evaluation: Evaluation) -> Mapping[str, float]:
+        return {}
+
+
+def test_a_metric_without_a_value_is_named(tmp_path: Path) -> None:
+    with pytest.raises(vbnfault.study.StudyFailed, match=r"the evaluator gives no value for y, of metrics\.names"):
+        run.run_study(kit.spec(), tmp_path / "s", QUIET, report=False, evaluator=Forgetful)
+
+
 def test_incomplete_blocks_count_where_they_are_complete() -> None:
     spec = kit.spec(2, 0.0, 1.0, design={"n": 128}, scene={"samples": 2})
     design = make_design(spec)

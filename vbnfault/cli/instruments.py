@@ -91,7 +91,8 @@ def lens(
     prescription = adapted_lens(LensRequest(lens=lens, **vars(options)))
     path = Path(f"{Path(lens).stem}.png") if out is None else out
     check_image_path(path, ".png")
-    typer.echo(f"{prescription.name}: {len(prescription.surfaces)} surfaces, {prescription.source}")
+    source = f", {prescription.source}" if prescription.source else ""
+    typer.echo(f"{prescription.name}: {len(prescription.surfaces)} surfaces{source}")
     for name, value in lens_sheet.figures(prescription).items():
         typer.echo(f"  {name:<28}{value:10.4f}")
     if json_ is not None:

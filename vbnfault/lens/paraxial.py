@@ -95,7 +95,7 @@ def paraxial_properties(lens: Prescription, wavelength_nm: float = D_NM) -> Para
         bfd_mm=bfd,
         entrance_pupil_mm=float(front[0, 1] / front[0, 0]),
         entrance_pupil_diameter_mm=entrance_diameter,
-        exit_pupil_mm=float(-back[0, 1] / back[1, 1]),
+        exit_pupil_mm=float(-back[0, 1] / back[1, 1]) + 0.0,  # a stop in the last row: 0, not -0
         exit_pupil_diameter_mm=float(2 * abs(radius * np.linalg.det(back) / back[1, 1])),
         f_number=efl / entrance_diameter,
     )

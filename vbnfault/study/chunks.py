@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from ..core import activity, file_contents
-from ..core.errors import InputChanged, VbnfaultError
+from ..core.errors import InputChanged, InputError, VbnfaultError
 from ..core.interrupts import check, finishing
 from ..dataset.progress import Progress
 from ..dataset.work import Fatal, Lazy, Queue, Tick, describe
@@ -150,6 +150,9 @@ class ChunkWorker:
                 values = evaluator.evaluate(evaluation)
         except InputChanged as error:  # every other evaluation would fail, too
             raise Fatal(error) from error
+        missing = [name for name in self._source.metrics if name not in values]
+        if missing:
+            raise InputError(f"the evaluator gives no value for {', '.join(missing)}, of metrics.names")
         return {name: float(values[name]) for name in self._source.metrics}
 
 
