@@ -16,7 +16,9 @@ import cv2
 import numpy as np
 import pytest
 from synthetic import filled
+from typer.testing import CliRunner
 
+from vbnfault import cli
 from vbnfault import store as st
 from vbnfault.core import registry
 from vbnfault.core.errors import InputError, VbnfaultError
@@ -464,6 +466,11 @@ def test_bad_input_is_one_sentence(described_store: Path, tmp_path: Path) -> Non
 
     refused(r"--format 'pgn': there is no such format \(did you mean png\?\)", name="pgn")
     refused(r"--workers 0: must be a whole number from 1 to 64", workers=0)
+    refused(r"--masks 'soft': must be one of footprint, effect", masks="soft")
+    refused("--masks effect: png writes every mask of the store by its name; leave it out", masks="effect")
+    plain = filled(tmp_path / "plain.zarr", samples=4, layers=())
+    sentence = "--masks effect: .*plain.zarr has no layer mask_effect; add it"
+    refused(sentence, name="coco", masks="effect", store=plain.path)
     refused("lies in the store", out=described_store / "png")
     refused("no such store", store=tmp_path / "none.zarr")
     photos = tmp_path / "photos"
@@ -478,6 +485,38 @@ def test_bad_input_is_one_sentence(described_store: Path, tmp_path: Path) -> Non
     half = filled(tmp_path / "half.zarr", samples=4)
     half._write_done(0, {0, 2})
     refused("half.zarr: 2 of 4 samples are finished", store=half.path)
+
+
+@pytest.mark.parametrize("name", ["coco", "webdataset", "huggingface", "yolo"])
+def test_masks_of_the_effect_replace_the_footprints(name: str, described_store: Path, tmp_path: Path) -> None:
+    """Two stores in which the two masks are exchanged: the effect of one is the footprint of the other."""
+    first, second = (st.open_store(shutil.copytree(described_store, tmp_path / s), "r+") for s in ("a", "b"))
+    for index in range(SAMPLES):
+        sample = first.read_sample(index)
+        footprint, effect = sample.layers["mask"], sample.layers["mask"].copy()
+        effect[:, : effect.shape[1] // 2] = False
+        for store, one, other in ((first, footprint, effect), (second, effect, footprint)):
+            layers = {"mask": one, "mask_effect": other, "mask_any": st.mask_union(store.spec, one)}
+            st.write_samples(store, [replace(sample, layers={**sample.layers, **layers})])
+    export_store(first, tmp_path / "effect", name, masks="effect", progress=False)
+    export_store(second, tmp_path / "footprint", name, progress=False)
+    export_store(first, tmp_path / "plain", name, progress=False)
+    texts = {"README.md", "croissant.json", "export.json"}
+    effect, footprint, plain = (
+        {k: v for k, v in tree(tmp_path / folder).items() if k not in texts}
+        for folder in ("effect", "footprint", "plain")
+    )
+    assert effect == footprint != plain
+    assert "- Masks: `effect`" in (tmp_path / "effect/README.md").read_text()
+    assert "- Masks: `footprint`" in (tmp_path / "plain/README.md").read_text()
+    with pytest.raises(InputError, match="holds another export: masks is 'effect' there and 'footprint' now"):
+        export_store(first, tmp_path / "effect", name, progress=False)
+
+
+def test_the_command_passes_the_masks_on(described_store: Path, tmp_path: Path) -> None:
+    arguments = ["export", str(described_store), "--format", "yolo", "--out", str(tmp_path / "e")]
+    assert CliRunner().invoke(cli.app, [*arguments, "--masks", "effect"]).exit_code == 0
+    assert json.loads((tmp_path / "e/export.json").read_text())["masks"] == "effect"
 
 
 def test_another_store_or_format_does_not_mix_into_an_export(

@@ -22,12 +22,16 @@ def export(
         typer.Option(metavar="FORMAT", help="One of coco, exr, huggingface, png, webdataset and yolo."),
     ],
     out: Annotated[Path, local_path("Folder for the files; an interrupted export in it is resumed.")],
+    masks: Annotated[
+        str,
+        typer.Option(metavar="RULE", help="Which mask the files hold: footprint or effect; exr and png hold both."),
+    ] = "footprint",
     workers: Annotated[int, whole(1, 64, "Number of threads; the files do not depend on it.")] = 2,
 ) -> None:
     """Write a finished store in the format of other tools, with its splits, classes and a card."""
     from ..output.export import export_store
 
-    for line in export_store(store, out, format, workers=workers).lines():
+    for line in export_store(store, out, format, masks=masks, workers=workers).lines():
         typer.echo(line)
 
 

@@ -18,7 +18,7 @@ scalars (everything else). These rules protect a store against kills, power loss
   rebuilt.
 """
 
-from .arrays import EFFECT_RULE, LAYERS, REQUIRED_LAYERS, SCALARS, SEMANTIC, Array, Member
+from .arrays import EFFECT_RULE, LAYERS, MASK_RULES, REQUIRED_LAYERS, SCALARS, SEMANTIC, Array, Member
 from .bucket import OWN, Bucket, Url
 from .check import (
     Planned,
@@ -51,6 +51,7 @@ __all__ = [
     "EFFECT_RULE",
     "FORMAT_VERSION",
     "LAYERS",
+    "MASK_RULES",
     "OWN",
     "REQUIRED_LAYERS",
     "SCALARS",

@@ -278,6 +278,8 @@ EFFECT_RULE = (
     "and the others are kept"
 )
 MASK_ANY_RULE = "union of the masks of the classes in the attribute faults, which dataset.mask_any chose"
+# The layer of each kind of mask that a reader may ask for.
+MASK_RULES = {"footprint": "mask", "effect": "mask_effect"}
 REQUIRED_LAYERS = ("image", "mask", "mask_any", "clean")
 
 # Scalars and small vectors: one chunk holds a whole shard, so that a task writes whole chunks.

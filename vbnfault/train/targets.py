@@ -9,10 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import InputError, shown
-from ..store import SCALARS, Store
+from ..store import MASK_RULES, SCALARS, Store
 from .selection import known_classes
-
-MASK_RULES = {"footprint": "mask", "effect": "mask_effect"}
 
 
 class Target(NamedTuple):

@@ -4,12 +4,20 @@ from __future__ import annotations
 
 from ...dataset.card import described
 from ...dataset.statistics import Statistics
-from ...store import Store
+from ...store import EFFECT_RULE, Store
 from .contract import Closing, Format
 
+_ABOUT_MASKS = {
+    "footprint": ("- Masks: `footprint`. `mask` is that of the store, by the rules of the table below.",),
+    "effect": (
+        f"- Masks: `effect`. What is called `mask` here is `mask_effect` of the store, not the footprint of the "
+        f"table below: {EFFECT_RULE}. `mask_any` is the union of these masks.",
+    ),
+}
 
-def export_card(store: Store, kind: Format, closing: Closing, numbers: Statistics) -> str:
-    """Return the card of an export as Markdown."""
+
+def export_card(store: Store, kind: Format, closing: Closing, numbers: Statistics, masks: str) -> str:
+    """Return the card of an export as Markdown; `masks`: footprint or effect."""
     title = store.attributes.get("title") or "untitled dataset"
     front = ["---", *closing.front, "---", ""] if closing.front else []
     lines = [
@@ -23,6 +31,7 @@ def export_card(store: Store, kind: Format, closing: Closing, numbers: Statistic
         "",
         *kind.usage,
         *closing.lines,
+        *(_ABOUT_MASKS[masks] if "mask_effect" not in kind.layers(store.spec) else ()),
         "- `samples.jsonl`: one line of JSON for each sample, with its file, its split, the names of "
         "its faults, pose, "
         "Sun, exposure, and every drawn parameter of every fault.",

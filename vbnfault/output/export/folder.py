@@ -22,6 +22,7 @@ from ...store import disk
 STATE = "export.json"
 _PARTS = ".parts"
 _OWN = re.compile(rf"{re.escape(STATE)}\.[0-9a-f]{{32}}{re.escape(disk.PARTIAL)}")
+_UNSAID = {"masks": "footprint"}  # what holds where `export.json` does not name a key
 _FILES_AT_ONCE = 8  # files that are open and in memory at once, in each thread
 
 
@@ -75,7 +76,7 @@ class Folder:
                 f"{self.path}: holds something else than an export of vbnfault, so it is left alone; choose "
                 "another --out"
             )
-        differing = [key for key in identity if state.get(key) != identity[key]]
+        differing = [key for key in identity if state.get(key, _UNSAID.get(key)) != identity[key]]
         if differing:
             key = differing[0]
             raise InputError(

@@ -8,7 +8,7 @@ import os
 import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from ...dataset.croissant import columns, croissant
 from ...dataset.lock import locked
 from ...dataset.progress import Progress
 from ...dataset.statistics import Statistics, statistics
-from ...store import SPLITS, STRATA, Store, Url, disk, open_store
+from ...store import MASK_RULES, SPLITS, STRATA, Store, Url, disk, mask_union, open_store
 from ..json_files import plain
 from .card import export_card
 from .contract import ExportPart, Finished, Format, formats
@@ -57,6 +57,7 @@ def export_store(
     out: str | os.PathLike[str],
     format: str,
     *,
+    masks: str = "footprint",
     workers: int = 1,
     progress: bool = True,
 ) -> ExportSummary:
@@ -72,6 +73,8 @@ def export_store(
         Folder of the export; made if missing.
     format
         Name of a format: coco, exr, huggingface, png, webdataset, yolo, or one of a plug-in.
+    masks
+        "footprint" or "effect": which mask the files hold. The formats exr and png hold both, each by its name.
     workers
         Number of threads, 1 to 64. Each holds one sample in memory.
     progress
@@ -93,10 +96,12 @@ def export_store(
     _check_place(store, target)
     _check_finished(store)
     kind = known[format]()
+    _check_masks(store, kind, masks)
     identity = {
         "format": format,
         "vbnfault": __version__,
         "samples": store.samples,
+        "masks": masks,
         "contents_sha256": _contents_sha256(store),
     }
     with locked(target), disk.explained(target, "writing the export"):
@@ -105,8 +110,8 @@ def export_store(
             folder.clear()
             return ExportSummary(path=target, format=format, samples=store.samples, written=0)
         with Progress(store.samples, shown=progress) as bar:
-            written = _write_parts(store, kind, parts, folder, bar, workers)
-        warnings = _finish(store, kind, parts, folder)
+            written = _write_parts(store, kind, parts, folder, bar, workers, masks)
+        warnings = _finish(store, kind, parts, folder, masks)
         folder.end(identity)
     return ExportSummary(path=target, format=format, samples=store.samples, written=written, warnings=warnings)
 
@@ -131,6 +136,22 @@ def _check_finished(store: Store) -> None:
             f"{store.path}: {finished} of {store.samples} samples are finished; run the build command again, and "
             "export the store when it is complete"
         )
+
+
+def _check_masks(store: Store, kind: Format, masks: str) -> None:
+    """Refuse a kind of mask that does not exist, that the store lacks, or that the format does not choose."""
+    if masks not in MASK_RULES:
+        raise InputError(f"--masks {shown(masks)}: must be one of {', '.join(MASK_RULES)}")
+    if masks == "footprint":
+        return
+    layer, read = MASK_RULES[masks], kind.layers(store.spec)
+    if layer not in store.spec.pixel_layers:
+        raise InputError(
+            f"--masks {masks}: {store.path} has no layer {layer}; add it to dataset.layers and build the dataset "
+            "again, or export footprints"
+        )
+    if layer in read or "mask" not in read:
+        raise InputError(f"--masks {masks}: {kind.name} writes every mask of the store by its name; leave it out")
 
 
 def _contents_sha256(store: Store) -> str:
@@ -168,7 +189,13 @@ def _parts(store: Store, size: int) -> tuple[ExportPart, ...]:
 
 
 def _write_parts(
-    store: Store, kind: Format, parts: Sequence[ExportPart], folder: Folder, bar: Progress, workers: int
+    store: Store,
+    kind: Format,
+    parts: Sequence[ExportPart],
+    folder: Folder,
+    bar: Progress,
+    workers: int,
+    masks: str,
 ) -> int:
     """Write the parts that are not finished yet, and return how many samples that were."""
     missing = []
@@ -183,7 +210,7 @@ def _write_parts(
     pool = ThreadPoolExecutor(workers)
     try:
         for part in missing:
-            running.add(pool.submit(_write_part, store, kind, part, folder, stop))
+            running.add(pool.submit(_write_part, store, kind, part, folder, stop, masks))
             if len(running) >= workers:
                 running = _finished_of(running, bar)
         while running:
@@ -203,10 +230,12 @@ def _finished_of(running: set[Future[ExportPart]], bar: Progress) -> set[Future[
     return rest
 
 
-def _write_part(store: Store, kind: Format, part: ExportPart, folder: Folder, stop: threading.Event) -> ExportPart:
+def _write_part(
+    store: Store, kind: Format, part: ExportPart, folder: Folder, stop: threading.Event, masks: str
+) -> ExportPart:
     """Write the files of a part, and then its record."""
     own, rows = folder.fresh(), []
-    layers = kind.layers(store.spec)
+    layers = {*kind.layers(store.spec)} | ({MASK_RULES[masks]} if masks != "footprint" else set())
 
     def samples() -> Iterator[Sample]:
         for index in part.samples:
@@ -214,11 +243,19 @@ def _write_part(store: Store, kind: Format, part: ExportPart, folder: Folder, st
                 raise VbnfaultError("the export was stopped")
             sample = store.read_sample(index, layers)
             rows.append(_row(store, sample))
-            yield sample
+            yield sample if masks == "footprint" else _with_masks(store, sample, MASK_RULES[masks])
 
     entries = kind.write_part(store, part, samples(), own)
     own.write_part(part.number, {"entries": entries, "rows": rows})
     return part
+
+
+def _with_masks(store: Store, sample: Sample, layer: str) -> Sample:
+    """Return a sample whose masks, and the union of them, are those of another layer of masks."""
+    masks = sample.layers[layer]
+    of_masks = {"mask": masks, "mask_any": mask_union(store.spec, masks)}
+    layers = {name: of_masks.get(name, values) for name, values in sample.layers.items() if name != layer}
+    return replace(sample, layers=layers)
 
 
 def _row(store: Store, sample: Sample) -> dict[str, Any]:
@@ -234,7 +271,7 @@ def _row(store: Store, sample: Sample) -> dict[str, Any]:
 # --- at the end ---------------------------------------------------------------------------------------------
 
 
-def _finish(store: Store, kind: Format, parts: Sequence[ExportPart], folder: Folder) -> tuple[str, ...]:
+def _finish(store: Store, kind: Format, parts: Sequence[ExportPart], folder: Folder, masks: str) -> tuple[str, ...]:
     """Write index, table of samples, card and Croissant description, and return the format's warnings."""
     splits = tuple(dict.fromkeys(part.split for part in parts))
     closing = kind.finish(Finished(store=store, splits=splits, parts=tuple(parts), folder=folder))
@@ -253,7 +290,7 @@ def _finish(store: Store, kind: Format, parts: Sequence[ExportPart], folder: Fol
     numbers = statistics(store)
     folder.put(
         [
-            ("README.md", export_card(store, kind, closing, numbers).encode()),
+            ("README.md", export_card(store, kind, closing, numbers, masks).encode()),
             ("croissant.json", to_json(_croissant(store, kind, digest.hexdigest(), numbers)).encode()),
         ]
     )
