@@ -14,12 +14,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import vbnfault
-from vbnfault import dataset
+from vbnfault import dataset, pipeline
 from vbnfault.body import PatchSpec
 from vbnfault.core.errors import InputError
 from vbnfault.dataset import describe
 from vbnfault.scene import config
-from vbnfault.scene.trajectory import COLUMNS, FlownPose, as_trajectory, load_trajectory
+from vbnfault.scene.trajectory import COLUMNS, FlownPose, Trajectory, as_trajectory, load_trajectory
 from vbnfault.world import assemble, ground
 
 Rows = list[dict[str, Any]]
@@ -428,6 +428,42 @@ def test_a_row_that_shows_the_rim_of_the_body_looks_not_past_it(
     path = scene_file(tmp_path, sphere, [row("near", (8000.0, 0.0, 0.0), **values)])
     text = "\n".join(dataset.describe_scene(config.load_scene(path), source="flown"))
     assert ("1 of 1 rows look past the body" in text) == looks_past
+
+
+@pytest.mark.parametrize(("radii", "is_inside"), [(0.98, True), (1.02, False)])
+def test_the_description_warns_of_rows_inside_the_body(
+    radii: float, is_inside: bool, tmp_path: Path, sphere: str
+) -> None:
+    table = [row("out", (30000.0, 0.0, 0.0)), row("low", (0.0, radii * RADIUS_M, 0.0))]
+    text = "\n".join(dataset.describe_scene(config.load_scene(scene_file(tmp_path, sphere, table)), source="flown"))
+    assert ("warning: 1 of 2 rows have the camera inside the body, the first is low; its" in text) == is_inside
+
+
+def test_the_boresights_of_a_table_are_those_of_its_poses() -> None:
+    turns = np.random.default_rng(3).standard_normal((20, 4))
+    turns /= np.linalg.norm(turns, axis=1, keepdims=True)
+    turned = [dict(zip("wxyz", map(float, turn), strict=True)) for turn in turns]
+    rows = [
+        row(f"r{k}", (0, 0, 9e3), **{f"camera_from_T_{n}": v for n, v in turn.items()})
+        for k, turn in enumerate(turned)
+    ]
+    table = as_trajectory({name: [r[name] for r in rows] for name in COLUMNS})
+    assert np.array_equal(table.boresight_T, np.stack([table.pose(k).T_from_C[:, 2] for k in range(len(rows))]))
+
+
+def test_a_description_of_many_rows_makes_no_pose_of_each(
+    tmp_path: Path, sphere: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    turned = dict(zip((f"camera_from_T_{n}" for n in "wxyz"), (1.0, 0.0, 0.0, 0.0), strict=True))  # boresight +z
+    scene = config.load_scene(
+        scene_file(tmp_path, sphere, [row(f"r{k}", (0, 0, 9e3), **turned) for k in range(50)])
+    )
+    made: list[int] = []
+    pose = Trajectory.pose
+    monkeypatch.setattr(Trajectory, "pose", lambda s, k: made.append(k) or pose(s, k))
+    session = pipeline.Session(scene)
+    assert describe._rows_that_miss_the_body(session, session.trajectory, 50)
+    assert not made
 
 
 def test_a_scene_made_in_python_has_the_samples_of_its_table(tmp_path: Path, sphere: str) -> None:

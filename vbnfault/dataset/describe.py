@@ -218,6 +218,7 @@ def _trajectory(session: Session, table: Trajectory) -> list[str]:
         f"phase angle at the centre of mass {_span(min(phase), max(phase))} deg",
         f"Sun: {_span(distance.min(), distance.max())} au away, dates {date.min():.5f} to {date.max():.5f} TDB",
         *_rows_that_miss_the_body(session, table, count),
+        *_rows_inside_the_body(session, table, count),
     ]
 
 
@@ -229,14 +230,29 @@ def _rows_that_miss_the_body(session: Session, table: Trajectory, count: int) ->
     radius_m = np.linalg.norm(body.vertices_m - body.centre_of_mass_T_m, axis=1).max()
     to_body_m = body.centre_of_mass_T_m - table.camera_position_T_m[:count]
     distance_m = np.maximum(np.linalg.norm(to_body_m, axis=1), radius_m)
-    boresight = np.stack([table.pose(k).T_from_C[:, 2] for k in range(count)])
-    cosine = np.clip((to_body_m * boresight).sum(axis=1) / distance_m, -1, 1)
+    cosine = np.clip((to_body_m * table.boresight_T[:count]).sum(axis=1) / distance_m, -1, 1)
     past = np.flatnonzero(np.arccos(cosine) > half_diagonal + np.arcsin(radius_m / distance_m))
     if not past.size:
         return []
     return [
         f"warning: {len(past)} of {count} rows look past the body, the first is {table.name[past[0]]}; "
         "camera_from_T takes the components of a vector from T to the camera's axes, w first"
+    ]
+
+
+def _rows_inside_the_body(session: Session, table: Trajectory, count: int) -> list[str]:
+    """Return a warning of the rows whose camera lies below the surface of the shape; [] if there are none."""
+    body, position_T_m = session.body, table.camera_position_T_m[:count]
+    low, high = body.vertices_m.min(axis=0), body.vertices_m.max(axis=0)
+    near = np.flatnonzero(((position_T_m >= low) & (position_T_m <= high)).all(axis=1))
+    inside = [k for k in near[:_POSES_DESCRIBED].tolist() if ground.encloses(body, position_T_m[k])]
+    if not inside:
+        return []
+    least = "at least " if len(near) > _POSES_DESCRIBED else ""
+    return [
+        f"warning: {least}{len(inside)} of {count} rows have the camera inside the body, the first is "
+        f"{table.name[inside[0]]}; its sample cannot be built: choose other poses, or the body.shape that the "
+        "poses were made for"
     ]
 
 

@@ -124,6 +124,12 @@ class Trajectory:
             sun_distance_au=np.repeat(self.sun_distance_au, count),
         )
 
+    @property
+    def boresight_T(self) -> F64:
+        """Return the camera's boresight in T of every row, float64[row, 3], unit length."""
+        w, x, y, z = self.camera_from_T.T
+        return np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=-1)
+
     def pose(self, index: int) -> FlownPose:
         """Return one row, counted from 0."""
         w, x, y, z = self.camera_from_T[index]
