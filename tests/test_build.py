@@ -253,6 +253,18 @@ def test_dry_run_touches_nothing(tmp_path: Path) -> None:
     assert summary.lines()[1].startswith("estimated time: 2.0 h, ")
 
 
+def test_a_dry_run_refuses_the_paths_that_a_build_refuses(tmp_path: Path) -> None:
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos/cat.png").touch()
+    run(tmp_path / "s.zarr")
+    sentence = "is no vbnfault store, so it is left alone; choose another --out"
+    inside = tmp_path / "s.zarr/a.zarr"
+    for out, why in ((Path("/"), sentence), (tmp_path / "photos", sentence), (inside, "lies in the store")):
+        for dry_run in (True, False):
+            with pytest.raises(InputError, match=why):
+                run(out, dry_run=dry_run)
+
+
 def test_one_site_is_no_plural(tmp_path: Path) -> None:
     values = {"path": tmp_path / "s.zarr", "finished": 0, "estimated_bytes": 10, "free_bytes": 100}
     one, two = (bd.Summary(samples=n, shards=n, sites=n, **values).outlook()[0] for n in (1, 2))

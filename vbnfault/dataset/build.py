@@ -309,6 +309,8 @@ def build(
     options, path = options or BuildOptions(), located(out)
     summary = _outlook(plan, path, options)
     if options.dry_run:
+        if not store_module.is_store(path):
+            store_module.check_free(path, plan.spec, len(plan.site))
         return summary
     _check_room(summary, plan.spec)
     if options.scheduler is not None:

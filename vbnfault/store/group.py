@@ -46,14 +46,21 @@ def create(path: str | os.PathLike[str] | Url, spec: StoreSpec, samples: int, *,
     old = is_store(target)
     if old and not overwrite:
         raise InputError(f"{target}: exists already; resume it, or give --overwrite to replace it")
-    why = "" if old else files.why_occupied(name for name, _ in group_files(spec, samples)) or _why_within(target)
-    if why:
-        raise InputError(f"{target}: {why}")
+    if not old:
+        check_free(target, spec, samples)
     try:
         files.create(group_files(spec, samples), old=old)
     except OSError as error:
         raise InputError(f"{target}: no store can be created here: {error.strerror or error}") from error
     return open_store(target, "r+")
+
+
+def check_free(path: str | os.PathLike[str] | Url, spec: StoreSpec, samples: int) -> None:
+    """Raise InputError if no store can be created at a path because of what lies there, or around it."""
+    target = located(path)
+    names = (name for name, _ in group_files(spec, samples))
+    if why := files_of(target).why_occupied(names) or _why_within(target):
+        raise InputError(f"{target}: {why}")
 
 
 def _why_within(target: Location) -> str:
