@@ -214,6 +214,12 @@ def test_a_bias_below_the_largest_number_leaves_a_gain(bits: int, bias: int) -> 
     assert ThreeColourDetector(adc_bits=camera.adc_bits, bias_dn=camera.bias_dn).gain_dn_per_e > 0
 
 
+@pytest.mark.parametrize("bias", [-1, 255, 4096])
+def test_a_detector_made_in_python_refuses_a_bias_without_codes_for_the_signal(bias: int) -> None:
+    with pytest.raises(InputError, match=rf"bias_dn = {bias}: must be from 0 to 254 with adc_bits = 8"):
+        ThreeColourDetector(adc_bits=8, bias_dn=bias)
+
+
 @settings(max_examples=60)  # the first example loads what the faults need
 @given(
     st.dictionaries(

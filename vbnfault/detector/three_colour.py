@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.errors import InputError
 from ..core.quantities import LUMINANCE, RGBI, Electrons, Irradiance, RawDN
 from .blocks import blockwise, pool
 from .efficiency import QuantumEfficiency, white_balance
@@ -68,6 +69,13 @@ class ThreeColourDetector:
     # each pixel of the image is independent of the others
     local: ClassVar[bool] = True
     channels: ClassVar[tuple[str, ...]] = ("R", "G", "B")
+
+    def __post_init__(self) -> None:
+        """Raise InputError unless the bias leaves codes for the signal, as a scene file must."""
+        if not 0 <= self.bias_dn < self.adc_max_dn:
+            raise InputError(
+                f"bias_dn = {self.bias_dn}: must be from 0 to {self.adc_max_dn - 1} with adc_bits = {self.adc_bits}"
+            )
 
     def draw_noise(self, shape: tuple[int, int], rng: Callable[[str], np.random.Generator]) -> Noise:
         """Draw the variates of one exposure. `rng` returns the random generator for a name."""
