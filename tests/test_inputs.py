@@ -27,6 +27,7 @@ from vbnfault.body.shape import signed_volume
 from vbnfault.cli.options import finite
 from vbnfault.core import html_page, images, path_checks, resources, spice, user_files
 from vbnfault.core.errors import InputError, VbnfaultError, shown
+from vbnfault.core.whole_files import write_whole
 from vbnfault.dataset.lock import locked
 from vbnfault.detector.sensor import load_sensor
 from vbnfault.faults import from_dict, registry
@@ -486,6 +487,19 @@ def test_a_file_that_cannot_be_written_keeps_its_content(name: str, tmp_path: Pa
         write(link)
         assert link.is_symlink()
         assert path.read_bytes() != b"mine"
+
+
+def test_a_file_that_is_replaced_keeps_its_permissions_and_a_new_one_has_the_usual(tmp_path: Path) -> None:
+    path, mask = tmp_path / "mine.txt", os.umask(0o027)
+    try:
+        write_whole(path, "new")
+        assert path.stat().st_mode & 0o7777 == 0o640
+        for mode in (0o600, 0o664, 0o444):
+            path.chmod(mode)
+            write_whole(path, f"{mode:o}")
+            assert (path.stat().st_mode & 0o7777, path.read_text()) == (mode, f"{mode:o}")
+    finally:
+        os.umask(mask)
 
 
 @pytest.mark.parametrize("key", ["body.shape", "body.albedo_map.file", "trajectory.file", "severity.file"])

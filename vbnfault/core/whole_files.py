@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import shutil
+import stat
 import uuid
 from pathlib import Path
 from typing import Any
@@ -13,8 +14,9 @@ from typing import Any
 def write_whole(path: Path, content: str | bytes) -> None:
     """Write bytes, or a text as UTF-8, to a file; if that fails, the file keeps its former content or stays absent.
 
-    A device or a pipe is written to as it is; a link stays, and the file that it names is replaced. Characters of a
-    file name that are no Unicode become question marks. Raises OSError if the file cannot be written.
+    A device or a pipe is written to as it is; a link stays, and the file that it names is replaced and keeps its
+    permissions. Characters of a file name that are no Unicode become question marks. Raises OSError if the file
+    cannot be written.
     """
     data = content.encode("utf-8", "replace") if isinstance(content, str) else content
     target = path.resolve()
@@ -23,6 +25,9 @@ def write_whole(path: Path, content: str | bytes) -> None:
         return
     with replacing(target) as temporary:
         temporary.write_bytes(data)
+        if target.exists():
+            with contextlib.suppress(OSError):  # a file system without permissions
+                temporary.chmod(stat.S_IMODE(target.stat().st_mode))
 
 
 class replacing:
