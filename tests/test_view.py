@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import http.client
 import json
+import os
 import shutil
 import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -302,6 +304,19 @@ def test_the_command_prints_its_address_and_ends_with_ctrl_c(finished_store: Pat
         process.send_signal(signal.SIGINT)
         _, errors = process.communicate(timeout=60)
     assert (process.returncode, errors) == (0, "")
+
+
+def test_a_view_that_is_ended_by_a_signal_says_nothing_of_files(
+    finished_store: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def ended(viewer: Viewer) -> None:
+        viewer.server.server_close()
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(60)
+
+    monkeypatch.setattr(Viewer, "serve", ended)
+    assert run(monkeypatch, "view", str(finished_store), "--no-browser") == 143
+    assert capsys.readouterr().err == f"vbnfault: the view of {finished_store} was ended\n"
 
 
 def test_the_command_opens_a_browser_unless_told_not_to(

@@ -83,6 +83,8 @@ def view(
     import signal
     import webbrowser
 
+    from ..core import interrupts
+    from ..dataset.errors import Interrupted
     from ..output.viewer import Viewer
     from ..store import open_store
 
@@ -93,5 +95,7 @@ def view(
     before = signal.signal(signal.SIGINT, lambda *_: viewer.stop())  # this is how a viewer ends: no error
     try:
         viewer.serve()
+    except interrupts.Stopped as stop:  # SIGTERM or SIGHUP
+        raise Interrupted(f"the view of {viewer.store.path} was ended", interrupts.exit_code(stop)) from None
     finally:
         signal.signal(signal.SIGINT, before)
