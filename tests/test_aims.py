@@ -75,7 +75,8 @@ def test_weights_set_the_numbers_of_samples_and_distances_fill_every_octave() ->
         assert gaps.max() < 1.9 / len(part)
     one = planned(scene(geometry={"aim": "limb"}))
     assert [one.aim_of(k) for k in range(20)] == ["limb"] * 20
-    assert planned(scene(geometry={"aim": None})).aim is None
+    aimless = scene(geometry={"aim": None, "distance_m": [100.0, 10e3], "pointing_error_deg": 0.1})
+    assert planned(aimless).aim is None
 
 
 def test_faults_that_need_the_sun_have_it_as_their_aim_or_are_refused() -> None:
@@ -134,6 +135,26 @@ def test_a_longer_block_keeps_the_views_and_a_redraw_keeps_aim_and_distance() ->
 def test_wrong_keys_are_refused_in_a_sentence(tables: dict[str, Any], sentence: str) -> None:
     with pytest.raises(InputError, match=rf"test: {sentence}"):
         scene(**tables)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "shown"),
+    [
+        ("distance_m", [1e3, 2e3], r"\(1000\.0, 2000\.0\)"),
+        ("sun_elongation_deg", [90, 180], r"\(90\.0, 180\.0\)"),
+        ("pointing_error_deg", 0.0, r"0\.0"),
+    ],
+)
+def test_keys_of_an_aim_are_refused_without_one(key: str, value: Any, shown: str, tmp_path: Path) -> None:
+    """The camera would fly at the default heights, whatever distance is asked for."""
+    content: dict[str, Any] = {"title": "aimless", "geometry": {key: value}}
+    sentence = rf"test: geometry\.{key} = {shown}: applies beside geometry\.aim alone; give geometry\.aim, or leave"
+    with pytest.raises(InputError, match=sentence):
+        config.parse_scene(content, source="test")
+    flown = content | {"trajectory": {"file": str(tmp_path / "poses.csv")}}  # no key of [geometry] applies there
+    config.parse_scene(flown, source="test")
+    stored = config.parse_scene({"title": "aimless"}, source="test").resolved()
+    config.parse_scene(stored, source="test")
 
 
 # ------------------------------------------------------------------------------------------------- the poses

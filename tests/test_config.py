@@ -203,6 +203,7 @@ def test_every_number_is_accepted_at_its_bounds() -> None:
                 extra |= {"exposure_min_s": 1e-9} if key == "exposure_max_s" else {}
                 extra |= {"shape": "x.obj"} if key == "sharpen" else {}
                 extra |= {"shard_samples": 16} if key == "variants_per_view" else {}
+                extra |= {"aim": "nadir"} if key == "pointing_error_deg" else {}
                 extra |= {"detector": "x"} if key in ("individuals", "detector_temperature_K") else {}
                 scene = parse_scene({"title": "t", table: {key: value, **extra}}, source="here")
                 assert getattr(getattr(scene, table), key) == value

@@ -21,7 +21,7 @@ from ..reflectance import is_packaged
 from .bodies import with_named_body
 from .coma import ComaTable
 from .instrument import OF_A_SENSOR_FILE, CameraTable, RenderTable
-from .sampling import DatasetTable, GeometryTable, PlanTable, StratumTable
+from .sampling import OF_AN_AIM, DatasetTable, GeometryTable, PlanTable, StratumTable
 from .surroundings import OrbitTable, SkyTable, SpacecraftTable, SpiceTable, SunTable
 from .target import EARTH, BodyTable, PatchTable
 from .trajectory import TrajectoryTable, with_rows
@@ -103,9 +103,15 @@ class Scene(Table):
 
     @model_validator(mode="after")
     def _aimed_alone(self) -> Scene:
-        if not self.is_aimed:
-            return self
         given = self.geometry
+        if not self.is_aimed:
+            changed = [key for key in OF_AN_AIM if getattr(given, key) != type(given).model_fields[key].default]
+            if changed and not self.is_flown:
+                raise ValueError(
+                    f"geometry.{changed[0]} = {shown(getattr(given, changed[0]))}: applies beside geometry.aim "
+                    "alone; give geometry.aim, or leave it out"
+                )
+            return self
         for key in ("x_m", "y_m", "height_m", "height_reference"):
             if getattr(given, key) != type(given).model_fields[key].default:
                 raise ValueError(
