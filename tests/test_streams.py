@@ -82,6 +82,7 @@ def full() -> Iterator[TextIO]:
 def plan_of_made_up_samples(monkeypatch: pytest.MonkeyPatch) -> None:
     """Their scene is none that could be planned."""
     monkeypatch.setattr("vbnfault.dataset.checking.planned", lambda *_: None)
+    monkeypatch.setattr("vbnfault.dataset.checking.check_described", lambda _: None)
     monkeypatch.setattr("vbnfault.dataset.checking.is_exact", lambda *_: False)
 
 
