@@ -29,6 +29,7 @@ def address(array: np.ndarray) -> int:
 def test_memory_is_used_again_once_the_last_view_is_gone() -> None:
     first = buffers.empty(SHAPE)
     assert (first.shape, first.dtype) == (SHAPE, np.float32)
+    assert address(first) % 64 == 0
     where, part = address(first), first[7:9, ::2]
     del first
     second = buffers.empty(SHAPE)
@@ -49,6 +50,19 @@ def test_memory_is_used_again_once_the_last_view_is_gone() -> None:
     assert (copied == 1).all()
     assert copied.flags.writeable
     assert copied.flags.c_contiguous
+
+
+def test_a_copy_is_made_only_of_arrays_that_are_not_aligned() -> None:
+    for size in (1000, 3_000_000):
+        memory = np.arange(size + 16, dtype=np.float32)
+        first = -address(memory) % 64 // 4
+        there = memory[first : first + size]
+        assert buffers.aligned(there) is there
+        for other in (memory[first + 1 : first + 1 + size], memory[first:][: size // 2 * 2].reshape(-1, 2).T):
+            copied = buffers.aligned(other)
+            assert address(copied) % 64 == 0
+            assert copied.flags.c_contiguous
+            np.testing.assert_array_equal(copied, other)
 
 
 def test_small_arrays_and_too_much_memory_are_not_kept(monkeypatch: pytest.MonkeyPatch) -> None:

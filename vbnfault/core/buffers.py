@@ -19,6 +19,7 @@ from numpy.typing import DTypeLike, NDArray
 T = TypeVar("T", bound=np.generic)
 
 _LEAST_BYTES = 1 << 20  # smaller arrays come from memory that the C library keeps
+_ALIGNED_BYTES = 64
 _MOST_KEPT_BYTES = 256 << 20  # what the faults of a sample with 1024×1024 pixels leave
 
 
@@ -35,7 +36,7 @@ class _Kept:
         self._bytes = 0
 
     def take(self, size: int) -> NDArray[np.uint8] | None:
-        """Return a free block of `size` bytes, or None."""
+        """Return a free block that holds an aligned array of `size` bytes, or None."""
         with self._lock:
             blocks = self._free.get(size)
             if not blocks:
@@ -45,10 +46,11 @@ class _Kept:
 
     def give(self, block: NDArray[np.uint8]) -> None:
         """Keep a free block, unless too much is kept."""
+        size = len(block) - _ALIGNED_BYTES
         with self._lock:
-            if self._bytes + len(block) <= _MOST_KEPT_BYTES:
-                self._bytes += len(block)
-                self._free.setdefault(len(block), []).append(block)
+            if self._bytes + size <= _MOST_KEPT_BYTES:
+                self._bytes += size
+                self._free.setdefault(size, []).append(block)
 
     def clear(self) -> None:
         """Free all blocks."""
@@ -66,7 +68,8 @@ if hasattr(os, "register_at_fork"):  # another thread of the parent may hold the
 def empty(shape: tuple[int, ...], dtype: DTypeLike = np.float32) -> NDArray[Any]:
     """Return an array whose values are not set, as `numpy.empty`.
 
-    Its memory is kept for another array once the array and all its views are gone.
+    Its memory is kept for another array once the array and all its views are gone. It begins at a multiple of 64
+    bytes if the array has a MiB or more.
     """
     of_type = np.dtype(dtype)
     size = math.prod(shape) * of_type.itemsize
@@ -74,9 +77,9 @@ def empty(shape: tuple[int, ...], dtype: DTypeLike = np.float32) -> NDArray[Any]
         return np.empty(shape, of_type)
     block = _kept.take(size)
     if block is None:
-        block = np.empty(size, np.uint8)
+        block = np.empty(size + _ALIGNED_BYTES, np.uint8)
     # the array and its views hold this object, but not the block alone
-    owner = (ctypes.c_ubyte * size).from_buffer(block.data)
+    owner = (ctypes.c_ubyte * size).from_buffer(block.data, -block.ctypes.data % _ALIGNED_BYTES)
     weakref.finalize(owner, _kept.give, block).atexit = False
     array: NDArray[Any] = np.frombuffer(memoryview(owner), of_type).reshape(shape)
     return array
@@ -92,6 +95,22 @@ def zeros(shape: tuple[int, ...], dtype: DTypeLike = np.float32) -> NDArray[Any]
 def copy(array: NDArray[T]) -> NDArray[T]:
     """Return a copy of an array in memory as that of `empty`."""
     out = empty(array.shape, array.dtype)
+    out[...] = array
+    return out
+
+
+def aligned(array: NDArray[T]) -> NDArray[T]:
+    """Return a contiguous array, or a copy of it, that begins at a multiple of 64 bytes.
+
+    drjit uses numpy's memory as it is, and compiles another kernel for each set of arrays that begin elsewhere.
+    """
+    if array.flags.c_contiguous and array.ctypes.data % _ALIGNED_BYTES == 0:
+        return array
+    if array.nbytes >= _LEAST_BYTES:
+        return copy(array)
+    memory = np.empty(array.nbytes + _ALIGNED_BYTES, np.uint8)
+    start = -memory.ctypes.data % _ALIGNED_BYTES
+    out: NDArray[T] = memory[start : start + array.nbytes].view(array.dtype).reshape(array.shape)
     out[...] = array
     return out
 

@@ -12,6 +12,8 @@ from typing import Any, ClassVar, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from . import buffers
+
 CHANNELS = ("R", "G", "B", "I")
 
 # Rec. 709 luminance of linear RGB: the intensity channel of a camera without W pixels.
@@ -153,13 +155,15 @@ class Electrons(Quantity):
             return replace(self, rim_rows=None)
         if self.past_rims is None:
             return self
-        return replace(self, array=self.array + self.past_rims, past_rims=None)
+        array = buffers.empty(self.array.shape)
+        return replace(self, array=np.add(self.array, self.past_rims, out=array), past_rims=None)
 
     def scaled(self, factor: float) -> Electrons:
         """Return all light multiplied by a factor; light past the rims in few rows becomes `rim_rows`."""
         if self.rim_rows is not None:
             return self.in_planes.scaled(factor)
-        array, times = self.array * np.float32(factor), np.float32(factor)
+        times = np.float32(factor)
+        array = np.multiply(self.array, times, out=buffers.empty(self.array.shape))
         if self.past_rims is None:
             return replace(self, array=array)
         rows = _lit_rows(self.past_rims)

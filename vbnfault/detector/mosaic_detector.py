@@ -116,8 +116,15 @@ class MosaicDetector:
         """
         return self.device.raw(sample(expected.array, self.sensor.pattern), exposure_s, noise, acts or {})
 
-    def develop(self, expected: Electrons, exposure_s: float, noise: Any, acts: Acts | None = None) -> RGBI:
-        """Return the 8 bit image of the expected photo-electrons. Arguments are as in `raw`."""
+    def develop(
+        self,
+        expected: Electrons,
+        exposure_s: float,
+        noise: Any,
+        acts: Acts | None = None,
+        base: tuple[Electrons, RGBI] | None = None,
+    ) -> RGBI:
+        """Return the 8 bit image of the expected photo-electrons. Arguments are as in `raw`; `base` is not used."""
         return self.rgbi(self.raw(expected, exposure_s, noise, acts), exposure_s)
 
     def rgbi(self, raw: NDArray[np.uint16], exposure_s: float) -> RGBI:

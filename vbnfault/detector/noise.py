@@ -9,6 +9,7 @@ import math
 import sys
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,10 +27,13 @@ F32 = NDArray[np.float32]
 EXACT_POISSON_BELOW_E = 4.0
 
 # Above this mean the first three terms of that expansion are enough.
-_ALL_TERMS_BELOW_E = 1000.0
+ALL_TERMS_BELOW_E = 1000.0
 
 # Above this mean, counting steps takes longer than the general quantile.
 _MANY_STEPS_E = 30.0
+
+# A sum of a distribution that no longer changes in float64.
+SUM_COMPLETE = 1 - 1e-15
 
 # Numbers that are looked up together: numpy makes indices of 8 bytes of them, which stay in the cache.
 _CODES_AT_ONCE = 1 << 17
@@ -40,7 +44,7 @@ _SUMMED_AT_ONCE = 1 << 15
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class NormalField:
-    """Hold standard normal variates as 16 bit uniform numbers, from which `values` and `at` look them up.
+    """Hold standard normal variates as 16 bit uniform numbers, from which `values` looks them up.
 
     Each number stands for the median of its bin. The two outermost bins, 4.2 standard deviations from the mean, are
     drawn again within the bin, so the tails are complete. A variate is a monotonic function of its number.
@@ -59,42 +63,18 @@ class NormalField:
     tail: NDArray[np.intp]
     tail_values: F32
 
-    @property
-    def _row_size(self) -> int:
-        return math.prod(self.codes.shape[1:])
-
-    def __getitem__(self, rows: slice) -> NormalField:
-        """Return the variates of contiguous rows. Raises ValueError if the slice has a step other than 1."""
-        if rows.step not in (None, 1):
-            raise ValueError(f"step = {rows.step}: must be 1, rows of variates are contiguous")
-        start, stop, _ = rows.indices(len(self.codes))
-        first, last = np.searchsorted(self.tail, (start * self._row_size, stop * self._row_size))
-        tail = self.tail[first:last] - start * self._row_size
-        return NormalField(codes=self.codes[start:stop], tail=tail, tail_values=self.tail_values[first:last])
-
     def of_pixels(self, pixels: NDArray[np.intp]) -> NormalField:
         """Return the variates of some pixels, given by their flat indices intp[row, n] and arranged like them."""
         channels = self.codes.shape[2]
-        codes = np.take(self.codes.reshape(-1, channels), pixels, axis=0)
-        tail = _outermost(codes)
+        codes = self.codes.reshape(-1, channels)[pixels]
+        tail = _outermost(codes.reshape(-1))
         place, channel = np.divmod(tail, channels)
         known = np.searchsorted(self.tail, pixels.reshape(-1)[place] * channels + channel)
         return NormalField(codes=codes, tail=tail, tail_values=self.tail_values[known])
 
-    def at(self, places: NDArray[np.intp]) -> F32:
-        """Return the variates at ascending flat indices, float32[n]."""
-        codes = np.take(self.codes.reshape(-1), places, mode="clip")  # a third of the time of indexing
-        out = np.take(_normal_table(), codes, mode="clip")
-        # places and tail ascend, so those of the tail that are among the places lie where they would be inserted
-        place = np.searchsorted(places, self.tail)
-        inside = place < len(places)
-        known = np.flatnonzero(inside)[places[place[inside]] == self.tail[inside]]
-        out[place[known]] = self.tail_values[known]
-        return out
-
     def values(self) -> F32:
         """Return the variates, float32[y, x, ...]."""
-        codes, table = self.codes.reshape(-1), _normal_table()
+        codes, table = self.codes.reshape(-1), variates_by_code()
         out = buffers.empty(codes.shape)
         for start in range(0, codes.size, _CODES_AT_ONCE):
             part = slice(start, start + _CODES_AT_ONCE)
@@ -103,13 +83,19 @@ class NormalField:
         return out.reshape(self.codes.shape)
 
 
-def draw_normals(shape: tuple[int, ...], rng: np.random.Generator) -> NormalField:
-    """Draw standard normal variates by the inverse distribution function of 16 bit uniform numbers."""
-    codes = _codes(math.prod(shape), rng)
-    tail = _outermost(codes)
-    sign = np.where(codes[tail] == 0, 1.0, -1.0)
+def draw_normals(
+    shape: tuple[int, ...], rng: np.random.Generator, codes: NDArray[np.uint16] | None = None
+) -> NormalField:
+    """Draw standard normal variates by the inverse distribution function of 16 bit uniform numbers.
+
+    `codes` receives these numbers, uint16 of the given shape, which may be a view with gaps between them.
+    """
+    if codes is None:
+        codes = buffers.empty(shape, np.uint16)
+    tail, outermost = _draw_codes(codes.reshape(math.prod(shape)), rng)
+    sign = np.where(outermost == 0, 1.0, -1.0)
     values = sign * ndtri((1.0 - rng.random(len(tail))) / 65536)
-    return NormalField(codes=codes.reshape(shape), tail=tail, tail_values=values.astype(np.float32))
+    return NormalField(codes=codes, tail=tail, tail_values=values.astype(np.float32))
 
 
 def normal_field(shape: tuple[int, ...], rng: np.random.Generator) -> F32:
@@ -117,36 +103,46 @@ def normal_field(shape: tuple[int, ...], rng: np.random.Generator) -> F32:
     return draw_normals(shape, rng).values()
 
 
-def variates_of(codes: NDArray[np.uint16]) -> F32:
-    """Return the normal variates of 16 bit uniform numbers, which exclude the least and the greatest, float32."""
-    return _normal_table()[codes]
-
-
 def _outermost(codes: NDArray[np.uint16]) -> NDArray[np.intp]:
-    """Return the flat indices at which a code is the smallest or the largest possible, intp[n], ascending."""
-    flat = codes.reshape(-1)
-    parts = range(0, flat.size, _CODES_AT_ONCE)
-    found = [np.flatnonzero(flat[i : i + _CODES_AT_ONCE] + np.uint16(1) <= 1) + i for i in parts]
-    return np.concatenate(found) if found else np.zeros(0, dtype=np.intp)
+    """Return the indices at which a code is the smallest or the largest possible, intp[n], ascending."""
+    return np.flatnonzero(codes + np.uint16(1) <= 1)
 
 
-def _codes(size: int, rng: np.random.Generator) -> NDArray[np.uint16]:
-    """Return 16 bit uniform numbers, uint16[size]: those of `rng.bytes`, in a quarter of its time if possible."""
+def _draw_codes(codes: NDArray[np.uint16], rng: np.random.Generator) -> tuple[NDArray[np.intp], NDArray[np.uint16]]:
+    """Draw 16 bit uniform numbers: those of `rng.bytes`, in a quarter of its time if possible.
+
+    Returns the indices of the outermost numbers, intp[n], and these numbers.
+    """
     # `bytes` takes words of 32 bits, of which a generator of 64 bits yields the low one first and keeps the other
+    size, found = codes.size, [np.zeros(0, dtype=np.intp)]
     whole = size % 4 == 0 and rng.bit_generator.state.get("has_uint32") == 0 and sys.byteorder == "little"
-    if not whole:
-        return np.frombuffer(rng.bytes(2 * size), dtype=np.uint16)
-    out = buffers.empty((size,), np.uint16)
-    for start in range(0, size, _CODES_AT_ONCE):  # their memory is in the cache, and that of `out` is kept
-        part = out[start : start + _CODES_AT_ONCE]
-        words = rng.integers(0, 2**64 - 1, part.size // 4, dtype=np.uint64, endpoint=True)
-        part[:] = words.view(np.uint16)
-    return out
+    drawn = None if whole else np.frombuffer(rng.bytes(2 * size), dtype=np.uint16)
+    for start in range(0, size, _CODES_AT_ONCE):  # their memory stays in the cache
+        stop = min(start + _CODES_AT_ONCE, size)
+        if drawn is None:
+            words = rng.integers(0, 2**64 - 1, (stop - start) // 4, dtype=np.uint64, endpoint=True)
+            part = words.view(np.uint16)
+        else:
+            part = drawn[start:stop]
+        codes[start:stop] = part
+        found.append(_outermost(part) + start)
+    tail = np.concatenate(found)
+    return tail, codes[tail]
 
 
 @lru_cache(maxsize=1)
-def _normal_table() -> F32:
+def variates_by_code() -> F32:
+    """Return the normal variates by their codes, float32[65536]; those of the two outermost codes are medians."""
     return ndtri((np.arange(65536) + 0.5) / 65536).astype(np.float32)
+
+
+def later_poisson_terms(m: Any, mean: Any, z: Any) -> Any:
+    """Return the terms of the Poisson quantile's expansion (Giles 2016, Q_N2) that matter for small means, float32.
+
+    `m` is the array namespace, numpy or drjit, of the means and the normal variates `z`.
+    """
+    safe, zz = m.maximum(mean, 1), z * z
+    return (zz * (zz * (1 / 270) + 7 / 810) - 8 / 405) / safe - z * (zz * (1 / 72) + 1 / 36) / m.sqrt(safe)
 
 
 def poisson_quantile(mean: F32, normal: F32) -> F32:
@@ -164,15 +160,12 @@ def poisson_quantile(mean: F32, normal: F32) -> F32:
     out += root
     out += mean
     # the later terms move a count by less than 0.01 where the mean is above this
-    few = np.flatnonzero(mean < _ALL_TERMS_BELOW_E)
+    few = np.flatnonzero(mean < ALL_TERMS_BELOW_E)
     if len(few):
         m, z = mean.ravel(), normal.ravel()
         if len(few) < m.size:
             m, z = m[few], z[few]
-        safe = np.maximum(m, np.float32(1))
-        zz = z * z
-        terms = (np.float32(-8 / 405) + zz * (np.float32(7 / 810) + np.float32(1 / 270) * zz)) / safe
-        terms -= z * (np.float32(1 / 36) + np.float32(1 / 72) * zz) / np.sqrt(safe)
+        terms = later_poisson_terms(np, m, z)
         if len(few) < out.size:
             out.ravel()[few] += terms
         else:
@@ -186,20 +179,10 @@ def poisson_quantile(mean: F32, normal: F32) -> F32:
 
 
 def poisson_on_dark(signal: F32, dark: np.float32, normal: F32) -> F32:
-    """Return `poisson_quantile(signal + dark, normal)`, quickly where there is no signal: the sky has one mean."""
+    """Return `poisson_quantile(signal + dark, normal)`, where unlit values count the steps of their only mean."""
     lit = signal > 0
-    count = np.count_nonzero(lit)
-    if count == signal.size:
-        return poisson_quantile(signal + dark, normal)
-    out = _counts_of_one_mean(float(dark), normal)
-    if 3 * count > 2 * signal.size:  # to choose the lit values takes longer than to compute all
-        dim, mean = ~lit, signal + dark
-        np.copyto(mean, np.float32(_ALL_TERMS_BELOW_E), where=dim)  # the quickest mean
-        counts = poisson_quantile(mean, normal)
-        np.copyto(counts, out, where=dim)
-        return counts
-    if count:
-        out[lit] = poisson_quantile(signal[lit] + dark, normal[lit])
+    out = counts_of_one_mean(float(dark), normal)
+    out[lit] = poisson_quantile(signal[lit] + dark, normal[lit])
     return out
 
 
@@ -220,13 +203,12 @@ def _poisson_exact(mean: F32, normal: F32) -> F32:
             term /= count
             total += term
             counts[left] = count  # those that go on are written again
-            # past 1 - 1e-15 the sum no longer changes in float64: stop there
-            more = np.flatnonzero((u > total) & (total < 1 - 1e-15))
+            more = np.flatnonzero((u > total) & (total < SUM_COMPLETE))
             left, m, u, term, total = left[more], m[more], u[more], term[more], total[more]
     return out
 
 
-def _counts_of_one_mean(mean: float, normal: F32) -> F32:
+def counts_of_one_mean(mean: float, normal: F32) -> F32:
     """Return `poisson_quantile` for a single mean by counting the distribution's steps below each variate."""
     if mean > _MANY_STEPS_E:
         return poisson_quantile(np.full(normal.shape, mean, dtype=np.float32), normal)

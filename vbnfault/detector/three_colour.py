@@ -11,39 +11,52 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any, ClassVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core import buffers
 from ..core.errors import InputError
 from ..core.quantities import LUMINANCE, RGBI, Electrons, Irradiance, RawDN
+from . import compiled
 from .blocks import blockwise, pool
 from .efficiency import QuantumEfficiency, white_balance
-from .noise import NormalField, draw_normals, poisson_on_dark
-from .unlit import Limits, noise_limits, values_to_develop
+from .noise import NormalField, counts_of_one_mean, draw_normals, poisson_on_dark, variates_by_code
 
 F32 = NDArray[np.float32]
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Noise:
-    """Hold the variates of one exposure for shot and read noise, [y, x, 3] each, standard normal."""
+    """Hold the variates of one exposure, standard normal.
 
+    Attributes
+    ----------
+    codes
+        Codes of the variates of shot noise and of read noise beside each other, uint16[y, x, 3, 2].
+    shot, read
+        The two fields, [y, x, 3] each; their codes are views of `codes`.
+    """
+
+    codes: NDArray[np.uint16]
     shot: NormalField
     read: NormalField
 
     @classmethod
     def draw(cls, shape: tuple[int, int], shot: np.random.Generator, read: np.random.Generator) -> Noise:
         """Draw two fields of normal variates for a (height, width) sensor, in two threads."""
-        fields = pool().map(lambda rng: draw_normals((*shape, 3), rng), (shot, read))
-        return cls(shot=next(fields), read=next(fields))
+        codes = buffers.empty((*shape, 3, 2), np.uint16)
+        views = codes[..., 0], codes[..., 1]
+        fields = pool().map(lambda rng, view: draw_normals((*shape, 3), rng, view), (shot, read), views)
+        return cls(codes=codes, shot=next(fields), read=next(fields))
 
-    def of_pixels(self, pixels: NDArray[np.intp]) -> Noise:
-        """Return the variates of the pixels with the flat indices intp[row, n], arranged like the indices."""
-        return Noise(shot=self.shot.of_pixels(pixels), read=self.read.of_pixels(pixels))
+    @cached_property
+    def outermost_pixels(self) -> NDArray[np.intp]:
+        """Return the flat indices of the pixels with an outermost code, whose variates no table holds, intp[n]."""
+        return np.unique(np.concatenate([self.shot.tail, self.read.tail]) // 3)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,35 +165,32 @@ class ThreeColourDetector:
             "gain_dn_per_e": self.gain_dn_per_e,
         }
 
-    def develop(self, expected: Electrons, exposure_s: float, noise: Any, acts: Any = None) -> RGBI:
-        """Return the 8 bit image of the expected photo-electrons.
+    def develop(
+        self,
+        expected: Electrons,
+        exposure_s: float,
+        noise: Any,
+        acts: Any = None,
+        base: tuple[Electrons, RGBI] | None = None,
+    ) -> RGBI:
+        """Return the 8 bit image of the expected photo-electrons, with the bits of the single steps.
 
-        All steps run block by block, so that intermediate results stay in the cache. Where a block is mostly sky,
-        only the values that may show anything but the mean dark signal are developed. `noise` comes from
-        `draw_noise`; None gives a noise-free image.
+        `noise` comes from `draw_noise`; None gives a noise-free image. `base` is another signal with its image for
+        the same exposure and noise: pixels with this signal are taken from it, which saves time.
         """
-        collect, show = self._collector(exposure_s), self._shower(exposure_s)
-        limits = None if noise is None else noise_limits_of(self, exposure_s)
-        unlit_dn = np.float32(0)  # with noise, what is not developed is black
-        if noise is None:
-            unlit_dn = self._convert(collect(np.zeros(1, dtype=np.float32), None), None)[0]
-
-        def step(signal: F32, shot: NormalField | None, read: NormalField | None) -> NDArray[np.uint8]:
-            some = values_to_develop(signal, shot, read, limits)
-            if some is None:
-                variates = [None if field is None else field.values() for field in (shot, read)]
-                return show(self._convert(collect(signal, variates[0]), variates[1]))
-            if not len(some):
-                word = show(np.full((1, 1, 3), unlit_dn)).view(np.uint32).item()  # four channels of 8 bits
-                return np.full((*signal.shape[:2], 1), word, dtype=np.uint32).view(np.uint8)
-            variates = [None if field is None else field.at(some) for field in (shot, read)]
-            electrons = collect(np.take(signal.reshape(-1), some), variates[0])
-            dn = np.full(signal.shape, unlit_dn)
-            dn.reshape(-1)[some] = self._convert(electrons, variates[1])
-            return show(dn)
-
-        shot, read = (None, None) if noise is None else (noise.shot, noise.read)
-        return RGBI(array=blockwise(step, expected.array, shot, read))
+        if not expected.array.size:
+            return RGBI(array=np.zeros((*expected.array.shape[:2], 4), dtype=np.uint8))
+        codes = None if noise is None else noise.codes
+        known = None if base is None else (base[0].array, base[1].array)
+        rgb = compiled.levels(curve_of(self, exposure_s), expected.array, codes, known)
+        image = blockwise(_with_luminance, rgb)
+        if noise is not None and len(noise.outermost_pixels):
+            beyond = noise.outermost_pixels[None]
+            light = expected.array.reshape(-1, 3)[beyond]
+            electrons = self._collector(exposure_s)(light, noise.shot.of_pixels(beyond).values())
+            dn = self._convert(electrons, noise.read.of_pixels(beyond).values())
+            image.reshape(-1, 4)[beyond] = self._shower(exposure_s)(dn)
+        return RGBI(array=image)
 
     def _collector(self, exposure_s: float) -> Callable[[F32, F32 | None], F32]:
         """Return the function that computes the collected electrons of a block."""
@@ -205,29 +215,47 @@ class ThreeColourDetector:
 
     def _shower(self, exposure_s: float) -> Callable[[F32], NDArray[np.uint8]]:
         """Return the function that computes the 8 bit image of a block."""
-        # white is the range above the black level, so a saturated pixel stays white after a long exposure. Where
-        # the dark signal alone saturates the pixels, 1 % of the range is left
-        dark_dn = self.bias_dn + self.dark_current_e_s * exposure_s * self.gain_dn_per_e
-        black = np.float32(min(dark_dn, self.adc_max_dn - 0.01 * (self.adc_max_dn - self.bias_dn)))
-        scale = (255.0 / (self.adc_max_dn - float(black)) * self.white_balance).astype(np.float32)
-        luminance = LUMINANCE.reshape(1, 3).astype(np.float64)
+        black, scale = self._black_and_scale(exposure_s)
 
         def show(dn: F32) -> NDArray[np.uint8]:
             # OpenCV multiplies with 64 bits, rounds to even and saturates at 0 and 255 as it converts
             rgb = cv2.multiply(dn - black, (*scale.tolist(), 0.0), dtype=cv2.CV_8U)
-            intensity = cv2.transform(rgb, luminance).reshape(rgb.shape[:2])
-            out = cv2.cvtColor(rgb, cv2.COLOR_RGB2RGBA)
-            return np.asarray(cv2.insertChannel(intensity, out, 3))
+            return _with_luminance(np.asarray(rgb))
 
         return show
 
+    def _black_and_scale(self, exposure_s: float) -> tuple[np.float32, F32]:
+        """Return the code that is shown as 0, and the levels per code of R, G and B, float32[3]."""
+        # white is the range above the black level, so a saturated pixel stays white after a long exposure. Where
+        # the dark signal alone saturates the pixels, 1 % of the range is left
+        dark_dn = self.bias_dn + self.dark_current_e_s * exposure_s * self.gain_dn_per_e
+        black = np.float32(min(dark_dn, self.adc_max_dn - 0.01 * (self.adc_max_dn - self.bias_dn)))
+        return black, (255.0 / (self.adc_max_dn - float(black)) * self.white_balance).astype(np.float32)
 
-@lru_cache(maxsize=64)
-def noise_limits_of(detector: ThreeColourDetector, exposure_s: float) -> Limits | None:
-    """Return the codes of the variates with which unlit values of an exposure are 0; None if they are few."""
-    show = detector._shower(exposure_s)
-    return noise_limits(
-        detector._collector(exposure_s), lambda counts, read: show(detector._convert(counts, read))[..., :3], 3
+
+def _with_luminance(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return R, G, B and the luminance as I, uint8[y, x, 4], of R, G and B, uint8[y, x, 3]."""
+    intensity = cv2.transform(rgb, LUMINANCE.reshape(1, 3).astype(np.float64)).reshape(rgb.shape[:2])
+    out = cv2.cvtColor(rgb, cv2.COLOR_RGB2RGBA)
+    return np.asarray(cv2.insertChannel(intensity, out, 3))
+
+
+@lru_cache(maxsize=8)
+def curve_of(detector: ThreeColourDetector, exposure_s: float) -> compiled.Curve:
+    """Return the numbers and tables with which a detector develops all images of an exposure."""
+    gain = np.float32(detector.gain_dn_per_e)
+    dark = np.float32(detector.dark_current_e_s * exposure_s)
+    black, scale = detector._black_and_scale(exposure_s)
+    return compiled.Curve(
+        dark_e=dark,
+        full_well_e=np.float32(detector.full_well_e),
+        gain_dn_per_e=gain,
+        read_noise_dn=np.float32(detector.read_noise_e_rms) * gain,
+        bias_dn=np.float32(detector.bias_dn),
+        adc_max_dn=np.float32(detector.adc_max_dn),
+        black_dn=black,
+        scale=scale,
+        dark_counts_e=counts_of_one_mean(float(dark), variates_by_code()),
     )
 
 

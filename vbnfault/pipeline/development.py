@@ -14,9 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..camera import Camera
-from ..core import buffers
 from ..core.quantities import RGBI, Electrons
-from ..detector.blocks import pool
 from ..faults import MOSAIC_STEPS, Fault, FaultContext, act, physical_order
 from . import masks
 from .spec import Draw, SceneExposure
@@ -24,13 +22,6 @@ from .spec import Draw, SceneExposure
 Draws = Mapping[str, Draw]
 Keys = tuple[tuple[str, int], ...]
 Mask = NDArray[np.bool_]
-
-# Of the pixels. Above these fractions it takes longer to choose pixels than to develop all of them.
-_MOST_CHANGED = 0.6
-_MOST_CHANGED_NOISE_FREE = 0.4
-
-# Their light, noise and image stay in the cache.
-_PIXELS_AT_ONCE = 1 << 15
 
 
 def acting_at(draws: Draws, step: str) -> list[str]:
@@ -82,7 +73,6 @@ class Development:
         self._images: dict[Any, RGBI] = {}
         self._raws: dict[Any, NDArray[np.uint16]] = {}
         self._effects: dict[Any, Mask] = {}
-        self._differences: dict[Any, NDArray[np.intp]] = {}
 
     @cached_property
     def noise(self) -> Any:
@@ -189,33 +179,31 @@ class Development:
                 self._raws[key] = raw  # a fifth of the memory of the image, and needed by `raw`
                 self._images[key] = camera.mosaic.rgbi(raw, camera.exposure_s)
             else:
-                patched = self._patched_clean(draws, signal) if noisy else None
-                self._images[key] = patched or camera.detector.develop(
-                    signal, camera.exposure_s, noise, self._acts(draws)
+                self._images[key] = camera.detector.develop(
+                    signal, camera.exposure_s, noise, self._acts(draws), self._clean(draws, noisy)
                 )
         return self._images[key]
 
-    def _patched_clean(self, draws: Draws, signal: Electrons) -> RGBI | None:
-        """Return the noisy image of a signal, made from the clean image; None if too many of its pixels differ."""
-        clean = self._images.get((*self._image_key({}, True), ()))
-        if clean is None or not (self.exposure.camera.detector.local and self.leaves_camera(draws)):
+    def _clean(self, draws: Draws, noisy: bool) -> tuple[Electrons, RGBI] | None:
+        """Return the clean signal and image, if they exist and images of the same camera may be made from them."""
+        image = self._images.get((*self._image_key({}, noisy), ()))
+        if image is None or not (self.exposure.camera.detector.local and self.leaves_camera(draws)):
             return None
-        lit = self.signal({}, []).merged.array
-        if _differing_fraction(signal.array, lit) > _MOST_CHANGED:
-            return None
-        changed = _differing_pixels(signal.array, lit)
-        return RGBI(array=self._patched(clean.array, signal, changed, noisy=True))
+        return self.signal({}, []).merged, image
 
     def twin(self, draws: Draws, name: str) -> RGBI:
         """Return `image` without one drawn fault; only the pixels that this fault changes are developed for it."""
         others = without(draws, name)
         key = (*self._image_key(others, True), ())
         if key not in self._images and self.is_local(draws, name):
-            part, base = self._part(draws, name), self._before_readout(draws, noisy=True).array
-            changed = self._changed(draws, name, part, _MOST_CHANGED)
-            if changed is not None:
-                self._images[key] = RGBI(array=self._patched(base, part, changed, noisy=True))
+            self._images[key] = self._lacking(draws, name, noisy=True)
         return self.image(others)
+
+    def _lacking(self, draws: Draws, name: str, *, noisy: bool) -> RGBI:
+        """Return the image without one fault of a local detector, before the faults that act on finished images."""
+        whole = self.signal(draws, acting_at(draws, "electrons")).merged, self._before_readout(draws, noisy)
+        camera, noise = self.exposure.camera, self.noise if noisy else None
+        return camera.detector.develop(self._part(draws, name), camera.exposure_s, noise, base=whole)
 
     def _read_out(self, image: RGBI, draws: Draws) -> RGBI:
         """Return the image with the drawn faults that act on the finished image."""
@@ -268,17 +256,8 @@ class Development:
             with_it = self.image(draws, noisy=False).array
             lacking = self.image(others, noisy=False, keep_signals=name in self._twins).array
             return masks.effect(with_it, lacking, least_dn)
-        part = self._part(draws, name)
-        changed = self._changed(draws, name, part, _MOST_CHANGED_NOISE_FREE)
-        if changed is not None and not len(changed):
-            return np.zeros(self.context.shape, dtype=bool)
+        before = self._lacking(draws, name, noisy=False)
         with_it = self.image(draws, noisy=False).array
-        if changed is None:
-            camera = self.exposure.camera
-            before = camera.detector.develop(part, camera.exposure_s, None)
-        else:
-            base = self._before_readout(draws, False).array
-            before = RGBI(array=self._patched(base, part, changed, noisy=False))
         return masks.effect(with_it, self._read_out(before, others).array, least_dn)
 
     def _part(self, draws: Draws, name: str) -> Electrons:
@@ -286,68 +265,10 @@ class Development:
         optical = acting_at(draws, "electrons")
         return self.signal(without(draws, name), [n for n in optical if n != name], keep=name in self._twins).merged
 
-    def _changed(self, draws: Draws, name: str, part: Electrons, most: float) -> NDArray[np.intp] | None:
-        """Return the flat indices of the pixels whose expected electrons differ from `part`, without one fault.
-
-        No other pixel of a local detector's image can change. Return None if they are more than a fraction `most`.
-        """
-        whole = self.signal(draws, acting_at(draws, "electrons")).merged
-        if _differing_fraction(whole.array, part.array) > most:
-            return None
-        key = (frozenset(_keys(draws, draws)), name)
-        if key not in self._differences:
-            self._differences[key] = _differing_pixels(whole.array, part.array)
-        return self._differences[key]
-
-    def _patched(
-        self, image: NDArray[np.uint8], signal: Electrons, pixels: NDArray[np.intp], *, noisy: bool
-    ) -> NDArray[np.uint8]:
-        """Return a copy of an image in which some pixels, by their flat indices, show another signal."""
-        out, camera = buffers.copy(image), self.exposure.camera
-        lit, words = signal.array.reshape(-1, signal.array.shape[2]), out.view(np.uint32).reshape(-1)
-
-        def patch(start: int) -> None:
-            some = pixels[start : start + _PIXELS_AT_ONCE]
-            noise = self.noise.of_pixels(some[None]) if noisy else None
-            light = signal.with_array(np.take(lit, some[None], axis=0))  # one row of these pixels
-            developed = camera.detector.develop(light, camera.exposure_s, noise).array
-            words[some] = developed.view(np.uint32).reshape(-1)  # four channels of 8 bits move as one word
-
-        list(pool().map(patch, range(0, len(pixels), _PIXELS_AT_ONCE)))
-        return out
-
     def is_local(self, draws: Draws, name: str) -> bool:
         """Return whether a drawn fault changes only those pixels whose expected electrons it changes."""
         detector = self.exposure.camera.detector
         return "electrons" in draws[name].fault.steps and self.leaves_camera(draws) and detector.local
-
-
-def _differing_fraction(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
-    """Return the fraction of the pixels in which any channel differs, estimated from every sixteenth row."""
-    rows = slice(len(a) // 32, None, 16)
-    return float(np.count_nonzero(_differ(a[rows], b[rows])) / max(1, a[rows, :, 0].size))
-
-
-def _differing_pixels(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.intp]:
-    """Return the flat indices of the pixels in which any channel differs, intp[n]."""
-    height, width = a.shape[:2]
-    step, parts = 64, []
-    for start in range(0, max(1, height), step):  # blocks of rows stay in the cache
-        differ = _differ(a[start : start + step], b[start : start + step])
-        parts.append(np.flatnonzero(differ))
-        parts[-1] += start * width
-    return np.concatenate(parts)
-
-
-def _differ(a: NDArray[np.float32], b: NDArray[np.float32]) -> Mask:
-    """Return whether any channel of each pixel differs, bool[pixel]."""
-    differ = (a != b).reshape(-1)
-    channels = a.shape[2]
-    last = differ.size - channels + 1
-    out = differ[:last].copy()  # of any value and those behind it: faster than to take each channel apart
-    for k in range(1, channels):
-        out |= differ[k : last + k]
-    return np.ascontiguousarray(out[::channels])
 
 
 def _altering(draws: Draws) -> list[str]:

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
-from ..core import llvm
+from ..core import buffers, llvm
 
 llvm.prepare()
 
@@ -23,8 +22,6 @@ mi: Any = mitsuba
 
 __all__ = ["dr", "mi", "packets", "set_threads"]
 
-_ALIGNED_BYTES = 64
-
 
 def set_threads(count: int) -> None:
     """Limit the number of render threads of this process."""
@@ -34,11 +31,7 @@ def set_threads(count: int) -> None:
 def packets(kind: Any, values: NDArray[Any]) -> Any:
     """Return numbers as a drjit array of the type `kind` from which `dr.gather` fetches two or four at a time.
 
-    drjit uses numpy's memory as it is. Where that is not aligned, it fetches single numbers, by another kernel: the
-    one in its cache on disk would serve only some of the processes.
+    Where they are not aligned, drjit fetches single numbers, by another kernel: the one in its cache on disk would
+    serve only some of the processes.
     """
-    memory = np.empty(values.nbytes + _ALIGNED_BYTES, np.uint8)
-    start = -memory.ctypes.data % _ALIGNED_BYTES
-    aligned = memory[start : start + values.nbytes].view(values.dtype)
-    aligned[:] = values.ravel()
-    return kind(aligned)
+    return kind(buffers.aligned(values.ravel()))

@@ -1,0 +1,190 @@
+"""Develop three-colour images with one compiled kernel, which keeps all intermediate results in registers.
+
+Every value takes the steps of `three_colour.ThreeColourDetector` in the same order and precision, so it has the
+bits that these steps give one after the other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr
+
+from ..core import buffers
+from ..core.llvm import backend
+from .noise import (
+    ALL_TERMS_BELOW_E,
+    EXACT_POISSON_BELOW_E,
+    SUM_COMPLETE,
+    later_poisson_terms,
+    variates_by_code,
+)
+
+F32 = NDArray[np.float32]
+U8 = NDArray[np.uint8]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Curve:
+    """Hold the numbers with which a sensor turns the signals of one exposure into levels.
+
+    Attributes
+    ----------
+    dark_e, full_well_e
+        Mean dark electrons, and the most electrons of a pixel.
+    gain_dn_per_e, read_noise_dn, bias_dn, adc_max_dn
+        Numbers of the converter.
+    black_dn, scale
+        Code that is shown as 0, and the levels per code of R, G and B, float32[3].
+    dark_counts_e
+        Electrons of an unlit value by the code of its shot noise, float32[65536].
+    """
+
+    dark_e: np.float32
+    full_well_e: np.float32
+    gain_dn_per_e: np.float32
+    read_noise_dn: np.float32
+    bias_dn: np.float32
+    adc_max_dn: np.float32
+    black_dn: np.float32
+    scale: F32
+    dark_counts_e: F32
+
+
+def levels(curve: Curve, signal: F32, codes: NDArray[np.uint16] | None, base: tuple[F32, U8] | None = None) -> U8:
+    """Return the 8 bit levels of R, G and B, uint8[y, x, 3].
+
+    Parameters
+    ----------
+    curve
+        The sensor and its exposure.
+    signal
+        Expected photo-electrons, float32[y, x, 3], of at least one pixel.
+    codes
+        Codes of the variates of shot noise and of read noise, uint16[y, x, 3, 2]; None for no noise. The two
+        outermost codes stand for variates that no table holds; here they are the medians of their bins.
+    base
+        Another signal, float32[y, x, 3], and its image with the same variates, uint8[y, x, 4]. Where a value of the
+        signal is the same, its level is taken from this image.
+    """
+    be = backend()
+    dr, trace = be.dr, _Trace(curve, noisy=codes is not None)
+    place = dr.arange(be.UInt32, signal.size)
+    given = [
+        be.Float(_flat(signal)),
+        place,
+        be.UInt32(0) if codes is None else be.UInt32(_flat(codes).view(np.uint32)),
+    ]
+    if base is None:
+        found = trace.level(*given)
+    else:
+        of_base = be.UInt32(_flat(base[1]).view(np.uint32))
+
+        def known(_: Any, place: Any, __: Any) -> Any:
+            pixel = place // 3
+            return dr.gather(be.UInt32, of_base, pixel) >> 8 * (place - 3 * pixel) & 0xFF
+
+        found = dr.if_stmt(tuple(given), given[0] != be.Float(_flat(base[0])), trace.level, known)
+    out = be.UInt8(found)
+    dr.eval(out)
+    dr.sync_thread()
+    array: U8 = np.array(out, copy=False).reshape(signal.shape)
+    return array
+
+
+class _Trace:
+    """Follow values through the steps.
+
+    All numbers of the sensor are device arrays: as literals they would give each exposure a kernel of its own.
+    """
+
+    def __init__(self, curve: Curve, *, noisy: bool) -> None:
+        be = backend()
+        self._noisy = noisy
+        self._dark, self._full_well, self._gain, self._read_noise, self._bias, self._top, self._black = (
+            be.dr.opaque(be.Float, float(value))
+            for value in (
+                curve.dark_e,
+                curve.full_well_e,
+                curve.gain_dn_per_e,
+                curve.read_noise_dn,
+                curve.bias_dn,
+                curve.adc_max_dn,
+                curve.black_dn,
+            )
+        )
+        self._scale = [be.dr.opaque(be.Float64, float(value)) for value in curve.scale]
+        if noisy:
+            self._normal, self._uniform = _tables()
+            self._dark_counts = be.Float(curve.dark_counts_e)
+
+    def level(self, signal: Any, place: Any, codes: Any) -> Any:
+        """Return the 8 bit levels of signals; the low half of a word of codes is that of the shot noise."""
+        be = backend()
+        dr = be.dr
+        if self._noisy:
+            lit = signal > 0
+            electrons = dr.if_stmt(
+                (signal + self._dark, codes & 0xFFFF, lit),
+                lit,
+                self._poisson,
+                lambda mean, shot, lit: dr.gather(be.Float, self._dark_counts, shot, ~lit),
+            )
+        else:
+            electrons = signal + self._dark
+        dn = dr.clip(electrons, 0, self._full_well) * self._gain
+        if self._noisy:
+            dn = dn + dr.gather(be.Float, self._normal, codes >> 16) * self._read_noise
+        dn = dr.clip(dr.round(dn + self._bias), 0, self._top)
+        colour = place % 3
+        scale = dr.select(colour == 0, self._scale[0], dr.select(colour == 1, self._scale[1], self._scale[2]))
+        return be.UInt32(be.Int32(dr.clip(dr.round(be.Float64(dn - self._black) * scale), 0, 255)))
+
+    def _poisson(self, mean: Any, shot: Any, lit: Any) -> Any:
+        """Return `noise.poisson_quantile` of lit values."""
+        be = backend()
+        dr = be.dr
+        z = dr.gather(be.Float, self._normal, shot, lit)
+        count = (z * z * be.Float(1 / 6) + be.Float(1 / 3) + dr.sqrt(mean) * z) + mean
+        count = dr.if_stmt(
+            (count, mean, z),
+            mean < ALL_TERMS_BELOW_E,
+            lambda count, mean, z: count + later_poisson_terms(dr, mean, z),
+            lambda count, mean, z: count,
+        )
+        few = lit & (mean < EXACT_POISSON_BELOW_E)
+        count = dr.maximum(dr.floor(count), 0)
+        return dr.if_stmt((count, mean, shot, few), few, self._summed, lambda count, *_: count)
+
+    def _summed(self, _: Any, mean: Any, shot: Any, few: Any) -> Any:
+        """Return the Poisson counts of few electrons by summing the distribution."""
+        be = backend()
+        dr = be.dr
+        u, m = dr.gather(be.Float64, self._uniform, shot, few), be.Float64(mean)
+
+        def goes_on(term: Any, total: Any, count: Any) -> Any:
+            return (u > total) & (total < SUM_COMPLETE)
+
+        def add(term: Any, total: Any, count: Any) -> Any:
+            count = count + 1
+            term = term * m / count
+            return term, total + term, count
+
+        term = dr.exp(-m)
+        _, _, count = dr.while_loop((term, be.Float64(term), be.Float64(0)), goes_on, add, mode="symbolic")
+        return be.Float(count)
+
+
+def _flat(array: NDArray[Any]) -> NDArray[Any]:
+    return buffers.aligned(array).reshape(-1)
+
+
+@lru_cache(maxsize=1)
+def _tables() -> tuple[Any, Any]:
+    """Return the normal variates by code, and the values of their distribution function, on the device."""
+    be, normal = backend(), variates_by_code()
+    return be.Float(normal), be.Float64(ndtr(normal.astype(np.float64)))
