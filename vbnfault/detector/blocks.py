@@ -27,10 +27,10 @@ if hasattr(os, "register_at_fork"):  # threads do not survive in a forked proces
     os.register_at_fork(after_in_child=pool.cache_clear)
 
 
-def blockwise(step: Callable[..., NDArray[Any]], array: NDArray[Any], *more: Any) -> NDArray[Any]:
+def blockwise(step: Callable[..., NDArray[Any]], array: NDArray[Any], *more: NDArray[Any] | None) -> NDArray[Any]:
     """Return `step(block, *blocks of more)` of all blocks of rows, joined.
 
-    `more` are arrays, or each a `NormalField`, which yields a block for a slice of rows, too; None stays None.
+    `more` are arrays; None stays None.
     """
 
     def of_block(start: int) -> NDArray[Any]:

@@ -31,7 +31,7 @@ def effect(image: NDArray[np.uint8], without: NDArray[np.uint8], least_dn: float
         return np.asarray((cv2.absdiff(image, without) >= least_dn).any(axis=2))
     # compare the four 8 bit channels as one 32 bit word
     a, b = (np.ascontiguousarray(x).view(np.uint32)[..., 0] for x in (image, without))
-    return a != b
+    return np.not_equal(a, b, out=buffers.empty(a.shape, np.bool_))
 
 
 def kind(fault: Fault, *, is_ccd: bool) -> str:
