@@ -136,7 +136,7 @@ def test_damaged_samples_are_counted_and_left_out(whole: st.Store, tmp_path: Pat
     shutil.rmtree(whole.path / "image" / "c" / "1")
     chunks = whole.chunk("image", 2)
     whole.file("image", 2).write_bytes(codec.join_shard({0: chunks[9], 1: chunks[9]}, 4))
-    sentence = r"sample 8: the stored crc32c of image is another; .* with 4 samples more; the report leaves"
+    sentence = r"sample 8 does not match the stored crc32c of image; .* of 4 samples more; the report leaves"
     with pytest.warns(UserWarning, match=sentence):
         text = write_report(whole, tmp_path / "r.html").read_text()
     assert "4 finished samples whose scalars cannot be read and 5 whose pixels cannot be read" in text

@@ -188,7 +188,7 @@ class Store:
             # a process that rewrites the sample replaces the file of `done` first
             mismatches += self.files.stamp(file) == stamp
         raise problem or VbnfaultError(
-            f"{self.path}: sample {index}: the stored crc32c of {' and '.join(wrong)} is another; the build "
+            f"{self.path}: sample {index} does not match the stored crc32c of {' and '.join(wrong)}; the build "
             "command repairs it"
         )
 

@@ -313,7 +313,7 @@ def readable(
             continue
         yield position, sample
     if problems:
-        more = f"; so it is with {len(problems) - 1} samples more" if len(problems) > 1 else ""
+        more = f"; the same is true of {len(problems) - 1} samples more" if len(problems) > 1 else ""
         warnings.warn(f"{problems[-1]}{more}; the report leaves out what it cannot read", stacklevel=2)
 
 
