@@ -156,6 +156,8 @@ def test_root_attributes_of_the_wrong_type_are_one_sentence(
         "store.mask_kinds": 7,
         "store.wavelength_nm": "x",
         "store.attitude_references": ["sun"],
+        "store.height": 0,
+        "store.shard_samples": -1,
     }
     for key, value in wrong.items():
         path = tmp_path / f"{key}.zarr"

@@ -132,6 +132,23 @@ def test_arrays_in_any_order_and_place_in_memory_give_the_same_image() -> None:
         np.testing.assert_array_equal(again.array, image)
 
 
+def test_shapes_that_differ_are_refused() -> None:
+    detector = ThreeColourDetector()
+    light, other = (
+        Electrons(array=np.ones((*s, 3), np.float32), white_e=detector.white_e) for s in ((4, 6), (6, 4))
+    )
+    with pytest.raises(ValueError, match="noise has the shape"):
+        detector.develop(light, EXPOSURE_S, draw(1, (6, 4)))
+    with pytest.raises(ValueError, match="base has the shape"):
+        detector.develop(light, EXPOSURE_S, None, base=(other, detector.develop(other, EXPOSURE_S, None)))
+
+
+def test_codes_with_gaps_that_differ_are_refused() -> None:
+    codes = np.zeros((4, 6, 3), np.uint16)
+    with pytest.raises(ValueError, match="must be equally spaced"):
+        draw_normals((4, 3, 3), np.random.default_rng(1), codes[:, ::2])
+
+
 @pytest.mark.parametrize("noisy", [True, False])
 def test_values_of_the_same_signal_are_taken_from_the_other_image(noisy: bool) -> None:
     detector, shape = ThreeColourDetector(), (70, 50)
@@ -152,12 +169,20 @@ def test_values_of_the_same_signal_are_taken_from_the_other_image(noisy: bool) -
     np.testing.assert_array_equal(image[..., :3][~taken], stepwise(detector, one, noise)[..., :3][~taken])
 
 
-def test_a_signal_that_is_no_number_does_not_end_the_process() -> None:
+@pytest.mark.parametrize("noisy", [True, False])
+@pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")
+def test_a_signal_that_is_no_number_does_not_end_the_process(noisy: bool) -> None:
     detector, shape = ThreeColourDetector(), (4, 6)
     signal = np.full((*shape, 3), np.nan, np.float32)
     signal[0] = np.inf
-    signal[1] = 100
-    image = detector.develop(Electrons(array=signal, white_e=detector.white_e), EXPOSURE_S, None).array
+    signal[1] = 500
+    noise = draw(3, shape) if noisy else None
+    image = detector.develop(Electrons(array=signal, white_e=detector.white_e), EXPOSURE_S, noise).array
+    np.testing.assert_array_equal(
+        image[:2], stepwise(detector, Electrons(array=signal, white_e=detector.white_e), noise)[:2]
+    )
+    if noisy:
+        return
     assert (image[0, :, :3] == 255).all()
     assert ((image[1, :, :3] > 0) & (image[1, :, :3] < 255)).all()
 
@@ -172,6 +197,8 @@ def test_exposures_and_variates_share_one_kernel() -> None:
         for k in range(6):
             detector = ThreeColourDetector(read_noise_e_rms=5.0 + k, bias_dn=10 * k, dark_current_e_s=float(k))
             light = Electrons(array=signal * np.float32(k + 1), white_e=detector.white_e)
-            detector.develop(light, 0.01 * (k + 1), draw(k, shape))
+            memory = np.zeros(signal.size + k, np.float32)[k:].reshape(signal.shape)  # anywhere in memory
+            memory[...] = light.array
+            detector.develop(light.with_array(memory), 0.01 * (k + 1), draw(k, shape))
             hashes |= {kernel["hash"] for kernel in dr.kernel_history() if "hash" in kernel}
     assert len(hashes) == 1

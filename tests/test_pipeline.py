@@ -527,7 +527,7 @@ def counted_pixels(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
         yield developed
 
 
-def test_a_twin_develops_only_the_pixels_that_its_fault_changes(
+def test_a_twin_takes_the_pixels_that_its_fault_does_not_change(
     frames_: list[Frame], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A twin has the bits of the image without its fault, and takes no more pixels than the fault changes."""
@@ -550,7 +550,7 @@ def test_a_twin_develops_only_the_pixels_that_its_fault_changes(
     assert tried > 2
 
 
-def test_an_image_develops_only_the_pixels_that_differ_from_the_clean_one(
+def test_an_image_takes_the_pixels_of_the_clean_one_that_do_not_differ(
     frames_: list[Frame], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     few = 0

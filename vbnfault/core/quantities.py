@@ -155,7 +155,7 @@ class Electrons(Quantity):
             return replace(self, rim_rows=None)
         if self.past_rims is None:
             return self
-        array = buffers.empty(self.array.shape)
+        array = buffers.empty(self.array.shape, self.array.dtype)
         return replace(self, array=np.add(self.array, self.past_rims, out=array), past_rims=None)
 
     def scaled(self, factor: float) -> Electrons:
@@ -163,7 +163,7 @@ class Electrons(Quantity):
         if self.rim_rows is not None:
             return self.in_planes.scaled(factor)
         times = np.float32(factor)
-        array = np.multiply(self.array, times, out=buffers.empty(self.array.shape))
+        array = np.multiply(self.array, times, out=buffers.empty(self.array.shape, self.array.dtype))
         if self.past_rims is None:
             return replace(self, array=array)
         rows = _lit_rows(self.past_rims)

@@ -24,10 +24,16 @@ def write_whole(path: Path, content: str | bytes) -> None:
         path.write_bytes(data)
         return
     with replacing(target) as temporary:
-        temporary.write_bytes(data)
-        if target.exists():
+        mode = stat.S_IMODE(target.stat().st_mode) if target.exists() else None
+        # what nobody else may read is not readable meanwhile, either
+        descriptor = os.open(
+            temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666 if mode is None else mode | 0o200
+        )
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(data)
+        if mode is not None:
             with contextlib.suppress(OSError):  # a file system without permissions
-                temporary.chmod(stat.S_IMODE(target.stat().st_mode))
+                temporary.chmod(mode)
 
 
 class replacing:

@@ -88,11 +88,15 @@ def draw_normals(
 ) -> NormalField:
     """Draw standard normal variates by the inverse distribution function of 16 bit uniform numbers.
 
-    `codes` receives these numbers, uint16 of the given shape, which may be a view with gaps between them.
+    `codes` receives these numbers, uint16 of the given shape, which may be a view with equal gaps between all of
+    them. Raises ValueError if the gaps differ.
     """
     if codes is None:
         codes = buffers.empty(shape, np.uint16)
-    tail, outermost = _draw_codes(codes.reshape(math.prod(shape)), rng)
+    flat = codes.reshape(math.prod(shape))
+    if flat.size and not np.shares_memory(flat, codes):
+        raise ValueError(f"codes has the strides {codes.strides}: its numbers must be equally spaced")
+    tail, outermost = _draw_codes(flat, rng)
     sign = np.where(outermost == 0, 1.0, -1.0)
     values = sign * ndtri((1.0 - rng.random(len(tail))) / 65536)
     return NormalField(codes=codes, tail=tail, tail_values=values.astype(np.float32))
@@ -136,13 +140,13 @@ def variates_by_code() -> F32:
     return ndtri((np.arange(65536) + 0.5) / 65536).astype(np.float32)
 
 
-def later_poisson_terms(m: Any, mean: Any, z: Any) -> Any:
+def later_poisson_terms(xp: Any, mean: Any, z: Any) -> Any:
     """Return the terms of the Poisson quantile's expansion (Giles 2016, Q_N2) that matter for small means, float32.
 
-    `m` is the array namespace, numpy or drjit, of the means and the normal variates `z`.
+    `xp` is the array namespace, numpy or drjit, of the means and the normal variates `z`.
     """
-    safe, zz = m.maximum(mean, 1), z * z
-    return (zz * (zz * (1 / 270) + 7 / 810) - 8 / 405) / safe - z * (zz * (1 / 72) + 1 / 36) / m.sqrt(safe)
+    safe, zz = xp.maximum(mean, 1), z * z
+    return (zz * (zz * (1 / 270) + 7 / 810) - 8 / 405) / safe - z * (zz * (1 / 72) + 1 / 36) / xp.sqrt(safe)
 
 
 def poisson_quantile(mean: F32, normal: F32) -> F32:

@@ -176,13 +176,20 @@ class ThreeColourDetector:
         """Return the 8 bit image of the expected photo-electrons, with the bits of the single steps.
 
         `noise` comes from `draw_noise`; None gives a noise-free image. `base` is another signal with its image for
-        the same exposure and noise: pixels with this signal are taken from it, which saves time.
+        the same exposure and noise: pixels with this signal are taken from it, which saves time. Raises ValueError
+        if the shapes of signal, noise and base differ.
         """
+        shape = expected.array.shape
         if not expected.array.size:
-            return RGBI(array=np.zeros((*expected.array.shape[:2], 4), dtype=np.uint8))
+            return RGBI(array=np.zeros((*shape[:2], 4), dtype=np.uint8))
+        for name, other in (("noise", noise and noise.codes[..., 0]), ("base", base and base[0].array)):
+            if other is not None and other.shape != shape:
+                raise ValueError(
+                    f"{name} has the shape {other.shape}, and the signal {shape}: they must be the same"
+                )
         codes = None if noise is None else noise.codes
         known = None if base is None else (base[0].array, base[1].array)
-        rgb = compiled.levels(curve_of(self, exposure_s), expected.array, codes, known)
+        rgb = compiled.levels(curve_of(self, float(exposure_s)), expected.array, codes, known)
         image = blockwise(_with_luminance, rgb)
         if noise is not None and len(noise.outermost_pixels):
             beyond = noise.outermost_pixels[None]

@@ -31,7 +31,8 @@ def set_threads(count: int) -> None:
 def packets(kind: Any, values: NDArray[Any]) -> Any:
     """Return numbers as a drjit array of the type `kind` from which `dr.gather` fetches two or four at a time.
 
-    Where they are not aligned, drjit fetches single numbers, by another kernel: the one in its cache on disk would
-    serve only some of the processes.
+    The array may use the memory of `values`, which must not change while the array is used. Where they are not
+    aligned, drjit fetches single numbers, by another kernel: the one in its cache on disk would serve only some of
+    the processes.
     """
     return kind(buffers.aligned(values.ravel()))

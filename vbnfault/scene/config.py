@@ -106,7 +106,8 @@ class Scene(Table):
         given = self.geometry
         if not self.is_aimed:
             changed = [key for key in OF_AN_AIM if getattr(given, key) != type(given).model_fields[key].default]
-            if changed and not self.is_flown:
+            # poses need no aim, and Python may take away the aim of a file that has these keys, too
+            if changed and not self.is_flown and "aim" not in given.model_fields_set:
                 raise ValueError(
                     f"geometry.{changed[0]} = {shown(getattr(given, changed[0]))}: applies beside geometry.aim "
                     "alone; give geometry.aim, or leave it out"

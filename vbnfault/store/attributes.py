@@ -29,8 +29,18 @@ _TABLES = (
 )
 # Names of the elements of a tuple in the type of a field of `StoreSpec` → the types that they have in JSON.
 _ELEMENTS: dict[str, tuple[type, ...]] = {"str": (str,), "int": (int,), "float": (int, float)}
+_WORDS = {
+    "tuple": "a list of ",
+    "Mapping": "a table",
+    "str": "a text",
+    "int": "a whole number",
+    "float": "a number",
+}
+_WORDS_OF_ELEMENTS = {"str": "texts", "int": "whole numbers", "float": "numbers"}
 # Fields of `StoreSpec` whose lists have this many elements.
 _LENGTHS = {"distortion_residual_px": (2,), "attitude_references": (2,), "rendered_shape": (0, 2)}
+# Fields of `StoreSpec` that count something, and the least that they may be.
+_LEAST = {"height": 1, "width": 1, "shard_samples": 0}
 # Fields of `StoreSpec` with one element for each class, or none.
 _OF_CLASSES = ("mask_kinds", "mask_rules", "soft_layers")
 
@@ -93,7 +103,9 @@ def check_plain_spec(plain: Any, spec: type) -> None:
             continue
         value, kind = plain[field.name], str(field.type)
         if (value is not None or not kind.endswith("| None")) and not _is_of(kind, value):
-            raise InputError(f"store.{field.name} = {shown(value)}: must be {kind}")
+            raise InputError(f"store.{field.name} = {shown(value)}: must be {_in_words(kind)}")
+        if field.name in _LEAST and value < _LEAST[field.name]:
+            raise InputError(f"store.{field.name} = {shown(value)}: must be at least {_LEAST[field.name]}")
         lengths = _LENGTHS.get(field.name)
         if field.name in _OF_CLASSES:
             lengths = 0, len(plain.get("faults", ()))
@@ -101,12 +113,20 @@ def check_plain_spec(plain: Any, spec: type) -> None:
             raise InputError(f"store.{field.name} = {shown(value)}: must have {lengths[-1]} elements")
 
 
+def _in_words(kind: str) -> str:
+    """Return what a type in `StoreSpec` is in JSON."""
+    words = _WORDS[kind.split("[")[0].removesuffix(" | None")]
+    if kind.startswith("tuple["):
+        words += _WORDS_OF_ELEMENTS[kind.removeprefix("tuple[").split(",")[0].split("]")[0]]
+    return f"{words}, or null" if kind.endswith("| None") else words
+
+
 def _is_of(kind: str, value: Any) -> bool:
     """Return whether a JSON value fits a type as it is written in `StoreSpec`."""
     kind = kind.removesuffix(" | None")
     if kind.startswith("tuple["):
         types = _ELEMENTS[kind.removeprefix("tuple[").split(",")[0]]
-        return isinstance(value, list) and all(type(element) in types for element in value)
+        return isinstance(value, list | tuple) and all(type(element) in types for element in value)
     if kind.startswith("Mapping["):
         return isinstance(value, dict)
     return type(value) in _ELEMENTS[kind]
