@@ -487,11 +487,12 @@ def test_samples_that_share_a_chunk_are_read_in_the_page(page: Page, tmp_path: P
             page.wait(f"document.getElementById('name').textContent === 'Sample {i}'")
             page.press("d")
             page.wait("window.vbnfault.view.layer === 'depth_m' && document.getElementById('message').hidden")
-            page.wait(
-                f"window.vbnfault.view.index === {i} && window.vbnfault.view.pixels?.layer.name === 'depth_m'"
-            )
+            depth_m = samples[i].layers["depth_m"].ravel()
+            # until they are read, the pixels of the sample before are shown
+            page.wait(f"window.vbnfault.view.pixels?.data[0] === Math.fround({float(depth_m[0])!r})")
+            assert page.evaluate("window.vbnfault.view.pixels.layer.name") == "depth_m"
             shown = page.evaluate("[...window.vbnfault.view.pixels.data]")
-            np.testing.assert_array_equal(np.float32(shown), samples[i].layers["depth_m"].ravel())
+            np.testing.assert_array_equal(np.float32(shown), depth_m)
             page.press("ArrowRight")
         assert page.evaluate("window.vbnfault.sources.server") == 0
     finally:
