@@ -12,9 +12,10 @@ import pytest
 from synthetic import FAULTS, fake_sample, flip, repaired
 
 from vbnfault import store as st
-from vbnfault.core.errors import VbnfaultError
+from vbnfault.core.errors import InputError, VbnfaultError
 from vbnfault.core.quantities import Sample
 from vbnfault.store import check, codec
+from vbnfault.store.attributes import check_attributes
 
 # --- damage ---------------------------------------------------------------------------------------------------
 
@@ -308,6 +309,30 @@ def test_consolidated_metadata_that_differ_are_found_and_mended(whole: st.Store,
     assert json.loads(file.read_text()) == json.loads(good)
     assert st.verify(whole.path) == []
     assert st.digest(whole.path) == before
+
+
+@pytest.mark.parametrize("where", ["array key", "attribute", "foreign entry", "root key"])
+def test_long_names_in_metadata_are_cut_in_the_sentence(whole: st.Store, where: str) -> None:
+    """A damaged name may be as long as the file; a sentence of many screens cannot be read."""
+    name = "[" * 5000
+    file = whole.path / ("depth_m/zarr.json" if where in ("array key", "attribute") else "zarr.json")
+    document = json.loads(file.read_text())
+    if where == "attribute":
+        document["attributes"][name] = 1
+    elif where == "foreign entry":
+        document["consolidated_metadata"]["metadata"][name] = {}
+    else:
+        document[name] = 1
+    file.write_text(json.dumps(document))
+    (sentence,) = st.verify(whole.path)
+    assert "[[[" in sentence
+    assert len(sentence) < 400
+
+
+def test_long_names_in_root_attributes_are_cut_in_the_sentence() -> None:
+    with pytest.raises(InputError, match=r"scene\.faults\.x+") as raised:
+        check_attributes({"scene": {"faults": {"x" * 5000: 3}}})
+    assert len(str(raised.value)) < 400
 
 
 @pytest.mark.parametrize("name", ["mask", "done", "parameters", "sample", "fault", "wavelength_nm"])

@@ -21,7 +21,7 @@ class VbnfaultError(Exception):
 
     def __init__(self, message: object = "") -> None:
         text = str(message)
-        super().__init__(text if len(text) <= _LONGEST_MESSAGE else _without_middle(text, _LONGEST_MESSAGE))
+        super().__init__(text if len(text) <= _LONGEST_MESSAGE else without_middle(text, _LONGEST_MESSAGE))
 
 
 class InputError(VbnfaultError):
@@ -63,8 +63,8 @@ def shown(value: object) -> str:
     if isinstance(value, str | bytes | list | tuple) and len(value) > 4 * _LONGEST_VALUE:
         # `repr` of the whole could take long and fill the memory
         half = 2 * _LONGEST_VALUE
-        return _without_middle(f"{shown_whole(value[:half])} … {shown_whole(value[-half:])}", _LONGEST_VALUE)
-    return _without_middle(shown_whole(value), _LONGEST_VALUE)
+        return without_middle(f"{shown_whole(value[:half])} … {shown_whole(value[-half:])}", _LONGEST_VALUE)
+    return without_middle(shown_whole(value), _LONGEST_VALUE)
 
 
 def shown_whole(value: object) -> str:
@@ -75,7 +75,7 @@ def shown_whole(value: object) -> str:
         return f"a {type(value).__name__}"
 
 
-def _without_middle(text: str, length: int) -> str:
+def without_middle(text: str, length: int = _LONGEST_VALUE) -> str:
     """Return a text. If it is longer than `length`, a note of its length replaces its middle."""
     if len(text) <= length:
         return text

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import fields
 from typing import Any
 
-from ..core.errors import InputError, shown
+from ..core.errors import InputError, shown, without_middle
 
 # Dotted keys of the root attributes that are tables wherever they are present; * stands for every key of a table.
 _TABLES = (
@@ -50,7 +50,7 @@ def check_attributes(attributes: Mapping[str, Any]) -> None:
     for path in _TABLES:
         for key, value in _values_at(attributes, path.split(".")):
             if not isinstance(value, dict):
-                raise InputError(f"{key} = {shown(value)}: must be a table")
+                raise InputError(f"{without_middle(key)} = {shown(value)}: must be a table")
     _check_blocks(attributes.get("blocks", [1]))
     notes = attributes.get("versions_of_samples", [])
     if not isinstance(notes, list) or not all(

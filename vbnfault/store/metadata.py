@@ -84,9 +84,9 @@ def _differences(stored: Mapping[str, Any], wanted: Mapping[str, Any]) -> Iterat
         if isinstance(a, dict) and isinstance(b, dict) and key == "attributes":
             for name in {**b, **a}:
                 if _differ(a.get(name, _ABSENT), b.get(name, _ABSENT)):
-                    yield f"its attribute {name} = {short(a.get(name))}, not {short(b.get(name))}"
+                    yield f"its attribute {short(name)} = {short(a.get(name))}, not {short(b.get(name))}"
         elif _differ(a, b):
-            yield f"its {key} = {short(a)}, not {short(b)}"
+            yield f"its {short(key)} = {short(a)}, not {short(b)}"
 
 
 _ABSENT = "absent"
@@ -136,12 +136,13 @@ def _root_differences(
         return
     for name in (*sound, *sorted(entries.keys() - documents.keys())):
         if name not in documents or name not in entries or _differ(entries[name], documents[name]):
+            name = short(name)
             yield f"array {name}: the consolidated metadata in {DOCUMENT} differ from {name}/{DOCUMENT}"
     for document in (root, wanted):
         del document["consolidated_metadata"]["metadata"]
     for key in {**wanted, **root}:
         if _differ(root.get(key, _ABSENT), wanted.get(key, _ABSENT)):
-            yield f"{DOCUMENT}: its {key} = {short(root.get(key))}, not {short(wanted.get(key))}"
+            yield f"{DOCUMENT}: its {short(key)} = {short(root.get(key))}, not {short(wanted.get(key))}"
 
 
 def short(value: Any) -> str:
