@@ -20,6 +20,7 @@ from vbnfault.lens.coating import NAMES, Layer, design, mean_reflectance, reflec
 from vbnfault.lens.glass import AIR, GLASSES, from_abbe
 from vbnfault.lens.paraxial import gap, refraction, system
 from vbnfault.lens.prescription import Surface
+from vbnfault.lens.prescription_file import write_lens
 from vbnfault.lens.rays import ghost, real_pupil_diameter_mm, trace
 from vbnfault.lens.straylight import paraxial
 
@@ -218,6 +219,12 @@ def lens_of(*rows: dict[str, Any], **more: Any) -> dict[str, Any]:
         (lens_of(STOP, GLASS | {"radius": 3.0}, BACK), ["surface[1]", "radius", "unknown key"]),
         (lens_of(STOP, GLASS | {"radius_mm": True}, BACK), ["surface[1].radius_mm = True: must be a number"]),
         (lens_of(STOP, GLASS | {"radius_mm": 0.0}, BACK), ["radius_mm = 0", "inf"]),
+        (lens_of(STOP, GLASS | {"radius_mm": 1e-308}, BACK), ["radius_mm = 1e-308", "from 1e-09", "inf"]),
+        (lens_of(STOP, GLASS | {"conic": 80.0}, BACK), ["diameter_mm = 20", "conic = 80", "at most 11.1111"]),
+        (
+            lens_of(STOP, GLASS | {"aspheric_mm": [0.0] * 400}, BACK),
+            ["aspheric_mm", "a list of at most 20"],
+        ),
         (lens_of(STOP, GLASS, BACK, surfaces=[]), ["surfaces", "unknown key"]),
     ],
 )
@@ -241,6 +248,10 @@ def test_a_lens_that_does_not_focus(tmp_path: Path) -> None:
     )
     with pytest.raises(InputError, match="afocal"):
         paraxial_properties(window)
+    path = tmp_path / "window.toml"
+    write_lens(window, path)
+    with pytest.raises(InputError, match=r"window\.toml: window: surface 0 to 2: .* afocal"):
+        load_lens(path)  # so that a scene whose fault has such a lens is refused before anything is rendered
     path = tmp_path / "broken.toml"
     path.write_text("surface = ")
     with pytest.raises(InputError, match=r"broken\.toml: not a TOML file"):
@@ -351,6 +362,24 @@ def test_the_command_draws_and_tabulates(
     assert not Path("x.json").exists()
     assert run(monkeypatch, "lens", "tessar_50_f2p8", "--json", tmp_path) == 2
     assert "cannot be written" in capsys.readouterr().err
+
+
+def test_no_output_replaces_another_or_the_prescription(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from test_cli import run
+
+    monkeypatch.chdir(tmp_path)
+    write_lens(load_lens("tessar_50_f2p8"), Path("mine.toml"))
+    before = Path("mine.toml").read_bytes()
+    assert run(monkeypatch, "lens", "mine.toml", "--vary-seed", 1, "--toml", tmp_path / "mine.toml") == 2
+    assert "mine.toml: is also the file of the input; choose another path" in capsys.readouterr().err
+    assert run(monkeypatch, "lens", "mine.toml", "--out", "a.png", "--json", "./a.png") == 2
+    assert "--out a.png: is also the file of --json; choose another path" in capsys.readouterr().err
+    assert run(monkeypatch, "flare", "mine.toml", "--sun-deg", 3, "--out", "a.png", "--json", "mine.toml") == 2
+    assert "--json mine.toml: is also the file of the input" in capsys.readouterr().err
+    assert Path("mine.toml").read_bytes() == before
+    assert not Path("a.png").exists()
 
 
 def test_a_lens_without_a_source_with_its_stop_behind_reads_well(

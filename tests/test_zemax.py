@@ -137,7 +137,7 @@ def test_the_unit_scales_every_length(tmp_path: Path) -> None:
             assert getattr(mine, key) == pytest.approx(getattr(other, key))
 
 
-@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "latin-1"])
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "latin-1"])
 def test_encodings(tmp_path: Path, encoding: str) -> None:
     path = tmp_path / "lens.ZMX"
     path.write_bytes(TRIPLET.replace("a triplet", "für Zemax").encode(encoding))
@@ -180,7 +180,19 @@ def test_a_stop_on_a_refracting_surface_is_a_row_of_its_shape(tmp_path: Path) ->
         ),
         ("DISZ 2.75", "DISZ -2.75", "SURF 6: DISZ -2.75: the distance to the next surface comes to -2.75 mm"),
         ("DIAM 4 0", "DIAM 0 0", "SURF 6: DIAM 0: the semi-diameter must be above 0"),
-        ("STOP", "HIDE", "stop: exactly one surface must have stop = true; none has"),
+        ("STOP", "HIDE", "STOP: must stand at exactly one surface from SURF 1 to SURF 8; it stands nowhere"),
+        ("SURF 2\n", "SURF 2\n  STOP\n", "SURF 1 to SURF 8; it stands at SURF 2, 6"),
+        ("SURF 9\n", "SURF 9\n  STOP\n", "SURF 1 to SURF 8; it stands at SURF 6, 9"),
+        ("CLAP 0 7.5", "CLAP 0 -7.5", "SURF 3: CLAP or FLAP -7.5: the radius of the aperture must be above 0"),
+        # what only the prescription knows is said with the file's own numbers
+        ("1 0 1.62 36.37", "1 0 9 36.37", "SURF 4: nd = 9.0: must be a number from 1 to 5"),
+        (
+            "CONI -0.7",
+            "CONI 1e5",
+            "SURF 3: diameter_mm = 15: a surface with radius_mm = -435.92 and conic = 100000",
+        ),
+        ("DISZ 3.26", "DISZ 0.1", "SURF 2: thickness_mm = 0.1: SURF 2 and SURF 3 cross"),
+        ("CURV -5.4361E-02", "CURV 5.4361E-02", "a triplet: surface 6: no ray reaches the sensor"),
         (TRIPLET[TRIPLET.index("SURF 1") :], "", "not a lens: between the first SURF"),
         ("  DISZ 0\n  DIAM 18", "  CURV 0.1\n  DIAM 18", "SURF 9: CURV 0.1: the image must be plane"),
     ],

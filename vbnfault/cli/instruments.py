@@ -15,6 +15,7 @@ from .options import (
     LensArgument,
     PluginOption,
     check_image_path,
+    check_separate,
     grouped,
     load_plugins,
     local_path,
@@ -88,8 +89,9 @@ def lens(
     from ..lens.prescription_file import write_lens
     from ..output import lens_sheet
 
-    prescription = adapted_lens(LensRequest(lens=lens, **vars(options)))
     path = Path(f"{Path(lens).stem}.png") if out is None else out
+    check_separate(lens, {"--json": json_, "--toml": toml, "--out": path})
+    prescription = adapted_lens(LensRequest(lens=lens, **vars(options)))
     check_image_path(path, ".png")
     source = f", {prescription.source}" if prescription.source else ""
     typer.echo(f"{prescription.name}: {len(prescription.surfaces)} surfaces{source}")
@@ -171,6 +173,7 @@ def flare(
     ] = None,
 ) -> None:
     """Compute ghosts, starburst and glare of the Sun in a lens, as an image and as a table of every ghost."""
+    check_separate(lens, {"--json": json_, "--out": out})
     check_image_path(out, ".png", ".exr")
     from ..lens.adapt import LensRequest, adapted_lens
     from ..output import flare_images

@@ -10,7 +10,7 @@ import math
 import re
 import sys
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
@@ -211,6 +211,17 @@ def writing(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from None
+
+
+def check_separate(read: str, written: Mapping[str, Path | None]) -> None:
+    """Refuse two options that name one file, and one that names the file which is read. Raises InputError."""
+    taken = {Path(read).resolve(): "the input"} if Path(read).is_file() else {}
+    for option, path in written.items():
+        if path is None:
+            continue
+        other = taken.setdefault(path.resolve(), option)
+        if other != option:
+            raise InputError(f"{option} {path}: is also the file of {other}; choose another path")
 
 
 def check_image_path(path: Path, *endings: str) -> None:

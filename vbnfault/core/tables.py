@@ -353,13 +353,22 @@ def _kind(schema: Mapping[str, Any], root: Mapping[str, Any]) -> str:
         each = _allowed(items[0], root, "a value").removeprefix("a ")
         return f"a list of {_COUNTS.get(len(items), str(len(items)))} values, each a {each}"
     if schema.get("type") == "array":
-        count = f" of at least {schema['minItems']}" if schema.get("minItems") else ""
+        count = _interval_of_counts(schema.get("minItems", 0), schema.get("maxItems"))
         kind = _kind(_choices(schema.get("items", {}), root)[0], root)
         plural = {"a table": " of tables", "a string": " of strings"}.get(kind, "")
         return f"a list{count or plural}"
     if schema.get("type") == "string" and schema.get("minLength"):
         return "a string that is not empty"
     return {"string": "a string", "object": "a table", "boolean": "true or false"}.get(schema.get("type", ""), "")
+
+
+def _interval_of_counts(least: int, most: int | None) -> str:
+    """Return how many entries a list may have in words; empty where any number may be."""
+    if most is None:
+        return f" of at least {least}" if least else ""
+    if least == most:
+        return f" of {most}"
+    return f" of {least} to {most}" if least else f" of at most {most}"
 
 
 def _interval(schema: Mapping[str, Any]) -> str:

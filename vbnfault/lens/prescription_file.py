@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -15,15 +16,17 @@ import numpy as np
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from ..core import resources, tables, toml_files
-from ..core.errors import InputError
+from ..core.errors import InputError, in_file
 from ..core.tables import Fraction, Table
 from ..core.whole_files import write_whole
 from .coating import Layer
 from .glass import AIR, CLEAR, D_NM, GLASSES, Glass, Transmittance, check_index, from_abbe, from_coefficients
+from .paraxial import paraxial_properties
 from .prescription import Hood, Prescription, Surface, facing_air
 from .zemax import LENS_SUFFIX, GlassCatalogue, read_catalogue, read_lens
 
 _RIM_POINTS = 65
+_SMALLEST_RADIUS_MM = 1e-9  # the squares of larger curvatures could be too large for a number
 _OF_THE_STOP = ("blades", "blade_rounding", "rotation_deg")
 
 
@@ -85,7 +88,7 @@ class SurfaceRow(Table):
     )
     conic: float = Field(0.0, ge=-1e6, le=1e6, description="0: a sphere, -1: a paraboloid")
     aspheric_mm: tuple[Annotated[float, Field(ge=-1e12, le=1e12)], ...] = Field(
-        (), description="coefficients of r⁴, r⁶, … of the sag"
+        (), max_length=20, description="coefficients of r⁴, r⁶, … of the sag"
     )
     stop: bool = Field(False, description="whether this row is the aperture stop, which one row must be")
     blades: int = Field(0, ge=0, le=64, description="of the stop; 0: a round stop, else from 3")
@@ -97,8 +100,11 @@ class SurfaceRow(Table):
     def _consistent(self) -> SurfaceRow:
         if self.radius_mm is None and not self.stop:
             raise ValueError("radius_mm: is missing")
-        if self.radius_mm is not None and (self.radius_mm == 0 or math.isnan(self.radius_mm)):
-            raise ValueError(f"radius_mm = {self.radius_mm:g}: must be a number other than 0; a plane has inf")
+        if self.radius_mm is not None and not abs(self.radius_mm) >= _SMALLEST_RADIUS_MM:  # nan is not, either
+            raise ValueError(
+                f"radius_mm = {self.radius_mm:g}: must be from {_SMALLEST_RADIUS_MM:g}, or from -inf to "
+                f"-{_SMALLEST_RADIUS_MM:g}; a plane has inf"
+            )
         for key in _OF_THE_STOP if not self.stop else ():
             if key in self.model_fields_set:
                 raise ValueError(f"{key} = {getattr(self, key):g}: only the stop has it")
@@ -183,13 +189,33 @@ def load_lens(name_or_path: str | Path) -> Prescription:
     Raises
     ------
     InputError
-        The file is missing or wrong; the message names file, surface and value.
+        The file is missing or wrong, or its lens has no focus behind it; the message names file, surface and value.
     """
     path = resources.find("scenes/lenses", name_or_path)
     if path.suffix.lower() == LENS_SUFFIX:
-        table, catalogues = read_lens(path)
-        return _prescription(tables.parse(PrescriptionFile, table, source=str(path)), str(path), catalogues)
-    return parse_lens(toml_files.read_toml(path, "lens"), source=str(path))
+        lens = _of_zemax(path)
+    else:
+        lens = parse_lens(toml_files.read_toml(path, "lens"), source=str(path))
+    with in_file(str(path)):
+        paraxial_properties(lens)
+    return lens
+
+
+def _of_zemax(path: Path) -> Prescription:
+    """Return the prescription of a Zemax file. Raises InputError, which counts surfaces as the file does."""
+    table, catalogues, numbers = read_lens(path)
+    source = str(path)
+    try:
+        return _prescription(tables.parse(PrescriptionFile, table, source=source), source, catalogues)
+    except InputError as error:
+        _, _, text = f"{error}".rpartition(f"{source}: ")
+    text = re.sub(r"^surface\[(\d+)\]\.", lambda found: f"SURF {numbers[int(found[1])]}: ", text)
+    text = re.sub(
+        r"\bsurfaces (\d+) and (\d+)\b",
+        lambda found: f"SURF {numbers[int(found[1])]} and SURF {numbers[int(found[2])]}",
+        text,
+    )
+    raise InputError(f"{source}: {text}")
 
 
 def parse_lens(table: Mapping[str, Any], *, source: str) -> Prescription:
@@ -247,9 +273,11 @@ def _surface(row: SurfaceRow, front: Glass, where: str, catalogues: Sequence[Gla
         rotation_deg=row.rotation_deg,
     )
     if np.isnan(surface.sag_mm(surface.semi_diameter_mm)):
+        most_mm = 2 * abs(radius) / math.sqrt(1 + row.conic)
+        shape = f"radius_mm = {radius:g}" + (f" and conic = {row.conic:g}" if row.conic else "")
         raise InputError(
-            f"{where}.diameter_mm = {row.diameter_mm:g}: a surface with radius_mm = {radius:g} ends before that; "
-            f"at most {2 * abs(radius):g} for a sphere"
+            f"{where}.diameter_mm = {row.diameter_mm:g}: a surface with {shape} ends before that; must be at most "
+            f"{most_mm:g}"
         )
     return surface
 

@@ -89,6 +89,8 @@ def _lines(path: Path, what: str, suffix: str) -> list[list[str]]:
     data = user_files.read_input(path, what, types=(suffix,))
     if data.startswith((b"\xff\xfe", b"\xfe\xff")):
         text = data.decode("utf-16", errors="replace")
+    elif b"\0" in data[:2]:  # UTF-16 without the mark of its byte order
+        text = data.decode("utf-16-be" if data[0] == 0 else "utf-16-le", errors="replace")
     else:
         try:
             text = data.decode("utf-8-sig")
@@ -201,6 +203,7 @@ class _Surface:
     """Collect the records of one surface; lengths in the file's unit."""
 
     where: str
+    number: int
     kind: str = "STANDARD"
     stop: bool = False
     curvature: float = 0.0
@@ -246,6 +249,8 @@ class _Surface:
     def row(self, unit_mm: float) -> dict[str, Any]:
         """Return the surface's shape and rim as keys of a row of a prescription. Raises InputError."""
         rim = self.semi_diameter if self.aperture is None else self.aperture
+        if self.aperture is not None and rim <= 0:
+            raise InputError(f"{self.where}: CLAP or FLAP {rim:g}: the radius of the aperture must be above 0")
         if rim <= 0:
             raise InputError(
                 f"{self.where}: DIAM {self.semi_diameter:g}: the semi-diameter must be above 0; let Zemax compute "
@@ -268,7 +273,7 @@ class _Surface:
         return row
 
 
-def read_lens(path: Path) -> tuple[dict[str, Any], tuple[GlassCatalogue, ...]]:
+def read_lens(path: Path) -> tuple[dict[str, Any], tuple[GlassCatalogue, ...], tuple[int, ...]]:
     """Read a lens file (.zmx).
 
     Returns
@@ -277,6 +282,8 @@ def read_lens(path: Path) -> tuple[dict[str, Any], tuple[GlassCatalogue, ...]]:
         Plain data as `prescription.parse_lens` reads them.
     catalogues
         The glass catalogues that lie beside the file, in which the rows' glasses are found.
+    numbers
+        Number of the surface in the file (SURF) that each row is made from.
 
     Raises
     ------
@@ -288,7 +295,7 @@ def read_lens(path: Path) -> tuple[dict[str, Any], tuple[GlassCatalogue, ...]]:
     for words in _lines(path, "lens", LENS_SUFFIX):
         key, *values = words
         if key == "SURF":
-            surfaces.append(_Surface(f"{path}: SURF {len(surfaces)}"))
+            surfaces.append(_Surface(f"{path}: SURF {len(surfaces)}", len(surfaces)))
         elif key == "MODE" and values != ["SEQ"]:
             raise InputError(f"{path}: MODE {' '.join(values)}: must be SEQ, a lens in sequential mode")
         elif key == "NAME" and values:
@@ -309,9 +316,17 @@ def read_lens(path: Path) -> tuple[dict[str, Any], tuple[GlassCatalogue, ...]]:
         )
     if surfaces[-1].curvature:
         raise InputError(f"{surfaces[-1].where}: CURV {surfaces[-1].curvature:g}: the image must be plane")
+    stops = [surface.number for surface in surfaces if surface.stop]
+    if len(stops) != 1 or not 0 < stops[0] < len(surfaces) - 1:
+        where = f"at SURF {', '.join(map(str, stops))}" if stops else "nowhere"
+        raise InputError(
+            f"{path}: STOP: must stand at exactly one surface from SURF 1 to SURF {len(surfaces) - 2}; it stands "
+            f"{where}"
+        )
     catalogues = _beside(path, names)
     source = "; ".join(notes) or f"Zemax file {path.name}"
-    return {"name": name, "source": source, "surface": _rows(surfaces[1:-1], unit_mm, catalogues)}, catalogues
+    rows, numbers = _rows(surfaces[1:-1], unit_mm, catalogues)
+    return {"name": name, "source": source, "surface": rows}, catalogues, numbers
 
 
 def _beside(path: Path, names: Sequence[str]) -> tuple[GlassCatalogue, ...]:
@@ -323,9 +338,10 @@ def _beside(path: Path, names: Sequence[str]) -> tuple[GlassCatalogue, ...]:
 
 def _rows(
     surfaces: Sequence[_Surface], unit_mm: float, catalogues: Sequence[GlassCatalogue]
-) -> list[dict[str, Any]]:
-    """Return the rows of a prescription. Raises InputError."""
+) -> tuple[list[dict[str, Any]], tuple[int, ...]]:
+    """Return the rows of a prescription, and the number of the surface behind each. Raises InputError."""
     rows: list[dict[str, Any]] = []
+    numbers: list[int] = []
     front: dict[str, Any] = {}
     for k, surface in enumerate(surfaces):
         medium = _medium(surface, catalogues)
@@ -336,6 +352,7 @@ def _rows(
             rows.append({**shape, **medium, "thickness_mm": 0.0})
             if surface.stop and medium == front:
                 rows[-1]["stop"] = True
+            numbers += [surface.number] * (len(rows) - len(numbers))
         front = medium
         if not rows or k == len(surfaces) - 1:
             continue  # distances in front of the first row do not matter; the sensor stands at the focus
@@ -346,7 +363,7 @@ def _rows(
                 f"{surface.where}: DISZ {surface.thickness:g}: the distance to the next surface comes to "
                 f"{rows[-1]['thickness_mm']:g} mm; must be from 0 to 1e6 mm"
             )
-    return rows
+    return rows, tuple(numbers)
 
 
 def _medium(surface: _Surface, catalogues: Sequence[GlassCatalogue]) -> dict[str, Any]:
