@@ -5,8 +5,10 @@ from __future__ import annotations
 import ast
 import importlib
 import importlib.metadata
+import re
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -160,6 +162,42 @@ def test_a_merge_of_one_text_is_refused(tmp_path: Path) -> None:
     """A text is a sequence, too: its letters would be taken for stores."""
     with pytest.raises(InputError, match=r"stores = 'a\.zarr': must be a list of stores"):
         vbnfault.merge("a.zarr", tmp_path / "out.zarr")
+
+
+@pytest.mark.parametrize("path", [None, 3, b"x", []])
+def test_what_is_no_path_is_refused_in_a_sentence(tmp_path: Path, path: Any) -> None:
+    calls: list[Callable[[], object]] = [
+        lambda: vbnfault.build(small(), path, dry_run=True, progress=False),
+        lambda: vbnfault.build(path, tmp_path / "s.zarr", dry_run=True, progress=False),
+        lambda: vbnfault.retake(tmp_path / "s.zarr", small(), path),
+        lambda: vbnfault.verify(path),
+        lambda: vbnfault.load_lens(path),
+        lambda: vbnfault.merge([path], tmp_path / "s.zarr"),
+        lambda: vbnfault.merge(["s.zarr"], path),
+    ]
+    for call in calls:
+        with pytest.raises(InputError, match=f"= {re.escape(repr(path))}: must be a path$"):
+            call()
+    if path is None:
+        with pytest.raises(InputError, match="stores = None: must be a list of stores"):
+            vbnfault.merge(path, tmp_path / "s.zarr")
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"shard_range": (0, 1)}, r"shard_range = \(0, 1\): must be a range of steps of 1, such as range\(0, 4\)"),
+        ({"shard_range": range(0, 4, 2)}, r"shard_range = range\(0, 4, 2\): must be a range of steps of 1"),
+        ({"overwrite": "no"}, "overwrite = 'no': must be True or False"),  # a text that is not empty is true
+        ({"dry_run": 1}, "dry_run = 1: must be True or False"),
+        ({"recycle_shards": None}, "recycle_shards = None: must be at least 1, and a whole number"),
+        ({"scheduler": 8786}, "scheduler = 8786: must be an address"),
+        ({"append": 1.5}, r"--append 1\.5: must be at least 1, and a whole number"),
+    ],
+)
+def test_options_of_a_build_are_checked(tmp_path: Path, options: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence):
+        vbnfault.build(small(), tmp_path / "s.zarr", **{"dry_run": True, "progress": False, **options})
 
 
 def test_lens_sensor_and_flare_are_at_hand() -> None:

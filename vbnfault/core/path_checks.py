@@ -44,6 +44,14 @@ def kind_of(status: os.stat_result) -> str:
     return f" but {kind}" if kind else ""
 
 
+def path_of(value: object, what: str) -> Path:
+    """Return a path from a text or an object that stands for one. Raises InputError for anything else."""
+    try:
+        return Path(value)  # type: ignore[arg-type]
+    except TypeError:
+        raise InputError(f"{what} = {shown(value)}: must be a path") from None
+
+
 def check_path(path: str, where: str) -> None:
     """Check that a path is possible. Raises InputError; its message begins with `where`, the key of the path."""
     try:

@@ -6,7 +6,7 @@ import stat
 from pathlib import Path
 
 from .errors import InputError
-from .path_checks import check_path, file_status, kind_of, shown_path, why_absent
+from .path_checks import check_path, file_status, kind_of, path_of, shown_path, why_absent
 
 # Folder of the package vbnfault.
 PACKAGE = Path(__file__).resolve().parents[1]
@@ -29,8 +29,8 @@ def packaged(kind: str) -> dict[str, Path]:
 
 def find(kind: str, name_or_path: str | Path) -> Path:
     """Return the path as given, or the packaged file of that name. Raises InputError, which lists these names."""
-    path = Path(name_or_path)
     what = kind.rsplit("/", 1)[-1]
+    path = path_of(name_or_path, what)
     check_path(str(name_or_path), what)
     status = file_status(path)
     if path.suffix or status:

@@ -97,8 +97,15 @@ class BuildOptions:
         object.__setattr__(self, "workers", _checked("workers", self.workers))
         if self.threads is not None:
             object.__setattr__(self, "threads", _checked("threads", self.threads))
-        if self.recycle_shards < 1:
-            raise InputError(f"recycle_shards = {self.recycle_shards}: must be at least 1")
+        if (number := tables.whole(self.recycle_shards)) is None or number < 1:
+            raise InputError(
+                f"recycle_shards = {shown(self.recycle_shards)}: must be at least 1, and a whole number"
+            )
+        for key in ("overwrite", "accept_versions", "dry_run"):
+            if not isinstance(value := getattr(self, key), bool | np.bool_):
+                raise InputError(f"{key} = {shown(value)}: must be True or False")
+        if not isinstance(self.scheduler, str | None):
+            raise InputError(f"scheduler = {shown(self.scheduler)}: must be an address such as tcp://host:8786")
         if self.scheduler is not None and self.workers > 1:
             raise InputError(
                 f"--workers {self.workers} and --scheduler {self.scheduler} exclude each other: the cluster has its"
@@ -106,7 +113,9 @@ class BuildOptions:
             )
         if self.shard_range is not None:
             part = self.shard_range
-            if part.step != 1 or not 0 <= part.start < part.stop:
+            if not isinstance(part, range) or part.step != 1:
+                raise InputError(f"shard_range = {shown(part)}: must be a range of steps of 1, such as range(0, 4)")
+            if not 0 <= part.start < part.stop:
                 raise InputError(
                     f"--shard-range {part.start}:{part.stop}: must be A:B, whole numbers with 0 <= A < B"
                 )

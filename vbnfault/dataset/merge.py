@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -117,7 +117,7 @@ def join_stores(
         After Ctrl-C, SIGTERM or SIGHUP; the same call resumes.
     """
     target = located(out)
-    if isinstance(stores, str | os.PathLike):
+    if isinstance(stores, str | os.PathLike) or not isinstance(stores, Iterable):
         raise InputError(f"stores = {shown(stores)}: must be a list of stores, not one of them")
     paths = dict.fromkeys(map(located, stores))
     sources = [store_module.open_store(path) for path in paths if not _same(path, target)]

@@ -8,7 +8,8 @@ from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 from .. import store as store_module
-from ..core.errors import InputError
+from ..core import tables
+from ..core.errors import InputError, shown
 from ..store import Planned, Store, StoreSpec, Url
 from . import versions
 
@@ -22,8 +23,9 @@ def planned_blocks(
     interrupted command can be repeated unchanged. Raises InputError if there is no store to append to, if `append`
     is negative, or if the first block of the store does not have `samples` samples.
     """
-    if append < 0:
-        raise InputError(f"--append {append}: must be at least 1")
+    if (number := tables.whole(append)) is None or number < 0:
+        raise InputError(f"--append {shown(append)}: must be at least 1, and a whole number")
+    append = number
     if append and overwrite:
         raise InputError(f"--append {append} and --overwrite exclude each other: give one of them")
     exists = store_module.is_store(out) and not overwrite

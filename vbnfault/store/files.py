@@ -9,6 +9,7 @@ from typing import Any, Protocol
 from urllib.parse import unquote, urlsplit
 
 from ..core.errors import InputError, VbnfaultError, shown
+from ..core.path_checks import path_of
 from .bucket import Bucket, Url, is_url, parsed
 from .disk import Disk
 
@@ -18,12 +19,12 @@ Location = Path | Url
 def located(store: str | os.PathLike[str] | Url) -> Location:
     """Return where a store is: the path of a folder, also for a URL `file://`, or the URL of an object store.
 
-    Raises InputError for another URL.
+    Raises InputError for another URL, and for what is no path.
     """
     if isinstance(store, Url):
         return store
     if not is_url(store):
-        return Path(store)
+        return path_of(store, "store")
     text = str(store)
     if not text.lower().startswith("file:"):
         return parsed(text)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from ... import __version__
 from ...core.errors import InputError, VbnfaultError, shown
+from ...core.path_checks import path_of
 from ...core.quantities import Sample
 from ...core.tables import did_you_mean
 from ...dataset.card import to_json
@@ -92,7 +93,7 @@ def export_store(
         raise InputError(f"--format {shown(format)}: there is no such format{did_you_mean(str(format), [*known])}")
     if type(workers) is not int or not 1 <= workers <= MOST_THREADS:
         raise InputError(f"--workers {shown(workers)}: must be a whole number from 1 to {MOST_THREADS}")
-    store, target = open_store(store), Path(out)
+    store, target = open_store(store), path_of(out, "out")
     _check_place(store, target)
     _check_finished(store)
     kind = known[format]()

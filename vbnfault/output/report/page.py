@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ...core.errors import InputError, VbnfaultError
 from ...core.html_page import Page, Section, escaped, grouped_digits, html_table
+from ...core.path_checks import path_of
 from ...dataset.statistics import Statistics, statistics
 from ...store import STRATA, Store, open_store
 from ..contact_sheet import COLOURS, abbreviations
@@ -80,7 +81,7 @@ def write_report(
     InputError
         If there is no store or no finished sample, or the page cannot be written there.
     """
-    store, path, limits = open_store(store), Path(out), limits or Limits()
+    store, path, limits = open_store(store), path_of(out, "out"), limits or Limits()
     if path.suffix.lower() not in (".html", ".htm") or os.path.isdir(path):
         raise InputError(f"{path}: the report is a page, so its name must end in .html")
     scalars = read_scalars(store)
