@@ -21,15 +21,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import VbnfaultError
-from ..core.quantities import DEAD, HOT, LUMINANCE, RGBI, RTS, RTS_HIGH, STUCK, TRAP
-from .demosaic import bounded_at_edges, correct_defects, demosaic, interpolate
+from ..core.quantities import DEAD, HOT, RGBI, RTS, RTS_HIGH, STUCK, TRAP
+from . import compiled_bayer
+from .demosaic import correct_defects, interpolate
+from .display import Display, levels, luminance
 from .effects import Acts, Effect, Exposure, chain_of, is_packaged
 from .effects.electrons import upper_fraction
 from .effects.output import full_well_to_codes
 from .efficiency import white_balance
 from .individual import Individual, IndividualSpec, dark_rate_e_s, make_individual, offset_e, response
 from .mosaic import channel_of
-from .noise import normal_field
+from .noise import NormalField, draw_normals
 from .readout import ReadoutIndividual, ReadoutNoise, read_out
 from .sensor import Sensor
 from .transfer import transfer_dark_e
@@ -46,11 +48,11 @@ _LEAST_BLACK_DN = 0.05
 class MosaicNoise:
     """Hold the variates of one exposure.
 
-    `shot` float32[y, x] is standard normal, `readout` holds the variates of the readout. `seed` seeds the
-    generators of effects that need few variates.
+    `shot` are the standard normal variates of the shot noise [y, x], `readout` those of the readout. `seed` seeds
+    the generators of effects that need few variates.
     """
 
-    shot: F32
+    shot: NormalField
     readout: ReadoutNoise
     seed: int = 0
 
@@ -60,7 +62,7 @@ class MosaicNoise:
     ) -> MosaicNoise:
         """Draw the variates for a (height, width) sensor. Their number does not depend on the signal."""
         return cls(
-            shot=normal_field(shape, shot),
+            shot=draw_normals(shape, shot),
             readout=ReadoutNoise.draw(shape, read, row),
             seed=int(row.integers(2**63)),
         )
@@ -228,7 +230,6 @@ class Device:
         mosaic: NDArray[Any] = raw
         if sensor.correct_defects:
             mosaic = correct_defects(raw, self.bad, sensor.pattern)
-        saturated = mosaic >= self.saturated_dn
         black, highest = self.black_dn(exposure_s), 0.0
         if self.row_black_dn is not None:
             mosaic, highest = mosaic - self.row_black_dn, float(self.row_black_dn.max())
@@ -240,19 +241,18 @@ class Device:
         scale = {
             name: full * float(gain) for name, gain in zip(sensor.pattern.channels, self.white_balance, strict=True)
         }
-        shown = [scale.get(colour, scale.get("W", full)) for colour in "RGB"]
-        linear = demosaic(mosaic, sensor.pattern, sensor.method)
+        red, green, blue = (scale.get(colour, scale.get("W", full)) for colour in "RGB")
         noise_dn = sensor.readout.read_noise_e_rms * sensor.readout.system_gain_dn_per_e
-        linear = bounded_at_edges(
-            linear, mosaic, sensor.pattern, sensor.method, black=black, noise=noise_dn, clipped=saturated
-        )
-        rgb = cv2.multiply(cv2.subtract(linear, (black, black, black, 0.0)), (*shown, 0.0), dtype=cv2.CV_8U)
+        display = Display(black_dn=black, noise_dn=noise_dn, scale=(red, green, blue))
+        if compiled_bayer.serves(mosaic, sensor.pattern, sensor.method):
+            return RGBI(array=compiled_bayer.image(mosaic, sensor.pattern, self.saturated_dn, display))
+        rgb = levels(mosaic, sensor.pattern, sensor.method, mosaic >= self.saturated_dn, display)
         out = np.empty((*raw.shape, 4), dtype=np.uint8)
         if "W" in sensor.pattern.channels:
             unfiltered = interpolate(mosaic, sensor.pattern, "W")
             intensity = cv2.multiply(cv2.subtract(unfiltered, black), scale["W"], dtype=cv2.CV_8U)
         else:
-            intensity = cv2.transform(rgb, LUMINANCE.reshape(1, 3).astype(np.float64))
+            intensity = luminance(rgb)
         intensity = intensity.reshape(*raw.shape, 1)
         cv2.mixChannels([rgb, intensity], [out], [0, 0, 1, 1, 2, 2, 3, 3])
         return RGBI(array=out)

@@ -22,7 +22,9 @@ from .noise import (
     ALL_TERMS_BELOW_E,
     EXACT_POISSON_BELOW_E,
     SUM_COMPLETE,
+    NormalField,
     later_poisson_terms,
+    poisson_quantile,
     variates_by_code,
 )
 
@@ -121,7 +123,7 @@ class _Trace:
         )
         self._scale = [be.dr.opaque(be.Float64, float(value)) for value in curve.scale]
         if noisy:
-            self._normal, self._uniform = _tables()
+            self._normal = _tables()[0]
             self._dark_counts = be.Float(_flat(curve.dark_counts_e))
 
     def level(self, signal: Any, place: Any, codes: Any) -> Any:
@@ -133,7 +135,7 @@ class _Trace:
             electrons = dr.if_stmt(
                 (signal + self._dark, codes & 0xFFFF, lit),
                 lit,
-                self._poisson,
+                _poisson,
                 lambda mean, shot, lit: dr.gather(be.Float, self._dark_counts, shot, ~lit),
             )
         else:
@@ -146,39 +148,58 @@ class _Trace:
         scale = dr.select(colour == 0, self._scale[0], dr.select(colour == 1, self._scale[1], self._scale[2]))
         return be.UInt32(be.Int32(dr.clip(dr.round(be.Float64(dn - self._black) * scale), 0, 255)))
 
-    def _poisson(self, mean: Any, shot: Any, lit: Any) -> Any:
-        """Return `noise.poisson_quantile` of the means of lit values, as Float."""
-        be = backend()
-        dr = be.dr
-        z = dr.gather(be.Float, self._normal, shot, lit)
-        count = (z * z * be.Float(1 / 6) + be.Float(1 / 3) + dr.sqrt(mean) * z) + mean
-        count = dr.if_stmt(
-            (count, mean, z),
-            mean < ALL_TERMS_BELOW_E,
-            lambda count, mean, z: count + later_poisson_terms(dr, mean, z),
-            lambda count, mean, z: count,
-        )
-        few = lit & (mean < EXACT_POISSON_BELOW_E)
-        count = dr.maximum(dr.floor(count), 0)
-        return dr.if_stmt((count, mean, shot, few), few, self._summed, lambda count, *_: count)
 
-    def _summed(self, _: Any, mean: Any, shot: Any, few: Any) -> Any:
-        """Return the Poisson counts of means of few electrons, as Float, by summing the distribution in float64."""
-        be = backend()
-        dr = be.dr
-        u, m = dr.gather(be.Float64, self._uniform, shot, few), be.Float64(mean)
+def poisson(mean: F32, normal: NormalField) -> F32:
+    """Return `noise.poisson_quantile` of means and normal variates, float32[y, x]."""
+    be = backend()
+    dr = be.dr
+    codes = _flat(normal.codes)
+    if codes.size % 2:  # two codes share a word
+        codes = _flat(np.append(codes, np.uint16(0)))
+    place = dr.arange(be.UInt32, mean.size)
+    word = dr.gather(be.UInt32, be.UInt32(codes.view(np.uint32)), place >> 1)
+    counts = _poisson(be.Float(_flat(mean)), word >> 16 * (place & 1) & 0xFFFF)
+    dr.eval(counts)
+    dr.sync_thread()
+    out: F32 = np.array(counts, copy=False)
+    out[normal.tail] = poisson_quantile(mean.reshape(-1)[normal.tail], normal.tail_values)
+    return out.reshape(mean.shape)
 
-        def goes_on(term: Any, total: Any, count: Any) -> Any:
-            return (u > total) & (total < SUM_COMPLETE)
 
-        def add(term: Any, total: Any, count: Any) -> Any:
-            count = count + 1
-            term = term * m / count
-            return term, total + term, count
+def _poisson(mean: Any, code: Any, active: Any = True) -> Any:
+    """Return `noise.poisson_quantile` of the means of active lanes, as Float."""
+    be = backend()
+    dr = be.dr
+    z = dr.gather(be.Float, _tables()[0], code, active)
+    count = (z * z * be.Float(1 / 6) + be.Float(1 / 3) + dr.sqrt(mean) * z) + mean
+    count = dr.if_stmt(
+        (count, mean, z),
+        mean < ALL_TERMS_BELOW_E,
+        lambda count, mean, z: count + later_poisson_terms(dr, mean, z),
+        lambda count, mean, z: count,
+    )
+    few = active & (mean < EXACT_POISSON_BELOW_E)
+    count = dr.maximum(dr.floor(count), 0)
+    return dr.if_stmt((count, mean, code, few), few, _summed, lambda count, *_: count)
 
-        term = dr.exp(-m)
-        _, _, count = dr.while_loop((term, be.Float64(term), be.Float64(0)), goes_on, add, mode="symbolic")
-        return be.Float(count)
+
+def _summed(_: Any, mean: Any, code: Any, few: Any) -> Any:
+    """Return the Poisson counts of means of few electrons, as Float, by summing the distribution in float64."""
+    be = backend()
+    dr = be.dr
+    u, m = dr.gather(be.Float64, _tables()[1], code, few), be.Float64(mean)
+
+    def goes_on(term: Any, total: Any, count: Any) -> Any:
+        return (u > total) & (total < SUM_COMPLETE)
+
+    def add(term: Any, total: Any, count: Any) -> Any:
+        count = count + 1
+        term = term * m / count
+        return term, total + term, count
+
+    term = dr.exp(-m)
+    _, _, count = dr.while_loop((term, be.Float64(term), be.Float64(0)), goes_on, add, mode="symbolic")
+    return be.Float(count)
 
 
 def _flat(array: NDArray[Any]) -> NDArray[Any]:

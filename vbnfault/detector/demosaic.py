@@ -25,6 +25,8 @@ Mask = NDArray[np.bool_]
 
 Method = Literal["bilinear", "malvar", "menon"]
 
+LEAST_PX = 6  # smallest height and width of a mosaic
+
 _MIRROR = cv2.BORDER_REFLECT_101
 
 # Both are even, so that every block begins with the same filters.
@@ -34,7 +36,7 @@ _HALO_PX = {"bilinear": 2, "malvar": 2, "menon": 8}
 _ROWS_PER_LOOK = {"malvar": 4, "menon": 8}
 
 # A hard edge spans more standard deviations of the noise than this and more than this to one.
-_HARD_NOISE, _HARD_RATIO = 16.0, 8.0
+HARD_NOISE, HARD_RATIO = 16.0, 8.0
 
 # Bilinear: weights with which a pixel contributes to the neighbours in its own plane (Losson, Macaire & Yang 2010,
 # Advances in Imaging and Electron Physics 162, doi 10.1016/S1076-5670(10)62005-8). The first is [½ 1 ½]ᵀ [½ 1 ½].
@@ -193,16 +195,16 @@ class _Edges:
         top = cv2.dilate(brightest, _support(self.method))[inner]
         lowest = cv2.erode(measured, np.ones((3, 3), np.uint8))[inner]
         # the few pixels where an edge may be hard for one of the colours
-        y, x = np.nonzero((top - lowest > _HARD_NOISE * self.noise) & (top - lowest > lowest - self.black))
+        y, x = np.nonzero((top - lowest > HARD_NOISE * self.noise) & (top - lowest > lowest - self.black))
         least = _malvar(measured, self.pattern, filtered=_least_beside)
         greatest = _malvar(measured, self.pattern, filtered=_greatest_beside)
         top, own = top[y, x], brightest[inner][y, x] - self.black
         for k in range(3):
             value, low, high = block[y, x, k], least[k][inner][y, x], greatest[k][inner][y, x]
             span, dark = top - low, low - self.black
-            ratio = (span > (_HARD_RATIO - 1) * dark) | ((value < self.black) & (span > dark))
-            hard = (span > _HARD_NOISE * self.noise) & ratio
-            dark_side = hard & (_HARD_RATIO * own < top - self.black)
+            ratio = (span > (HARD_RATIO - 1) * dark) | ((value < self.black) & (span > dark))
+            hard = (span > HARD_NOISE * self.noise) & ratio
+            dark_side = hard & (HARD_RATIO * own < top - self.black)
             value = np.where(hard & (value < low), low, value)
             block[y, x, k] = np.where(dark_side & (value > high), high, value)
 
@@ -217,11 +219,11 @@ class _Edges:
         top = cv2.dilate(_by_groups(np.max, bright, group), np.ones((3, 2 * reach + 1), np.uint8))
         low = cv2.erode(_by_groups(np.min, signal, group), np.ones((3, 3), np.uint8))
         span, dark = top - low, low - self.black
-        clear = span > _HARD_NOISE * self.noise
+        clear = span > HARD_NOISE * self.noise
         blocks = np.arange(0, len(span), _ROWS_PER_BLOCK // group)
         hard, negative = (
             np.logical_or.reduceat((clear & (span > ratio * dark)).any(axis=1), blocks)
-            for ratio in (_HARD_RATIO - 1, 1)
+            for ratio in (HARD_RATIO - 1, 1)
         )
         starts = range(0, len(signal), _ROWS_PER_BLOCK)
         with_edges = [
@@ -360,8 +362,10 @@ def _from_neighbours(
 
 def _checked(raw: NDArray[Any]) -> F32:
     """Return the mosaic as contiguous float32. Raises InputError for a wrong shape."""
-    if raw.ndim != 2 or min(raw.shape) < 6:
-        raise InputError(f"the mosaic has shape {raw.shape}, but must be [y, x] of at least 6 × 6 pixels")
+    if raw.ndim != 2 or min(raw.shape) < LEAST_PX:
+        raise InputError(
+            f"the mosaic has shape {raw.shape}, but must be [y, x] of at least {LEAST_PX} × {LEAST_PX} pixels"
+        )
     return np.ascontiguousarray(raw, dtype=np.float32)
 
 
@@ -447,7 +451,7 @@ def _normaliser(pattern: Pattern, shape: tuple[int, ...], index: int) -> tuple[i
 # --------------------------------------------------------------------------------------------- Bayer: Malvar
 
 
-def _sites(pattern: Pattern) -> tuple[tuple[int, int], tuple[int, int]]:
+def colour_sites(pattern: Pattern) -> tuple[tuple[int, int], tuple[int, int]]:
     """Return row and column of the tile's red pixel and of its blue one."""
     flat = [pattern.channels[i] for row in pattern.tile for i in row]
     red, blue = flat.index("R"), flat.index("B")
@@ -479,7 +483,7 @@ def _greatest_beside(raw: F32, kernel: F32) -> F32:
 
 def _malvar(raw: F32, pattern: Pattern, *, filtered: Callable[[F32, F32], F32] = _signed) -> list[F32]:
     """Return R, G, B at every pixel, each from `filtered` with the kernel that Malvar's method uses there."""
-    (ry, rx), (by, bx) = _sites(pattern)
+    (ry, rx), (by, bx) = colour_sites(pattern)
     red_rows, red_columns = slice(ry, None, 2), slice(rx, None, 2)
     blue_rows, blue_columns = slice(by, None, 2), slice(bx, None, 2)
     green = filtered(raw, MALVAR_GREEN)
@@ -538,7 +542,7 @@ def _menon(raw: F32, pattern: Pattern) -> list[F32]:
     K is red minus green at red pixels and blue minus green at blue pixels; L is red minus blue. The method
     interpolates along the direction in which K varies less.
     """
-    (ry, rx), (by, bx) = _sites(pattern)
+    (ry, rx), (by, bx) = colour_sites(pattern)
     red, blue = (slice(ry, None, 2), slice(rx, None, 2)), (slice(by, None, 2), slice(bx, None, 2))
     # green pixels of the red rows and of the blue rows
     green_r, green_b = (red[0], blue[1]), (blue[0], red[1])

@@ -20,9 +20,10 @@ from numpy.typing import NDArray
 
 from ..core import buffers
 from ..core.errors import InputError
-from ..core.quantities import LUMINANCE, RGBI, Electrons, Irradiance, RawDN
+from ..core.quantities import RGBI, Electrons, Irradiance, RawDN
 from . import compiled
 from .blocks import blockwise, pool
+from .display import luminance
 from .efficiency import QuantumEfficiency, white_balance
 from .noise import NormalField, counts_of_one_mean, draw_normals, poisson_on_dark, variates_by_code
 
@@ -242,9 +243,7 @@ class ThreeColourDetector:
 
 def _with_luminance(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Return R, G, B and the luminance as I, uint8[y, x, 4], of R, G and B, uint8[y, x, 3]."""
-    intensity = cv2.transform(rgb, LUMINANCE.reshape(1, 3).astype(np.float64)).reshape(rgb.shape[:2])
-    out = cv2.cvtColor(rgb, cv2.COLOR_RGB2RGBA)
-    return np.asarray(cv2.insertChannel(intensity, out, 3))
+    return np.asarray(cv2.insertChannel(luminance(rgb), cv2.cvtColor(rgb, cv2.COLOR_RGB2RGBA), 3))
 
 
 @lru_cache(maxsize=8)

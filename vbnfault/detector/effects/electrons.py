@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from .. import compiled
 from ..dark import Telegraph, silicon_factor
-from ..noise import poisson_quantile
 from ..transfer import passing_dark_e
 from .contract import F32, Effect, Exposure, FaultStep
 
@@ -65,7 +65,7 @@ class ShotNoise(Effect):
 
     def apply(self, signal: F32, exposure: Exposure) -> F32:
         """Return the collected electrons; without noise, the expected ones."""
-        return signal if exposure.noise is None else poisson_quantile(signal, exposure.noise.shot)
+        return signal if exposure.noise is None else compiled.poisson(signal, exposure.noise.shot)
 
 
 class ChargeStep(FaultStep):
