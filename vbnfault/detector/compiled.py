@@ -1,4 +1,6 @@
-"""Develop three-colour images with one compiled kernel, which keeps all intermediate results in registers.
+"""Develop three-colour images with one compiled kernel, and draw the shot noise of mosaics with another.
+
+A kernel keeps all intermediate results in registers.
 
 Every value takes the steps of `three_colour.ThreeColourDetector` in the same order and precision, so that it has
 the bits that these steps give one after the other (tests/test_detector_compiled.py). Only the exponential function

@@ -67,9 +67,9 @@ def image(mosaic: Raw, pattern: Pattern, saturated: Raw, display: Display) -> U8
 
 
 def _neighbourhoods(mosaic: Raw, saturated: Mask, tiles: tuple[int, int]) -> tuple[Lanes, Lanes]:
-    """Return the 6 × 6 raw numbers in and around each tile, by row and column, and the brightest that they may be.
+    """Return the 6 × 6 raw numbers in and around each tile by row and column, twice.
 
-    In the second, saturated numbers are infinite.
+    In the second table, saturated numbers are infinite, since their light has no upper bound.
     """
     be = backend()
     dr = be.dr
