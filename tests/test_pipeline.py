@@ -280,6 +280,31 @@ def test_a_redrawn_fault_leaves_the_draws_and_results_of_the_others(monkeypatch:
         assert calls == {"dust": 1, "degradation": 8, "shadows": 1}
 
 
+@pytest.mark.parametrize("layers", [["clean"], ["clean", "mask_effect"]])
+def test_a_fault_that_only_moves_roundings_is_not_injected_unless_the_delivered_image_changes(
+    layers: list[str],
+) -> None:
+    """A grain of 0.1 µm far out of focus takes 10⁻¹⁰ of the light: by chance it changes a pixel or two by 1 DN.
+
+    Without noise these are other pixels than with noise. Labels are of the image that is delivered.
+    """
+    dust = {"model": "defocused", "diameter_um": [0.1, 0.1], "count": [1, 1]}
+    scene = {
+        **small_scene(
+            camera={"width_px": 192, "height_px": 192},
+            plan={"faulty_fraction": 1.0, "on_invisible": "drop"},
+            geometry={"min_lit_fraction": 0.3},
+            dataset={"layers": layers, "samples": 8, "variants_per_view": 8, "shard_samples": 8},
+        ),
+        "faults": {"dust_on_optics": dust},
+    }
+    s = Session(config.parse_scene(scene, source="test"))
+    for index in range(8):
+        sample = to_sample(s.frame(index))
+        changes = not np.array_equal(sample.layers["image"], sample.layers["clean"])
+        assert sample.scalars["injected"].tolist() == [changes]
+
+
 def test_a_mosaic_detector_takes_raw_pictures_with_its_own_device() -> None:
     faults = {"broken_pixels": {"model": "hot_pixels", "growth_factor": 1e5, "years": 10.0}, "broken_lines": {}}
     camera = {"width_px": 96, "height_px": 80, "detector": "generic_cmos", "individuals": 4}
