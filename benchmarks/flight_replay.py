@@ -58,15 +58,20 @@ has a third of the real variance there; it is for figures that compare places. W
 `TEXTURE`, for figures that compare statistics, as those of `flight_classifier.py`: facets of half a native pixel,
 rougher at short wavelengths, with scarps, uneven, of planes that meet in edges, and with dust of another albedo.
 What matters most is the size of the facets: relief shorter than two of them is not shown, so facets of a native
-pixel blur what the camera resolves. Next come the edges, which rounded waves lack. On the 33 frames:
+pixel blur what the camera resolves. Next come the edges, which rounded waves lack.
+
+With `--texture`, an image is also taken a second time, with the black that the sky of its frame asks for: bias and
+dark signal at a date are no more in the table than exposure and gain are. `sky` and `glow` then tell nothing of the
+level. Without it the noise, which depends on the level after the stretch, tells skies apart, since biases and
+temperatures that are drawn put the level up to 1.7 DN off. On the 33 frames:
 
 | ground    | `rank` | variance at 2-4, 4-8, 8-16, 16-32, 32-64 px | body   | limb   | sky    |
 |-----------|--------|---------------------------------------------|--------|--------|--------|
-| `GROUND`  | 0.807  | 0.35, 0.51, 0.73, 0.92, 0.84 of the real    | 99.4 % | 94.9 % | 73.8 % |
-| `TEXTURE` | 0.736  | 0.93, 0.90, 0.99, 1.12, 1.03 of the real    | 74.8 % | 74.3 % | 72.5 % |
+| `GROUND`  | 0.807  | 0.36, 0.51, 0.74, 0.93, 0.85 of the real    | 99.4 % | 94.9 % | 73.8 % |
+| `TEXTURE` | 0.736  | 0.98, 0.92, 1.00, 1.12, 1.04 of the real    | 75.7 % | 72.4 % | 69.5 % |
 
 The last three columns are the patches that the classifier tells, with `--splits 4` and for `TEXTURE` `--draws 4`;
-50 % would be none. Single draws of `TEXTURE` are 73 to 76 % for body and limb. The settings were chosen by it on
+50 % would be none. Single draws of `TEXTURE` are 75 to 77 % for the body. The settings were chosen by it on
 the same frames, so others may be told more often. What had given the images away most were mottled plains and
 a core of the point spread that was too wide: real ground is either smooth or rough, and boulders and shadows on it
 are sharp. Obliquely lit ground is still too rough in its smoothest tenth, and real scarps throw thin dark lines
@@ -136,6 +141,7 @@ _STRETCH = 255 / 4095**0.5  # of a root of DN
 _SKY_VARIANCE = (0.08, 0.16, 8.0)
 _NOISY = 1.45  # times this variance: 28 frames have 0.88 to 1.17, three in a row 1.7 to 2.0
 HIGH_GAIN = 1.4  # over the low one: what noise of 1.9 times the variance asks for; 1.7 in visnav
+_MOST_BLACK_DN = 4.0  # more is light: of 32 frames the black differs by 1.7 DN at most
 AFRHO_CM = 50.0  # chosen beside halo and wings of the point spread for the sky of 31 frames
 # What leaves spots and tracks in the sky. Protons: flux, energies, depth and `ending_fraction` fitted to the peaks,
 # sums and sizes of the spots of 28 frames, diffusion to those of 11; in quiet time CREME96 has 4.67 at the
@@ -484,6 +490,35 @@ def write_high_gain(detector: str, folder: Path) -> Path:
     return high
 
 
+def black_excess_dn(real: Look, rendered: Look) -> float:
+    """Return by how many DN the sky of a real frame is brighter than that of an aligned rendered one.
+
+    0 where the real sky is clipped, or so bright that its light is no black.
+    """
+    sky = real.sky & rendered.sky
+    if real.clipped or not sky.any():
+        return 0.0
+    # the levels are whole numbers, so means first; tracks hardly move the median of these
+    levels = [float(np.median(ndimage.uniform_filter(one.image, 9)[sky])) for one in (real, rendered)]
+    excess_dn = (levels[0] ** 2 - levels[1] ** 2) / _STRETCH**2
+    return excess_dn if abs(excess_dn) < _MOST_BLACK_DN else 0.0
+
+
+def with_black(scene: vbnfault.Scene, excess_dn: float, folder: Path) -> vbnfault.Scene:
+    """Return a scene whose black is higher by `excess_dn`; its sensor file is written into a folder."""
+    path = resources.find("scenes/detectors", str(scene.camera.detector))
+    offsets_dn = [offset_dn + excess_dn for offset_dn in load_sensor(path).readout.node_offsets_dn]
+    lines = path.read_text(encoding="utf-8").splitlines()
+    k = next(k for k, line in enumerate(lines) if line.startswith("node_offsets_dn = "))
+    lines[k] = f"node_offsets_dn = [{', '.join(f'{offset_dn:.4f}' for offset_dn in offsets_dn)}]"
+    folder.mkdir(parents=True, exist_ok=True)
+    # a name of its own, since files that were read are kept
+    black = folder / f"{path.stem}_{1000 * excess_dn:+.0f}_mdn.toml"
+    black.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    camera = scene.camera.model_copy(update={"detector": str(black.resolve())})
+    return scene.model_copy(update={"camera": camera})
+
+
 def exposed_as(scene: vbnfault.Scene, real: Look, detectors: Sequence[str]) -> vbnfault.Scene:
     """Return a scene whose exposure is metered so that the body is as bright as in a real frame.
 
@@ -502,10 +537,12 @@ def replay(
     frame: NDArray[np.uint8],
     detectors: Sequence[str],
     mendings: int = 0,
+    black_in: Path | None = None,
 ) -> Pair:
     """Render a row with one of the sensor files, align it with its real frame by a shift, and compare the two.
 
-    Before, the pose is mended `mendings` times by the similarity between the images.
+    Before, the pose is mended `mendings` times by the similarity between the images. With a folder `black_in`, the
+    image is taken again with the frame's own black, by a sensor file written there.
     """
     start = time.perf_counter()
     real = look(frame)
@@ -525,9 +562,14 @@ def replay(
                 *aligned_pose(trajectory.pose(row), similarity, session.scene.camera.fov_deg, frame.shape),
             )
             session.trajectory = trajectory
-    seconds = time.perf_counter() - start
     native = round(BINNING * shift[0]), round(BINNING * shift[1])
     rendered = look(developed(shifted(raw_dn, native), bias_dn))
+    excess_dn = 0.0 if black_in is None else black_excess_dn(real, rendered)
+    if black_in is not None and excess_dn:
+        session.scene = with_black(session.scene, excess_dn, black_in)
+        raw_dn = session.simulate(row).layers["raw"]
+        rendered = look(developed(shifted(raw_dn, native), bias_dn))
+    seconds = time.perf_counter() - start
     pose = trajectory.pose(row)
     sun_C = pose.T_from_C.T @ pose.sun_direction_T
     sun_xy = sun_C[:2] / max(float(np.linalg.norm(sun_C[:2])), 1e-9)
@@ -641,9 +683,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     scene = replay_scene(given.scene, (width, height), overrides, TEXTURE if given.texture else GROUND)
     session = vbnfault.Session(scene, threads=given.threads, poses=trajectory)
     detectors = [scene.camera.detector, str(write_high_gain(scene.camera.detector, given.out).resolve())]
+    black_in = given.out / "sensors" if given.texture else None
     pairs = []
     for row in rows:
-        pair = replay(session, trajectory, row, frames[row], detectors, given.mend_poses)
+        pair = replay(session, trajectory, row, frames[row], detectors, given.mend_poses, black_in)
         f = pair.figures
         print(
             f"{pair.name}: IoU {f['iou']:.4f}, rank {f['rank']:.3f}, limb {f['limb_px']:.2f} px, shift "

@@ -151,6 +151,7 @@ def main() -> None:
     known = sorted([*SHEETS, *SINGLE])
     parser.add_argument("scenes", nargs="*", metavar="SCENE", help=f"of {', '.join(known)} [default: all]")
     given = parser.parse_args()
+    given.out.mkdir(parents=True, exist_ok=True)
     for scene in given.scenes or known:
         path = given.out / f"{scene}.png"
         figure = sheet(scene) if scene in SHEETS else SINGLE[scene]()

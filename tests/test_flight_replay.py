@@ -155,6 +155,29 @@ def test_a_noisy_frame_is_rendered_with_the_higher_gain(tmp_path: Path) -> None:
         assert chosen == ("low" if excess == 1 else "high")
 
 
+def test_the_black_of_a_frame_is_that_of_its_sky(tmp_path: Path) -> None:
+    body = disc(80, 80)
+    noise = np.random.default_rng(4).normal(size=(2, *body.shape))
+    skies_dn = 5.0, 3.8
+    real, rendered = (
+        flight_replay.look(np.where(body > 40, body, flight_replay._STRETCH * np.sqrt(sky_dn) + 0.6 * grain))
+        for sky_dn, grain in zip(skies_dn, noise, strict=True)
+    )
+    # of 81 pixels, a mean of a level of 9 has a deviation of 0.07, or 0.08 DN, and the median of many far less
+    assert flight_replay.black_excess_dn(real, rendered) == pytest.approx(1.2, abs=0.04)
+    assert flight_replay.black_excess_dn(rendered, real) == pytest.approx(-1.2, abs=0.04)
+    bright = flight_replay.look(np.where(body > 40, body, 20.0))  # smear or glow, and no black
+    assert flight_replay.black_excess_dn(bright, rendered) == 0
+    clipped = flight_replay.look(np.where(body > 40, body, 0.0))
+    assert flight_replay.black_excess_dn(clipped, rendered) == 0
+
+    scene = vbnfault.load_scene("navcam67p")
+    sensors = [load_sensor(one.camera.detector) for one in (scene, flight_replay.with_black(scene, -1.2, tmp_path))]
+    offsets_dn = [sensor.readout.node_offsets_dn for sensor in sensors]
+    assert offsets_dn[1] == pytest.approx((offsets_dn[0][0] - 1.2,))
+    assert sensors[1].readout.bias_drift_dn_rms == sensors[0].readout.bias_drift_dn_rms
+
+
 def test_centre_and_limb_of_the_body_lie_where_the_table_says(frames: Path, real_shape: Path) -> None:
     """Projected by the documented convention, the shape covers the frame's lit body, within the labels' 7 px."""
     from vbnfault.body import load_body
