@@ -62,6 +62,7 @@ def main() -> None:
     parser.add_argument("--pixels", type=int, default=96)
     parser.add_argument("scenes", nargs="*", help="names [default: all packaged scenes]")
     given = parser.parse_args()
+    given.out.parent.mkdir(parents=True, exist_ok=True)
     before = json.loads(given.before.read_text(encoding="utf-8")) if given.before else {}
     table: dict[str, dict[str, str]] = {}
     with tempfile.TemporaryDirectory() as folder:

@@ -54,6 +54,7 @@ def main() -> None:
     parser.add_argument("--tries", type=int, default=6, help="number of views to choose from")
     parser.add_argument("--blocks", type=int, default=1, help="number of blocks side by side")
     given = parser.parse_args()
+    given.out.parent.mkdir(parents=True, exist_ok=True)
     table = read_table(given.table)
     views: dict[tuple[str, bool], SequenceView] = {}
     rows = []

@@ -43,6 +43,7 @@ def main() -> None:
     parser.add_argument("--sites", type=int, default=6)
     parser.add_argument("--seed", type=int, default=7)
     arguments = parser.parse_args()
+    arguments.out.parent.mkdir(parents=True, exist_ok=True)
     body = load_body(arguments.shape)
     edge, law = mean_edge_m(body.vertices_m, body.faces), model_roughness(body)
     coarse = edge * np.geomspace(1.0, 5.0, 7)

@@ -169,6 +169,7 @@ def main() -> None:
     parser.add_argument("store", type=Path, help="store whose views are looked at")
     parser.add_argument("--out", type=Path, required=True, help="PNG to write")
     given = parser.parse_args()
+    given.out.parent.mkdir(parents=True, exist_ok=True)
     strata = views_of(given.store)
     for views in strata:
         print("\n".join(lines(views)))

@@ -508,6 +508,10 @@ def test_masks_of_the_effect_replace_the_footprints(name: str, described_store: 
     )
     assert effect == footprint != plain
     assert "- Masks: `effect`" in (tmp_path / "effect/README.md").read_text()
+    for folder, rule in (("effect", [st.EFFECT_RULE] * len(second.spec.faults)), ("plain", first.spec.mask_rules)):
+        records = json.loads((tmp_path / folder / "croissant.json").read_text())["recordSet"]
+        classes = next(record["data"] for record in records if record["name"] == "fault_classes")
+        assert [one["fault_classes/rule"] for one in classes] == list(rule)
     assert "- Masks: `footprint`" in (tmp_path / "plain/README.md").read_text()
     with pytest.raises(InputError, match="holds another export: masks is 'effect' there and 'footprint' now"):
         export_store(first, tmp_path / "effect", name, progress=False)

@@ -71,16 +71,19 @@ def store_croissant(store: Store) -> dict[str, Any]:
     return croissant(store, files, [inline("arrays", "Arrays of the Zarr group", arrays)])
 
 
-def croissant(store: Store, files: Sequence[Any], records: Sequence[Any]) -> dict[str, Any]:
+def croissant(
+    store: Store, files: Sequence[Any], records: Sequence[Any], mask_rules: Sequence[str] | None = None
+) -> dict[str, Any]:
     """Return the Croissant description of a store or of one of its exports.
 
     `files`: the entries of `distribution`. `records`: sets of records besides the fault classes and the splits.
+    `mask_rules`: for each class, what its masks in the files hold; default: the store's rules of `mask`.
     """
     attributes, spec = store.attributes, store.spec
     title = str(attributes.get("title") or "untitled")
+    rules = spec.mask_rules if mask_rules is None else mask_rules
     classes = [
-        {"index": k, "name": fault, "rule": spec.mask_rules[k] if spec.mask_rules else ""}
-        for k, fault in enumerate(spec.faults)
+        {"index": k, "name": fault, "rule": rules[k] if rules else ""} for k, fault in enumerate(spec.faults)
     ]
     shared = [inline("splits", "Splits; no site is in two of them", [{"name": name} for name in SPLITS])]
     if classes:

@@ -25,7 +25,7 @@ from ...dataset.croissant import columns, croissant
 from ...dataset.lock import locked
 from ...dataset.progress import Progress
 from ...dataset.statistics import Statistics, statistics
-from ...store import MASK_RULES, SPLITS, STRATA, Store, Url, disk, mask_union, open_store
+from ...store import EFFECT_RULE, MASK_RULES, SPLITS, STRATA, Store, Url, disk, mask_union, open_store
 from ..json_files import plain
 from .card import export_card
 from .contract import ExportPart, Finished, Format, formats
@@ -292,7 +292,7 @@ def _finish(store: Store, kind: Format, parts: Sequence[ExportPart], folder: Fol
     folder.put(
         [
             ("README.md", export_card(store, kind, closing, numbers, masks).encode()),
-            ("croissant.json", to_json(_croissant(store, kind, digest.hexdigest(), numbers)).encode()),
+            ("croissant.json", to_json(_croissant(store, kind, digest.hexdigest(), numbers, masks)).encode()),
         ]
     )
     return tuple(closing.warnings)
@@ -310,8 +310,11 @@ _COLUMNS = {
 }
 
 
-def _croissant(store: Store, kind: Format, sha256: str, numbers: Statistics) -> dict[str, Any]:
-    """Return the Croissant description of an export, whose records are the rows of the table of samples."""
+def _croissant(store: Store, kind: Format, sha256: str, numbers: Statistics, masks: str) -> dict[str, Any]:
+    """Return the Croissant description of an export, whose records are the rows of the table of samples.
+
+    `masks`: footprint or effect.
+    """
     files = [
         {
             "@type": "cr:FileObject",
@@ -331,4 +334,6 @@ def _croissant(store: Store, kind: Format, sha256: str, numbers: Statistics) -> 
             "includes": kind.pattern,
         },
     ]
-    return croissant(store, files, [columns("samples", f"The {numbers.finished} samples", SAMPLES, _COLUMNS)])
+    records = [columns("samples", f"The {numbers.finished} samples", SAMPLES, _COLUMNS)]
+    rules = [EFFECT_RULE] * len(store.spec.faults) if masks == "effect" else None
+    return croissant(store, files, records, rules)
