@@ -152,10 +152,12 @@ def test_root_attributes_of_the_wrong_type_are_one_sentence(
         "versions": "x",
         "versions_of_samples": [7],
         "retake": {},
+        "samples": -1,
         "store": 7,
         "store.mask_kinds": 7,
         "store.wavelength_nm": "x",
         "store.attitude_references": ["sun"],
+        "store.centre_of_mass_T_m": [1.0, 2.0],
         "store.height": 0,
         "store.shard_samples": -1,
     }

@@ -38,7 +38,12 @@ _WORDS = {
 }
 _WORDS_OF_ELEMENTS = {"str": "texts", "int": "whole numbers", "float": "numbers"}
 # Fields of `StoreSpec` whose lists have this many elements.
-_LENGTHS = {"distortion_residual_px": (2,), "attitude_references": (2,), "rendered_shape": (0, 2)}
+_LENGTHS = {
+    "distortion_residual_px": (2,),
+    "attitude_references": (2,),
+    "centre_of_mass_T_m": (3,),
+    "rendered_shape": (0, 2),
+}
 # Fields of `StoreSpec` that count something, and the least that they may be.
 _LEAST = {"height": 1, "width": 1, "shard_samples": 0}
 # Fields of `StoreSpec` with one element for each class, or none.
@@ -61,6 +66,14 @@ def check_attributes(attributes: Mapping[str, Any]) -> None:
         )
     if "retake" in attributes:
         _check_retake(attributes["retake"])
+
+
+def number_of_samples(attributes: Mapping[str, Any]) -> int:
+    """Return how many samples the root attributes of a store count. Raises InputError if that is no such number."""
+    samples = attributes["samples"]
+    if type(samples) is not int or samples < 0:
+        raise InputError(f"samples = {shown(samples)}: must be a whole number of at least 0")
+    return samples
 
 
 def _values_at(table: Mapping[str, Any], path: list[str], above: str = "") -> Iterator[tuple[str, Any]]:
@@ -109,7 +122,7 @@ def check_plain_spec(plain: Any, spec: type) -> None:
         lengths = _LENGTHS.get(field.name)
         if field.name in _OF_CLASSES:
             lengths = 0, len(plain.get("faults", ()))
-        if lengths is not None and len(value) not in lengths:
+        if lengths is not None and value is not None and len(value) not in lengths:
             raise InputError(f"store.{field.name} = {shown(value)}: must have {lengths[-1]} elements")
 
 

@@ -16,7 +16,7 @@ from ..core.errors import InputError, VbnfaultError
 from ..core.quantities import Sample
 from . import disk
 from .arrays import SCALARS
-from .attributes import check_attributes
+from .attributes import check_attributes, number_of_samples
 from .codec import (
     Encoded,
     chunk_ranges,
@@ -61,7 +61,7 @@ class Store:
         self.root_attributes = attributes
         self.attributes = {k: v for k, v in attributes.items() if k not in OWN_ATTRIBUTES}
         check_attributes(self.attributes)
-        self.samples = int(attributes["samples"])
+        self.samples = number_of_samples(attributes)
         self.spec = spec_from_plain(attributes["store"], self.attributes)
         self._mode: Any = mode
         self._arrays: dict[str, zarr.Array[Any]] = {}
