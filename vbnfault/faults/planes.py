@@ -34,6 +34,34 @@ def plus(array: NDArray[np.float32], other: NDArray[np.float32]) -> NDArray[np.f
     return out
 
 
+def plus_plane(
+    array: NDArray[np.float32], plane: NDArray[np.float32], factors: NDArray[np.floating[Any]]
+) -> NDArray[np.float32]:
+    """Return planes float32[y, x, channel] plus a plane float32[y, x] times a factor for each channel [channel]."""
+    out = buffers.empty(array.shape)
+    for start in range(0, len(array), _ROWS_AT_ONCE):
+        rows = slice(start, start + _ROWS_AT_ONCE)
+        more = cv2.merge([plane[rows] * np.float32(factor) for factor in factors])
+        cv2.add(array[rows], more.reshape(array[rows].shape), dst=out[rows])
+    return out
+
+
+def sums(array: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return the sum of each channel of float32[y, x, channel], float64[channel]."""
+    if array.shape[2] > 4:  # OpenCV's scalars have four numbers
+        return np.asarray(array.sum(axis=(0, 1), dtype=np.float64))
+    return np.array(cv2.sumElems(array)[: array.shape[2]])
+
+
+def reaches(array: NDArray[np.float32], level: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Return where any channel of float32[y, x, channel] is at least its level, float32[channel]; bool[y, x]."""
+    if array.shape[2] > 4:
+        return np.asarray((array >= level).any(axis=2))
+    below = tuple(map(float, np.nextafter(level, np.float32(-np.inf))))
+    lowest = (-float(np.finfo(np.float32).max),) * len(below)
+    return np.asarray(cv2.inRange(array, lowest, below) == 0)
+
+
 def intensity_dn(electrons: NDArray[np.float32], camera: Camera) -> NDArray[np.float32]:
     """Return the intensity of electrons float32[y, x, channel], as float32[y, x] in DN of 255.
 

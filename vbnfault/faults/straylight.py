@@ -47,7 +47,7 @@ from ..core.user_files import read_input
 from .context import FaultContext, Params
 from .contract import Fault
 from .fields import Interval, Severity, bounds, number, rows
-from .planes import intensity_dn, plus
+from .planes import intensity_dn, plus, reaches
 
 # Radius of a flare's outline over half the side of its texture, as `benchmarks/flare_textures.py` draws it.
 FILL = 0.9
@@ -191,9 +191,7 @@ class TextureStraylight(Fault):
         layer = _layer_once(params, context, white)
         if layer is None:
             return np.zeros(context.shape, dtype=bool)
-        level = white * np.float32(params["mask_level_dn"] / 255)
-        below = tuple(map(float, np.nextafter(level, np.float32(0))))
-        return cv2.inRange(layer, (-1.0,) * len(below), below) == 0
+        return reaches(layer, white * np.float32(params["mask_level_dn"] / 255))
 
     def soft(self, params: Params, context: FaultContext) -> NDArray[np.float32]:
         """Return the intensity of flares and glare, float32[y, x] in DN of 255."""

@@ -29,21 +29,22 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from ..core import spectra
-from ..core.quantities import Irradiance, Radiance
+from ..core.quantities import Radiance
 from ..core.shared_results import SharedResults
 from ..lens.straylight.scatter import CLEANLINESS_LIMITS, ROUGHNESS_NM_LIMITS, Cleanliness
 from ..lens.straylight.scene import PointSources, RenderGrid, SceneInLens, surrounding_grids
 from ..lens.straylight.scene_diffraction import starburst_of_source, wing_fraction
 from ..lens.straylight.settings import Baffle, DirectPath, GhostSettings, SensorGrid, StraylightSettings, SunSource
-from ..lens.straylight.total import ClearLight, SunlightInLens, scene_veil_fraction, veil_of
+from ..lens.straylight.total import ClearLight, SunlightInLens, scene_veil_fraction, veil_per_px
 from .context import FaultContext, Params
 from .contract import LensFault
 from .fields import Interval, Severity, bounds, choice, flag, number
-from .planes import intensity_dn, plus, times
+from .planes import intensity_dn, plus, plus_plane, reaches, sums, times
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -202,8 +203,8 @@ class _LensStraylight(LensFault):
             return quantity
         scene, added = times(quantity.array, 1 - light.scene_lost), light.added
         if not light.scene_added:
-            flux = quantity.array.sum(axis=(0, 1), dtype=np.float64) * light.scene_lost
-            added = plus(added, veil_of(flux, context.shape, context.camera.focal_length_px))
+            veil = sums(quantity.array) * light.scene_lost
+            added = plus_plane(added, veil_per_px(context.shape, context.camera.focal_length_px), veil)
         if quantity.past_rims is None:
             return quantity.with_array(plus(scene, added))
         past = plus(times(quantity.past_rims, light.direct_left), added)
@@ -215,7 +216,7 @@ class _LensStraylight(LensFault):
         if light is None:
             return np.zeros(context.shape, dtype=bool)
         white = context.camera.detector.white_e
-        return np.asarray((light.added >= white * np.float32(params["mask_level_dn"] / 255)).any(axis=2))
+        return reaches(light.added, white * np.float32(params["mask_level_dn"] / 255))
 
     def soft(self, params: Params, context: FaultContext) -> F32:
         """Return the intensity of the straylight, float32[y, x] in DN of 255."""
@@ -240,10 +241,11 @@ class _LensStraylight(LensFault):
             lost = self.scene_lost(params, context)
             return _Light(added=scene, direct_left=1 - lost, scene_lost=lost, scene_added=True)
         camera, light = context.camera, source.light
-        combined, direct_fraction = light.combined(_clear_light(light, context))
-        combined *= source.irradiance_W_m2_nm.astype(np.float32)[:, None, None]
-        on_sensor = Irradiance(array=combined, wavelength_nm=light.nodes_nm)
-        added = camera.detector.electrons_expected(on_sensor, camera.exposure_s).array
+        weights = camera.detector.electron_rate_weights(light.nodes_nm) * source.irradiance_W_m2_nm
+        clear = _clear_light(light, weights, context)
+        samples = context.of_view.once("glare", light.glare_samples_key, light.glare_samples)
+        planes, direct_fraction = light.in_channels(weights, clear, samples, camera.exposure_s)
+        added = cv2.merge(list(planes)).reshape(*context.shape, len(planes))
         return _Light(
             added=added if scene is None else plus(added, scene),
             direct_left=source.channel_mean(direct_fraction),
@@ -383,22 +385,18 @@ def _shared_while_new(context: FaultContext) -> SharedResults:
     return SharedResults() if context.coating_loss else context.of_view
 
 
-def _clear_light(light: SunlightInLens, context: FaultContext) -> ClearLight:
-    """Return ghosts and starburst of the Sun, which the samples of a view share."""
-    shared = _shared_while_new(context)
-    clear = shared.once("ghosts and starburst", light.clear_key, lambda: _new_clear_light(light, context))
-    if shared.kept:
-        clear.array.flags.writeable = False
-    return clear
+def _clear_light(light: SunlightInLens, weights: F64, context: FaultContext) -> ClearLight:
+    """Return ghosts and starburst of the Sun, which the samples of a view share, in electrons per second."""
+    shared, key = _shared_while_new(context), (*light.clear_key, weights.tobytes())
+    return shared.once("ghosts and starburst", key, lambda: _new_clear_light(light, weights, context))
 
 
-def _new_clear_light(light: SunlightInLens, context: FaultContext) -> ClearLight:
+def _new_clear_light(light: SunlightInLens, weights: F64, context: FaultContext) -> ClearLight:
     """Return ghosts and starburst; the starburst does not depend on the coatings, whose wear differs by sample."""
-    if not (context.coating_loss and context.of_view.kept):
-        return light.clear_light()  # whole coatings: the sum is shared
-    layer, beyond = context.of_view.once("starburst", light.burst_key, light.starburst)
-    layer.flags.writeable = False
-    return light.clear_light((layer, beyond))
+    if not context.coating_loss:
+        return light.clear_light(weights)  # whole coatings: the sum is shared
+    key = *light.burst_key, weights.tobytes()
+    return light.clear_light(weights, context.of_view.once("starburst", key, lambda: light.burst(weights)))
 
 
 def _diffracts(params: Params, context: FaultContext) -> bool:

@@ -38,8 +38,7 @@ from ..lens.changes import changed
 from ..lens.footprint import ImageFrame
 from ..lens.straylight.irradiance import flare_model
 from ..lens.straylight.settings import GhostSettings, SensorGrid
-from ..lens.straylight.total import SunlightInLens
-from ..lens.thin import cos4_map
+from ..lens.straylight.total import SunlightInLens, veil_per_px
 from ..pipeline.development import Development
 from ..pipeline.exposure import exposure_s
 from ..pipeline.injection import fault_context, inject_faults
@@ -437,8 +436,7 @@ class SceneEvaluator:
             lost = source.scene_lost
             scene_e = exposed.scene_e
             if of_scene is None:  # what the lens scatters of the scene returns as a veil, distributed as the Sun's
-                focal_px = camera.focal_length_px
-                veil = cos4_map(camera_shape(camera), focal_px) * np.float32(1 / (np.pi * focal_px**2))
+                veil = veil_per_px(camera_shape(camera), camera.focal_length_px)
                 flux = scene_e.sum(axis=(1, 2), dtype=np.float64) * lost
                 of_scene = veil * flux.astype(np.float32)[:, None, None]
             sun_veil = (per_s @ entering * camera.exposure_s).astype(np.float32)

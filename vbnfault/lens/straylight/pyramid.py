@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core import buffers
 from ...core.llvm import backend
 
 F32 = NDArray[np.float32]
@@ -20,6 +21,7 @@ T = TypeVar("T")
 
 LEVELS = 6
 MARGIN = 4  # pixels around each level, for cells that lie partly outside
+_STRIP = 32  # rows
 _CALM_SIGMA = 0.8  # sigma by which a coarser level is smoothed, in pixels of this level
 
 
@@ -102,6 +104,24 @@ def summed(canvas: Canvas, levels: Sequence[NDArray[Any]], unit: float | None = 
         np.maximum(below[rows, columns], 0, out=out[layer])
 
     in_layers(resize, len(out))
+    return out
+
+
+def bands_mixed(array: F32, weights: F64) -> F32:
+    """Return float32[band, y, x] summed over the bands with float64[channel, band], float32[channel, y, x]."""
+    # the rows of a strip stay in the cache; BLAS is slow for so few weights, and its bits depend on the threads
+    factors = weights.astype(np.float32)
+    out = buffers.empty((len(factors), *array.shape[1:]))
+    starts = range(0, array.shape[1], _STRIP)
+
+    def mix(strip: int) -> None:
+        rows = slice(starts[strip], starts[strip] + _STRIP)
+        for plane, row in zip(out[:, rows], factors, strict=True):
+            np.multiply(array[0, rows], row[0], out=plane)
+            for band, factor in zip(array[1:, rows], row[1:], strict=True):
+                plane += band * factor
+
+    in_layers(mix, len(starts))
     return out
 
 

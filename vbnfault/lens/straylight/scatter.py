@@ -403,13 +403,24 @@ class VeilingGlare:
         The flux is divided by the source's irradiance at the entrance. The flux includes the cos⁴ of the field
         angle, which `image` omits.
         """
-        slope = np.asarray(sun_xy_mm, dtype=np.float64) / self.efl_mm
-        angle = np.linspace(0, 2 * np.pi, _AROUND, endpoint=False, dtype=np.float64)
+        slope = tuple(float(v) / self.efl_mm for v in sun_xy_mm)
         half_slope = (shape[1] / 2 * pitch_mm / self.efl_mm, shape[0] / 2 * pitch_mm / self.efl_mm)
-        missing = beyond_frame(slope, self.offset, angle, half_slope).mean(axis=1)
+        missing = _missing(slope, tuple(self.offset.tolist()), half_slope)
         # E dA = E(β) cos⁴θ dA = E(β) f² d²β
         rings = 2 * np.pi * (self.efl_mm * self.offset) ** 2 * missing
         return np.asarray(np.trapezoid(self.irradiance * rings, x=np.log(self.offset), axis=1))
+
+
+@lru_cache(maxsize=4)
+def _missing(slope: tuple[float, ...], offset: tuple[float, ...], half_slope: tuple[float, float]) -> F64:
+    """Return the fraction of each ring around a source's image that lies outside the frame, float64[sample].
+
+    It does not depend on the state of the surfaces, so the samples of a view share the cached result.
+    """
+    angle = np.linspace(0, 2 * np.pi, _AROUND, endpoint=False, dtype=np.float64)
+    missing = beyond_frame(slope, np.array(offset), angle, half_slope).mean(axis=1)
+    missing.flags.writeable = False
+    return missing
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -487,8 +498,11 @@ def _surfaces(lens: Prescription, wavelength_nm: float, cleanliness: Cleanliness
     )
 
 
+@lru_cache(maxsize=4)
 def _lit(lens: Prescription, sun_deg: float) -> F64:
     """Return the fraction of the beam that a source at an angle lights, float64[surface] by scattering surface.
+
+    The samples of a view share the cached result.
 
     The fraction is a paraxial estimate of the light that passes all rims up to the surface. At a surface before
     the stop, the beam is the part of the surface that the middle of the sensor receives light from. Behind the
@@ -511,7 +525,9 @@ def _lit(lens: Prescription, sun_deg: float) -> F64:
         reached = height[: row + 1, None, None] * entrance + slope[: row + 1, None, None] * lean
         inside = np.einsum("knc,knc->kn", reached, reached) <= rims[: row + 1, None] ** 2 * (1 + 1e-9)
         fractions.append(inside.all(axis=0).mean())
-    return np.array(fractions)
+    out = np.array(fractions)
+    out.flags.writeable = False
+    return out
 
 
 @lru_cache(maxsize=8)

@@ -31,16 +31,18 @@ from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core import buffers
 from ...core.memory import release_unused
 from ..paraxial import paraxial_properties
 from ..prescription import Prescription
 from ..thin import cos4_map
 from .irradiance import FlareModel, flare_model
 from .paraxial import axial_transmittance
-from .pyramid import Pyramid, in_layers
+from .pyramid import Pyramid, bands_mixed, in_layers
 from .scatter import (
     Cleanliness,
     VeilingGlare,
@@ -85,20 +87,38 @@ class Straylight:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class Burst:
+    """Hold a starburst, summed over the bands.
+
+    Attributes
+    ----------
+    planes
+        Sum of the bands with the weights of `SunlightInLens.in_channels`, float32[channel, y, x], read-only.
+    flux_mm2, beyond_mm2
+        float64[band]: flux inside and outside the frame, over the Sun's irradiance at the entrance.
+    """
+
+    planes: F32
+    flux_mm2: F64
+    beyond_mm2: F64
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class ClearLight:
     """Hold the straylight of a lens without scatter: its ghosts and its starburst.
 
     Attributes
     ----------
-    array
-        Sum of both, irradiance on the sensor over the Sun's at the entrance, float32[band, y, x].
+    planes
+        Sum of both and of the bands with the weights of `SunlightInLens.in_channels`, float32[channel, y, x],
+        read-only.
     ghosts_mm2, starburst_mm2
-        float64[band]: flux of each in the frame.
+        float64[band]: flux of each in the frame, over the Sun's irradiance at the entrance.
     beyond_mm2
         float64[band]: flux of the starburst outside the frame.
     """
 
-    array: F32
+    planes: F32
     ghosts_mm2: F64
     starburst_mm2: F64
     beyond_mm2: F64
@@ -220,45 +240,67 @@ class SunlightInLens:
             beyond_mm2=beyond,
         )
 
-    def combined(self, clear: ClearLight | None = None) -> tuple[F32, F64]:
-        """Return the sum of all straylight, float32[band, y, x], and `Straylight.direct_fraction`.
+    def in_channels(
+        self, weights: F64, clear: ClearLight, samples: GlareSamples, exposure_s: float = 1.0
+    ) -> tuple[F32, F64]:
+        """Return the sum of all straylight and of the bands, float32[channel, y, x], and the kept direct fraction.
 
-        The values are those of `total`, but the parts are not kept: each takes 34 MB for 1024 pixels and 8 bands.
-        `clear` is the result of `clear_light`, if it is known; its array is used up unless it is read-only.
+        The values are those of `total`, but for rounding. Planes of all bands would take 34 MB for 1024 pixels and
+        8 bands, and several times as long.
+
+        Parameters
+        ----------
+        weights
+            float64[channel, band]: what a second of the Sun's irradiance gives in each channel.
+        clear
+            Result of `clear_light` for these weights.
+        samples
+            Result of `glare_samples`.
+        exposure_s
+            Exposure.
         """
-        pitch_mm = self.sensor.pitch_mm
-        clear = self.clear_light() if clear is None else clear
-        combined = clear.array if clear.array.flags.writeable else clear.array.copy()
-        fluxes, outside = [clear.starburst_mm2], [clear.beyond_mm2]
-        for part in (self.glare, self.veil):
-            layer, beyond = part()
-            fluxes.append(_flux_mm2(layer, pitch_mm))
-            outside.append(beyond)
-            combined += layer
-            del layer  # before the next one is made
-        taken = np.sum(fluxes, axis=0) + np.sum(outside, axis=0)
-        return combined, self.direct_fraction(clear.ghosts_mm2, taken)
+        table, glare_beyond, kept_of_single = self.glare_light()
+        gain = self.glare_gain(kept_of_single)
+        entering, per_mm2 = self._veil_on_axis()
+        # on the sensor glare and veil have the same factor, cos⁴
+        scattered = table * gain[:, None].astype(np.float32) + (entering * per_mm2)[:, None].astype(np.float32)
+        planes = samples.mixed(scattered, weights * exposure_s, (clear.planes, exposure_s))
+        taken = (samples.flux_mm2(table) + glare_beyond) * gain + entering
+        taken = taken + clear.starburst_mm2 + clear.beyond_mm2
+        return planes, self.direct_fraction(clear.ghosts_mm2, taken)
 
     @property
     def clear_key(self) -> tuple[Any, ...]:
-        """Return all that `clear_light` depends on."""
+        """Return all that `clear_light` depends on beside the weights."""
         return *self.ghost_key, self.past_baffle, *self.burst_key
 
-    def clear_light(self, starburst: tuple[F32, F64] | None = None) -> ClearLight:
+    def clear_light(self, weights: F64, burst: Burst | None = None) -> ClearLight:
         """Return ghosts and starburst, which roughness, dust and veil do not change.
 
-        `starburst` is the result of the method of that name, if it is known; it stays as it is.
+        `weights` are as in `in_channels`. `burst` is the result of `burst` for the same weights, if it is known.
         """
         frame_bytes = 4 * len(self.nodes_nm) * self.sensor.shape[0] * self.sensor.shape[1]
         release_unused(9 * frame_bytes)  # the sums of all levels take 90 MB, the cells 200 MB
-        array = self._ghosts()
+        ghosts = self._ghosts()
         # what the drawing took, before the other parts and the signals of the sample's faults take as much
         release_unused(9 * frame_bytes)
-        ghosts_mm2 = _flux_mm2(array, self.sensor.pitch_mm)
-        layer, beyond = self.starburst() if starburst is None else starburst
-        starburst_mm2 = _flux_mm2(layer, self.sensor.pitch_mm)
-        array += layer
-        return ClearLight(array=array, ghosts_mm2=ghosts_mm2, starburst_mm2=starburst_mm2, beyond_mm2=beyond)
+        ghosts_mm2 = _flux_mm2(ghosts, self.sensor.pitch_mm)
+        planes = bands_mixed(ghosts, weights)
+        del ghosts  # before the starburst takes as much
+        burst = self.burst(weights) if burst is None else burst
+        planes += burst.planes
+        planes.flags.writeable = False
+        return ClearLight(
+            planes=planes, ghosts_mm2=ghosts_mm2, starburst_mm2=burst.flux_mm2, beyond_mm2=burst.beyond_mm2
+        )
+
+    def burst(self, weights: F64) -> Burst:
+        """Return the starburst, summed over the bands with weights as in `in_channels`."""
+        image, beyond = self.starburst()
+        flux = _flux_mm2(image, self.sensor.pitch_mm)
+        planes = bands_mixed(image, weights)
+        planes.flags.writeable = False
+        return Burst(planes=planes, flux_mm2=flux, beyond_mm2=beyond)
 
     @property
     def lit(self) -> float:
@@ -432,8 +474,12 @@ class SunlightInLens:
 
     def veil_light(self) -> tuple[F64, F32]:
         """Return the flux of the veil, float64[band] in mm², and its distribution, float32[y, x] in 1/mm²."""
-        entering = self.lit * self.passed * self.pupil_mm2 * self.settings.veil_fraction
-        return entering, self._cos4 * np.float32(1 / (np.pi * self._efl_mm**2))
+        entering, per_mm2 = self._veil_on_axis()
+        return entering, self._cos4 * np.float32(per_mm2)
+
+    def _veil_on_axis(self) -> tuple[F64, float]:
+        """Return the flux of the veil, float64[band] in mm², and the fraction of it that a mm² on the axis gets."""
+        return self.lit * self.passed * self.pupil_mm2 * self.settings.veil_fraction, 1 / (np.pi * self._efl_mm**2)
 
     def direct_fraction(self, ghosts_mm2: F64, taken_mm2: F64) -> F64:
         """Return the fraction of the Sun's direct image that remains, float64[band].
@@ -489,10 +535,24 @@ class GlareSamples:
         # not a product of BLAS, whose bits may depend on the number of threads
         return np.einsum("bs,s->b", table[:, : len(self.area_mm2)].astype(np.float64), self.area_mm2)
 
-    def mixed(self, table: F32, weights: F64) -> F32:
-        """Return sums over the bands with weights float64[channel, band], float32[channel, y, x]."""
+    def mixed(self, table: F32, weights: F64, more: tuple[F32, float] | None = None) -> F32:
+        """Return sums over the bands with weights float64[channel, band], float32[channel, y, x].
+
+        `more` are planes of the shape of the result, and a factor; their product is added.
+        """
         channels = weights.astype(np.float32) @ table
-        return np.stack([np.take(channel, self.index) * self.cos4 for channel in channels])
+        index = self.index.astype(np.intp)  # numpy would convert it for every channel
+        out = buffers.empty((len(channels), *index.shape))
+
+        def take(channel: int) -> None:
+            plane = out[channel]
+            np.take(channels[channel], index, out=plane, mode="clip")
+            np.multiply(plane, self.cos4, out=plane)
+            if more is not None:
+                cv2.scaleAdd(more[0][channel], more[1], plane, dst=plane)
+
+        in_layers(take, len(out))
+        return out
 
 
 def scene_veil_fraction(
@@ -506,14 +566,12 @@ def scene_veil_fraction(
     return np.asarray(1 - (1 - scattered) * (1 - veil_fraction))
 
 
-def veil_of(flux: F64, shape: tuple[int, int], focal_length_px: float) -> F32:
-    """Return the veil of a flux that leaves the image, float32[y, x, channel] per pixel.
+def veil_per_px(shape: tuple[int, int], focal_length_px: float) -> F32:
+    """Return the fraction of a flux leaving the image that its veil brings to each pixel, float32[y, x].
 
-    `flux` is float64[channel] in any unit. The veil's sum over the unbounded plane is the flux; the part outside
-    the frame is lost to the walls.
+    Its sum over the unbounded plane is 1; the part outside the frame is lost to the walls.
     """
-    per_px = cos4_map(shape, focal_length_px) * np.float32(1 / (np.pi * focal_length_px**2))
-    return np.asarray(per_px[..., None] * flux.astype(np.float32))
+    return np.asarray(cos4_map(shape, focal_length_px) * np.float32(1 / (np.pi * focal_length_px**2)))
 
 
 def _flux_mm2(irradiance: F32, pitch_mm: float) -> F64:
