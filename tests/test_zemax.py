@@ -169,6 +169,12 @@ def test_a_stop_on_a_refracting_surface_is_a_row_of_its_shape(tmp_path: Path) ->
         ("UNIT MM", "UNIT FT", "UNIT FT: must be one of MM, CM, IN"),
         ("TYPE EVENASPH", "TYPE ODDASPHE", "SURF 2: TYPE ODDASPHE: must be STANDARD or EVENASPH"),
         ("PARM 1 0", "PARM 1 0.1", "SURF 2: PARM 1 0.1: the term of r² must be 0"),
+        ("PARM 1 0\n", "PARM 9 1e-20\n", "SURF 2: PARM 9 1e-20: the number of the parameter must be from 1 to 8"),
+        (
+            "PARM 1 0\n",
+            "PARM 2.5 1e-9\n",
+            "SURF 2: PARM 2.5 1e-09: the number of the parameter must be from 1",
+        ),
         ("CURV 4.5421E-02 0", "CURV often 0", "SURF 2: CURV: value 1 is 'often'; must be a number"),
         ("CLAP 0 7.5", "CLAP 1 7.5", "SURF 3: CLAP 1: the inner radius of the aperture must be 0"),
         ("CLAP 0 7.5", "SQAP 7 7.5", "SURF 3: SQAP: a rectangular aperture cannot be read"),

@@ -66,6 +66,8 @@ _REFUSED = {
 }
 _NOT_RECORDED = (1.5, 40.0)  # nd and vd that older files have for every glass of a catalogue
 
+_PARAMETERS = range(1, 9)  # of an EVENASPH: coefficients of r², r⁴, …
+
 # Zemax's formula → the registered formula, how many coefficients it has, and whether B₁ C₁ B₂ C₂ … alternate.
 _FORMULAS = {
     1: ("polynomial", 6, False),
@@ -211,7 +213,7 @@ class _Surface:
     thickness: float = 0.0
     semi_diameter: float = 0.0
     aperture: float | None = None
-    parameters: dict[int, float] = field(default_factory=dict)
+    parameters: dict[float, float] = field(default_factory=dict)
     glass: Sequence[str] | None = None
 
     def take(self, words: Sequence[str]) -> None:
@@ -240,7 +242,7 @@ class _Surface:
                 raise InputError(f"{self.where}: {key} {words[1]}: the inner radius of the aperture must be 0")
             self.aperture = _number(words, 2, self.where)
         elif key == "PARM":
-            self.parameters[int(_number(words, 1, self.where))] = _number(words, 2, self.where)
+            self.parameters[_number(words, 1, self.where)] = _number(words, 2, self.where)
         elif key == "GLAS":
             if words[1:2] == ["MIRROR"]:
                 raise InputError(f"{self.where}: GLAS MIRROR: lenses with mirrors cannot be read")
@@ -263,9 +265,15 @@ class _Surface:
         if self.conic:
             row["conic"] = self.conic
         if self.kind == "EVENASPH":
+            for number, value in self.parameters.items():
+                if value and number not in _PARAMETERS:
+                    raise InputError(
+                        f"{self.where}: PARM {number:g} {value:g}: the number of the parameter must be from "
+                        f"{_PARAMETERS[0]} to {_PARAMETERS[-1]}"
+                    )
             if self.parameters.get(1):
                 raise InputError(f"{self.where}: PARM 1 {self.parameters[1]:g}: the term of r² must be 0")
-            terms = [self.parameters.get(k, 0.0) * unit_mm ** (1 - 2 * k) for k in range(2, 9)]
+            terms = [self.parameters.get(k, 0.0) * unit_mm ** (1 - 2 * k) for k in _PARAMETERS[1:]]
             while terms and not terms[-1]:
                 terms.pop()
             if terms:

@@ -30,7 +30,6 @@ FINE = 768  # rays across a box, to compute flux and position
 FINE_OF_FOUR = 192
 _STEEP = 0.3  # rise of the relative radius over a cell, above which neighbouring rays ended at different rims
 _PEAK = 64  # rays across a box, to locate the peak
-_IN_CACHE = 8  # bundles of which the peaks are located at a time: a third of the time of all at once
 _TOGETHER = 1 << 22  # rays traced at a time, to limit memory
 _SHARP = 1e-3  # default width of soft edges while boxes are located
 _LEAST_SPREAD = 0.25  # fraction of a ghost's image that is magnified less than `Arrivals.magnification`
@@ -429,30 +428,28 @@ def _inside(radius: Any, across: int) -> Any:
 def peaks(made: Tracer, rays: Rays, sun_deg: float) -> F64:
     """Return each ghost's largest irradiance over that of the Sun, float64[bundle].
 
-    It is taken over the cells of a lattice.
+    It is taken over the cells of a lattice. A ghost of only a few rays has no whole cell, and its peak is 0.
     """
+    be = backend()
+    dr = be.dr
     spots = made.trace(rays, _PEAK, centred=True)
-    x, y, fraction, radius = (
-        v.numpy().reshape(len(rays), _PEAK, _PEAK) for v in (spots.x_mm, spots.y_mm, spots.fraction, spots.radius)
-    )
+    here = dr.arange(be.UInt32, len(rays) * _PEAK**2)
+    column, row = here % _PEAK, here // _PEAK % _PEAK
+    inner = (column > 0) & (row > 0)
+    left, below = (dr.select(inner, here - step, here) for step in (1, _PEAK))
+
+    def at(values: Any, index: Any) -> Any:
+        return dr.gather(be.Float, values, index)
+
+    x, y, whole = spots.x_mm, spots.y_mm, inner & (spots.radius <= 1)
+    for index in (left, below):
+        whole &= at(spots.radius, index) <= 1
+    ux, uy, vx, vy = (v - at(v, index) for index in (left, below) for v in (x, y))
+    area = dr.abs(ux * vy - uy * vx)
+    density = dr.select(whole & (area > 0), spots.fraction / area, 0)
+    highest = dr.block_reduce(dr.ReduceOp.Max, density, _PEAK**2).numpy()
     cell = 4 * rays.box_mm[:, 2] * rays.box_mm[:, 3] / _PEAK**2
-    most = np.zeros(len(rays))
-    for first in range(0, len(rays), _IN_CACHE):
-        part = slice(first, first + _IN_CACHE)
-        most[part] = _highest(x[part], y[part], fraction[part], radius[part], cell[part])
-    return most * float(np.cos(np.radians(sun_deg)))
-
-
-def _highest(x: F64, y: F64, fraction: F64, radius: F64, cell: F64) -> F64:
-    """Return the greatest light per area of each lattice of rays, [bundle]; `cell` is the area at the entrance."""
-    ux, uy = (np.diff(v, axis=2)[:, 1:] for v in (x, y))
-    vx, vy = (np.diff(v, axis=1)[:, :, 1:] for v in (x, y))
-    passes = radius <= 1
-    whole = passes[:, 1:, 1:] & passes[:, 1:, :-1] & passes[:, :-1, 1:]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        density = np.where(whole, fraction[:, 1:, 1:] * cell[:, None, None] / np.abs(ux * vy - uy * vx), 0)
-    # a ghost of only a few rays has no whole cell, and its peak is 0
-    return np.asarray(np.nan_to_num(density, posinf=0.0).max(axis=(1, 2)))
+    return np.asarray(highest * cell * np.cos(np.radians(sun_deg)), dtype=np.float64)
 
 
 def surface_interactions_per_second(
