@@ -224,7 +224,7 @@ def test_light_is_traced_once_for_each_state_of_the_coatings(monkeypatch: pytest
 
         monkeypatch.setattr(module, name, count)
 
-    counted(SunlightInLens, "combined")
+    counted(SunlightInLens, "in_channels")
     counted(dust_lens, "_shadows")
     faults = {
         "straylight": {"model": "paraxial"},
@@ -247,7 +247,7 @@ def test_light_is_traced_once_for_each_state_of_the_coatings(monkeypatch: pytest
             whole.append(dict(calls))
     # with the worn coatings, and with whole ones where the degradation is left out
     assert whole
-    assert all(count == {"combined": 2, "_shadows": 1} for count in whole), whole
+    assert all(count == {"in_channels": 2, "_shadows": 1} for count in whole), whole
 
 
 def test_a_redrawn_fault_leaves_the_draws_and_results_of_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
