@@ -540,7 +540,7 @@ class GlareSamples:
 
         `more` are planes of the shape of the result, and a factor; their product is added.
         """
-        channels = weights.astype(np.float32) @ table
+        channels = bands_mixed(table[:, None], weights)[:, 0]
         index = self.index.astype(np.intp)  # numpy would convert it for every channel
         out = buffers.empty((len(channels), *index.shape))
 
