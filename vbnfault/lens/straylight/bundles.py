@@ -97,7 +97,8 @@ class Spots:
         The value is 1000 or more if the ray has missed a surface or is totally reflected.
     margin
         Smallest value along the path of (1 - relative radius) over the width of the rim's soft edge. The margin
-        is negative outside a rim. It is computed only if soft edges have widths.
+        is negative outside a rim. It is computed only if soft edges have widths, and margins that exceed
+        `steps.FRINGES_END` may be stretched.
     """
 
     rays: Rays
@@ -121,11 +122,14 @@ class TraceOptions(TypedDict, total=False):
         If False, a tracer with only one path and one wavelength does not compute `fraction`, which is then 1.
     halved
         Whether to trace only one side of the plane of axis and Sun if all boxes are symmetric about this plane.
+    stretch
+        float64[step], at least 1: factor on what of the margin exceeds `steps.FRINGES_END`. Default: 1.
     """
 
     centred: bool
     light: bool
     halved: bool
+    stretch: F64
 
 
 def _paired(first: NDArray[Any], second: NDArray[Any]) -> NDArray[np.uint64]:
@@ -417,7 +421,7 @@ class Tracer:
             float64[step]: width of the rim's soft edge at each step of each route, in radii of the rim. Without
             widths, margins are not computed, and rays that miss a surface or are totally reflected become nan.
         options
-            See `TraceOptions`; by default not centred, with light, and halved.
+            See `TraceOptions`; by default not centred, with light, halved, and without stretch.
         """
         side = np.broadcast_to(np.asarray(across, dtype=np.int64), len(rays))
         centred, light = options.get("centred", False), options.get("light", True)
@@ -431,6 +435,7 @@ class Tracer:
         start = self._start(rays, side, centred, even)
         count, soft = dr.width(start.x), width is not None
         per_width = (np.zeros(len(self.rows)) if width is None else 1 / width).astype(np.float32)
+        stretch = np.asarray(options.get("stretch", np.ones(len(self.rows))) - 1, dtype=np.float32)
         sides = 2 if even and self._bladed else 1
         none, unit = dr.zeros(be.Float, count), dr.full(be.Float, 1, count)
         outside, margin = self._hood_rim(start)
@@ -438,12 +443,12 @@ class Tracer:
         ray = (start.x, start.y, none, start.dx, start.dy, start.dz, unit, *(rim * sides))
         if len(self.routes) == len(self.wavelength_nm) == 1:
             # one path and one wavelength: all numbers are constants of the kernel, and nothing is fetched
-            for at, sharpness in zip(self._known, per_width.tolist(), strict=True):
-                step = replace(at, sharpness=sharpness)
+            for at, sharpness, more in zip(self._known, per_width.tolist(), stretch.tolist(), strict=True):
+                step = replace(at, sharpness=sharpness, stretch=more)
                 ray = meet(step, ray, soft=soft, special=self._special, blades=self._blades, light=light)
             last: Any = self._last_gap_mm
         else:
-            ray, last = self._followed(ray, start, per_width, soft)
+            ray, last = self._followed(ray, start, per_width, stretch, soft)
         both = arrived(ray, last, soft)
         dr.eval(both)
         if not even:
@@ -468,12 +473,18 @@ class Tracer:
         return outside, (1 - outside) * dr.opaque(be.Float, 1 / self.hood_width)
 
     def _followed(
-        self, ray: tuple[Any, ...], start: Any, per_width: NDArray[np.float32], soft: bool
+        self,
+        ray: tuple[Any, ...],
+        start: Any,
+        per_width: NDArray[np.float32],
+        stretch: NDArray[np.float32],
+        soft: bool,
     ) -> tuple[tuple[Any, ...], Any]:
         """Return the rays at the last surface of their paths, and the distance of this vertex behind the sensor."""
         be, t = backend(), self._tables
         dr = be.dr
         edge = be.UInt64(_paired(per_width, self._look_up_word.view(np.float32)))
+        beyond = be.Float(stretch) if soft else None
         wavelength = start.wavelength * dr.opaque(be.UInt32, len(self.rows))
         fractions = start.wavelength * dr.opaque(be.UInt32, 3 * _COSINES * (len(self.lens.surfaces) + 1))
         end = dr.gather(be.UInt32, t["end"], start.route)
@@ -482,7 +493,7 @@ class Tracer:
             return step < end
 
         def body(step: Any, *ray: Any) -> Any:
-            at = self._fetched(step, edge, wavelength, fractions)
+            at = self._fetched(step, edge, beyond, wavelength, fractions)
             return step + 1, *meet(at, ray, soft=soft, special=self._special, blades=self._blades)
 
         first = dr.gather(be.UInt32, t["start"], start.route)
@@ -525,7 +536,7 @@ class Tracer:
         dr.eval(spots)
         return Spots(rays, side, *spots)
 
-    def _fetched(self, step: Any, edge: Any, wavelength: Any, fractions: Any) -> Step:
+    def _fetched(self, step: Any, edge: Any, beyond: Any, wavelength: Any, fractions: Any) -> Step:
         """Return the data of one step of each lane's path, fetched from the tables."""
         be, t = backend(), self._tables
         dr = be.dr
@@ -547,6 +558,7 @@ class Tracer:
             eta=eta,
             per_rim=per_rim,
             sharpness=sharpness,
+            stretch=0.0 if beyond is None else dr.gather(be.Float, beyond, step),
             mirror=(word & 1) == 1,
             onward=None,
             stop=dr.gather(be.UInt32, t["stop"], step) == 1 if self._bladed else False,
@@ -578,6 +590,7 @@ class Tracer:
                     eta=float(n["eta"][0, step]),
                     per_rim=float(n["per_rim"][step]),
                     sharpness=1.0,
+                    stretch=0.0,
                     mirror=bool(word & 1),
                     onward=onward,
                     stop=row == self.lens.stop,

@@ -27,6 +27,7 @@ from .paraxial import Ghost, along, mean_ghost
 from .pyramid import LEVELS, Canvas, Pyramid
 from .raster import PARTS, BundleDrawing, Sums, edge_kind
 from .settings import TRACED, GhostSettings, SensorGrid
+from .steps import FRINGES_END, stretched
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -41,10 +42,11 @@ _FOCUSED = 0.35  # width of an edge in radii of its rim above which the disc is 
 _DISC_RINGS = 3
 _LARGE_PX = 150.0  # radius of a rim's image from which on the image is large
 _PLAIN = 0.03  # edges below this fraction of the summed irradiance are drawn one level coarser
-_RAMP, _RAMP_PX = 7.0, 24.0  # distance from an edge, in its widths and at least in pixels, that is drawn finely
+_RAMP, _RAMP_PX = FRINGES_END, 24.0  # distance from an edge, in its widths and at least in pixels, that is drawn finely
 _FRAME_PIXELS = 16  # smallest number of pixels of a level across the frame
 _SPREAD = 0.25, 256.0  # bounds of the size of rims' images relative to the paraxial size
 _SPREAD_SHARP = 4.0  # upper bound of the same in estimates of sharpness
+_STRETCH = 64.0  # upper bound of the ratio of edges' widths on the sensor
 _LEAST = 1e-10  # irradiance over the Sun's below which a ghost is omitted
 _SPARE = 8  # ghosts traced beyond those wanted: a few rays may pass the lattice of the peaks alone
 
@@ -93,6 +95,7 @@ class ParaxialTracer(Tracer):
         side = np.broadcast_to(np.asarray(across, dtype=np.int64), len(rays))
         start = self._start(rays, side, options.get("centred", False), False)
         per_width = be.Float((np.zeros(len(self.rows)) if width is None else 1 / width).astype(np.float32))
+        stretch = be.Float(np.asarray(options.get("stretch", np.ones(len(self.rows))) - 1, dtype=np.float32))
         blades = self._blades
         x, y = start.x, start.y
         sx, sy = start.dx / start.dz, start.dy / start.dz
@@ -111,7 +114,8 @@ class ParaxialTracer(Tracer):
             if blades is not None:
                 blade = blades.relative_radius(hx, hy)
                 beyond = dr.select(dr.gather(be.UInt32, t["stop"], step) == 1, blade, beyond)
-            margin = dr.minimum(margin, (1 - beyond) * dr.gather(be.Float, per_width, step))
+            inside = (1 - beyond) * dr.gather(be.Float, per_width, step)
+            margin = dr.minimum(margin, stretched(inside, dr.gather(be.Float, stretch, step)))
             return step + 1, dr.maximum(radius, beyond), margin
 
         first = (dr.gather(be.UInt32, t["start"], start.route), *self._hood_rim(start))
@@ -144,6 +148,7 @@ class _Detail:
     ramp: F64
     kind: NDArray[np.int64]
     width: F64
+    stretch: F64
     magnification: F64
 
 
@@ -268,7 +273,8 @@ class FlareModel:
         edge = np.minimum(level(blur_px / 1.5) + coarser, most)
         steady = np.hypot(self._sun, 0.5 * 2.0 ** edge[route] / px)
         width = np.clip(np.hypot(steady, self._fresnel), 1e-4, 0.5)
-        one_px = width[least] * self._px[least] * sharp
+        own_px = width[least] * self._px[least]
+        one_px = own_px * sharp
         ramp = np.maximum(_RAMP, _RAMP_PX * 2.0**coarser / one_px)
         return _Detail(
             level=edge,
@@ -281,6 +287,8 @@ class FlareModel:
             ramp=ramp,
             kind=edge_kind(steady[least], self._fresnel[least]),
             width=width,
+            # beyond the fringes, margins of all rims count the same distances on the sensor
+            stretch=np.clip(width * self._px / own_px[route], 1, _STRETCH),
             magnification=np.abs(t.matrix[:, 0, 0]) * sharp,
         )
 
@@ -353,7 +361,7 @@ class FlareModel:
                 if of_disc:
                     each, bundles, strength = self._over_disc(bundles, sun_deg)
                     drawn, side = drawn.of(each), np.full(len(bundles), _ACROSS_FOCUSED)
-                spots = made.trace(bundles, side, detail.width, halved=halved)
+                spots = made.trace(bundles, side, detail.width, halved=halved, stretch=detail.stretch)
                 sums.draw(spots, self._place(detail, bundles, drawn, strength), turn)
         return sums
 

@@ -41,6 +41,7 @@ _LOST, _FAR = -1e6, -1e4  # margin of rays that do not reach the sensor, and the
 _BEYOND_EDGE = -1.0  # margin at which a soft edge ends in the dark
 _LIMIT_SHARPNESS = 100.0  # sharpness of an edge where rays miss a surface or are totally reflected
 _LEAST_SLOPE = 1e-3  # smallest |dz| of a lost ray
+FRINGES_END = 7.0  # margin from which on the light of an edge is even; margins beyond may be stretched
 
 
 @dataclass(eq=False)
@@ -59,6 +60,8 @@ class Step:
         Index before the surface over the index behind it.
     per_rim, sharpness
         1 / (radius of the rim), and 1 / (width of its soft edge, as a fraction of the radius).
+    stretch
+        Factor on what of the margin exceeds `FRINGES_END`, less 1; see `stretched`.
     mirror, stop
         Whether the ray is reflected, and whether the surface is the stop.
     onward
@@ -74,6 +77,7 @@ class Step:
     eta: Any
     per_rim: Any
     sharpness: Any
+    stretch: Any
     mirror: Any
     onward: Any
     stop: Any
@@ -279,10 +283,21 @@ def _rims_after(
             beyond = dr.select(step.stop, blade * blade, beyond)
         out.append(dr.maximum(radius, dr.select(room < 0, 1e6, beyond)))
         if soft:
-            here = dr.minimum((1 - beyond) * (0.5 * step.sharpness), room * _LIMIT_SHARPNESS)
+            inside = stretched((1 - beyond) * (0.5 * step.sharpness), step.stretch)
+            here = dr.minimum(inside, room * _LIMIT_SHARPNESS)
             # keep the margin of the surface at which a ray was lost: later margins say nothing about this edge
             out.append(dr.select(margin[0] < _BEYOND_EDGE, margin[0], dr.minimum(margin[0], here)))
     return out
+
+
+def stretched(margin: Any, stretch: Any) -> Any:
+    """Return margins whose part beyond `FRINGES_END` is multiplied by 1 + `stretch`.
+
+    Widths of edges differ between the rims of a path. Without this, a ghost that passes far inside a rim with a wide
+    edge would seem to be near an edge everywhere.
+    """
+    dr = backend().dr
+    return dr.fma(dr.maximum(margin - FRINGES_END, 0), stretch, margin)
 
 
 def arrived(ray: Sequence[Any], last: Any, soft: bool) -> list[tuple[Any, Any]]:
