@@ -143,9 +143,8 @@ class Sums:
         folded = np.flatnonzero(folds).astype(np.uint32)
         if len(folded):
             number = lattice.cells(UInt32(folded)).points().numpy()
-            order = folded[_shared_out(number, np.flatnonzero(number))]
-            if len(order):
-                self._splat(lattice.cells(UInt32(order)))
+            order = folded[_shared_out(number, np.arange(len(folded)))]
+            self._splat(lattice.cells(UInt32(order)))
 
     def _fill(self, cells: _Cells) -> None:
         """Draw cells as pairs of triangles; add small cells to the pixels nearest to their middle."""
@@ -489,24 +488,29 @@ class _Cells:
     def pixels(self) -> tuple[Any, Any]:
         """Return approximately how many pixels a cell covers, and whether the cell is drawn by points instead.
 
-        The number is 0 for cells without light in the part that is drawn, and for those drawn by points.
+        The number is 0 for cells without light in the part that is drawn, and for those drawn by points. Of the
+        latter, only those with light that may reach the frame are returned.
         """
         dr, ends = backend().dr, self.ends()
-        number, folds = self.pixel_rows(ends)[2], ends[3] & self.valid
+        number, folds = self.pixel_rows(ends)[2], ends[3] & self._near_and_lit(ends[1])
         dr.eval(number, folds)
         return number, folds
 
     def points(self) -> Any:
-        """Return by how many points a cell is drawn; 0 without light in the part that is drawn."""
+        """Return by how many points a cell is drawn."""
         be = backend()
         dr = be.dr
         across, down = self.points_along()
-        _, factors, _, folds = self.ends()
+        number = be.UInt32(across * down)
+        dr.eval(number)
+        return number
+
+    def _near_and_lit(self, factors: list[Any]) -> Any:
+        """Return which cells, drawn by points, may reach the frame and have light in the part that is drawn."""
         far = _WANDER * (self.high[0] - self.low[0] + self.high[1] - self.low[1]) + 2
         near = (self.high[0] > -far) & (self.low[0] < self.width + far)
         near &= (self.high[1] > -far) & (self.low[1] < self.height + far)
-        lit = self.valid & folds & (_most(*factors) > 0) & (_most(*(c[3] for c in self.corners)) > EDGE_LOW)
-        return be.UInt32(dr.select(lit & near, across * down, 0))
+        return near & self.valid & (_most(*factors) > 0) & (_most(*(c[3] for c in self.corners)) > EDGE_LOW)
 
     def points_along(self) -> tuple[Any, Any]:
         """Return the numbers of points along both sides, at which points are no farther apart than pixels."""
