@@ -584,7 +584,7 @@ class _Cells:
         low, high = 1e9, -1e9
         for (px, py, *_), (qx, qy, *_) in itertools.pairwise((*self.corners, self.corners[0])):
             crossed = (dr.minimum(py, qy) <= y) & (dr.maximum(py, qy) >= y)
-            x = dr.fma((y - py) / dr.select(py == qy, 1, qy - py), qx - px, px)
+            x = dr.fma(y - py, (qx - px) / dr.select(py == qy, 1, qy - py), px)
             low, high = dr.minimum(low, dr.select(crossed, x, 1e9)), dr.maximum(high, dr.select(crossed, x, -1e9))
         start = dr.select(self.small, dr.floor(self.middle[0] - 0.5), dr.ceil(low - 0.501))
         last = dr.select(self.small, start + 1, dr.floor(high - 0.499))
