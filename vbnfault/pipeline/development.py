@@ -133,6 +133,12 @@ class Development:
                 self._signals[key] = signal
         return signal
 
+    def forget_steps(self, draws: Draws) -> None:
+        """Keep no signals but those of the images that will be taken: with all drawn faults, and of the twins."""
+        sets = [draws, *(without(draws, name) for name in self._twins if name in draws)]
+        keys = {(self._instrument(of), _acting_keys(of, acting_at(of, "electrons"))) for of in (*sets, {})}
+        self._signals = {key: signal for key, signal in self._signals.items() if key in keys}
+
     def _instrument(self, draws: Draws) -> Keys:
         """Return the keys of the faults that alter the camera, if its expected electrons differ for them."""
         if self.camera_with(draws).optics == self.exposure.camera.optics:

@@ -158,12 +158,14 @@ def _invisible(development: Development, draws: Draws, *, stored: bool) -> list[
         development.image(draws, noisy=False)  # all effects need it
         # without a fault that informs others, their light is computed anew, with both cores and much memory
         alone = [name for name in draws if informs(draws[name].fault)]
-        invisible = {name: is_invisible(name) for name in alone}
-        release_unused(_TWINS_BYTES)
         # numpy and OpenCV use one core for most steps of the others
-        others = [name for name in draws if name not in invisible]
+        others = [name for name in draws if name not in alone]
         with ThreadPoolExecutor(_THREADS) as pool:
-            invisible |= dict(zip(others, pool.map(is_invisible, others), strict=True))
+            invisible = dict(zip(others, pool.map(is_invisible, others), strict=True))
+        if alone:
+            development.forget_steps(draws)
+            release_unused(_TWINS_BYTES)
+            invisible |= {name: is_invisible(name) for name in alone}
         return [name for name in draws if invisible[name]]
     doubtful = sorted(_doubtful(development, draws))
     return [n for n in doubtful if not _shows_on_some_rows(development, draws, n) and is_invisible(n)]
