@@ -42,7 +42,7 @@ def inject_faults(
     A fault without a visible effect is drawn again a few times, then left out. So the result holds the faults that
     are in the image, and labels never claim more.
     """
-    release_unused()  # what imaging took
+    release_unused(_TWINS_BYTES)  # what imaging took
     commanded = list(spec.commanded if commanded is None else commanded)
     if not pose.resolved or pose.sun_visible_fraction == 0:
         commanded = [name for name in commanded if not spec.faults[name].needs_sun]

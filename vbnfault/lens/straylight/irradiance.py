@@ -34,7 +34,7 @@ F64 = NDArray[np.float64]
 
 MODELS = ("traced", "paraxial")
 _UNEVEN = 0.3  # uneven fraction of a ghost above which twice as many rays are traced
-_RAYS_AT_ONCE = 1 << 18  # of the wavelengths that are always traced, to bound memory
+_RAYS_AT_ONCE = 1 << 16  # of the wavelengths that are always traced, to bound memory
 _ACROSS_FOCUSED = 25  # rays across a ghost for each sample of the Sun's disc
 _SUBDIVISIONS = 8  # of the interval between two nodes, where colours separate
 _APART_PX = 2.0  # pixels of a ghost's level: colours farther apart than this need more wavelengths
