@@ -394,6 +394,31 @@ def test_four_reflections_add_little_light() -> None:
     assert 1.0 < four / two < 1.05
 
 
+def test_ghosts_far_inside_a_wide_edge_are_drawn_coarsely(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A rim whose edge is wide does not make all of a large ghost its edge, and the picture stays the same."""
+    lens = scaled_to_focal_length(load_lens("nikkor_28_f2p8_camera"), 4.42)
+    fill, drawn, pictures = Sums._fill, [], []
+
+    def counted(self: Sums, cells: Any) -> None:
+        drawn[-1] += int(cells.pixels()[0].numpy().sum())
+        fill(self, cells)
+
+    monkeypatch.setattr(Sums, "_fill", counted)
+    for most in (1.0, irradiance._STRETCH):
+        monkeypatch.setattr(irradiance, "_STRETCH", most)
+        sensor = SensorGrid(shape=(512, 512), pitch_mm=0.011)
+        made = FlareModel(lens, np.array([450.0, 600.0]), sensor, sun_radius_rad=1.55e-3)
+        drawn.append(0)
+        pictures.append(made.image(16.0, 30.0).astype(float))
+    assert drawn[1] < 0.5 * drawn[0]
+    before, after = pictures
+    # light far from edges is interpolated from pixels 8 times as wide, and is smooth there: single pixels differ by
+    # less than 1 %
+    assert np.abs(after - before).max() < 0.01 * before.max()
+    assert np.abs(after / np.maximum(before, 0.01 * before.mean()) - 1)[before > 0.01 * before.mean()].max() < 0.02
+    assert after.mean() == pytest.approx(before.mean(), rel=1e-3)
+
+
 def test_soft_edges() -> None:
     s = np.linspace(EDGE_LOW, EDGE_HIGH, _EDGE_NODES)
     profiles = edge_profiles()

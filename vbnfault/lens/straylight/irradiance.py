@@ -42,7 +42,8 @@ _FOCUSED = 0.35  # width of an edge in radii of its rim above which the disc is 
 _DISC_RINGS = 3
 _LARGE_PX = 150.0  # radius of a rim's image from which on the image is large
 _PLAIN = 0.03  # edges below this fraction of the summed irradiance are drawn one level coarser
-_RAMP, _RAMP_PX = FRINGES_END, 24.0  # distance from an edge, in its widths and at least in pixels, that is drawn finely
+# distance from an edge, in its widths and at least in pixels, that is drawn finely
+_RAMP, _RAMP_PX = FRINGES_END, 24.0
 _FRAME_PIXELS = 16  # smallest number of pixels of a level across the frame
 _SPREAD = 0.25, 256.0  # bounds of the size of rims' images relative to the paraxial size
 _SPREAD_SHARP = 4.0  # upper bound of the same in estimates of sharpness

@@ -293,8 +293,8 @@ def _rims_after(
 def stretched(margin: Any, stretch: Any) -> Any:
     """Return margins whose part beyond `FRINGES_END` is multiplied by 1 + `stretch`.
 
-    Widths of edges differ between the rims of a path. Without this, a ghost that passes far inside a rim with a wide
-    edge would seem to be near an edge everywhere.
+    Widths of edges differ between the rims of a path. Without this, a ghost that passes far inside a rim with a
+    wide edge would seem to be near an edge everywhere.
     """
     dr = backend().dr
     return dr.fma(dr.maximum(margin - FRINGES_END, 0), stretch, margin)
