@@ -404,18 +404,18 @@ def test_ghosts_far_inside_a_wide_edge_are_drawn_coarsely(monkeypatch: pytest.Mo
         fill(self, cells)
 
     monkeypatch.setattr(Sums, "_fill", counted)
-    for most in (1.0, irradiance._STRETCH):
-        monkeypatch.setattr(irradiance, "_STRETCH", most)
-        sensor = SensorGrid(shape=(512, 512), pitch_mm=0.011)
+    for widest in (1.0, irradiance._WIDEST):
+        monkeypatch.setattr(irradiance, "_WIDEST", widest)
+        sensor = SensorGrid(shape=(1024, 1024), pitch_mm=0.0055)
         made = FlareModel(lens, np.array([450.0, 600.0]), sensor, sun_radius_rad=1.55e-3)
         drawn.append(0)
-        pictures.append(made.image(16.0, 30.0).astype(float))
+        pictures.append(made.image(10.0, 30.0).astype(float))
     assert drawn[1] < 0.5 * drawn[0]
     before, after = pictures
-    # light far from edges is interpolated from pixels 8 times as wide, and is smooth there: single pixels differ by
-    # less than 1 %
-    assert np.abs(after - before).max() < 0.01 * before.max()
-    assert np.abs(after / np.maximum(before, 0.01 * before.mean()) - 1)[before > 0.01 * before.mean()].max() < 0.02
+    # Far from edges, light is interpolated from pixels 4 times as wide as before. Single pixels in dark corners differ
+    # by 0.4 %. With _WIDEST = 64 a sawtooth of the lattice of rays showed along the edges.
+    lit = before > 0.01 * before.mean()
+    assert np.abs(after[lit] / before[lit] - 1).max() < 0.005
     assert after.mean() == pytest.approx(before.mean(), rel=1e-3)
 
 

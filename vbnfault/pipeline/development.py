@@ -134,7 +134,10 @@ class Development:
         return signal
 
     def forget_steps(self, draws: Draws) -> None:
-        """Keep no signals but those of the images that will be taken: with all drawn faults, and of the twins."""
+        """Forget the signals with some of the drawn faults, which only the effects of faults need.
+
+        The signals of the clean image, of the image with all drawn faults, and of the twins are kept.
+        """
         sets = [draws, *(without(draws, name) for name in self._twins if name in draws)]
         keys = {(self._instrument(of), _acting_keys(of, acting_at(of, "electrons"))) for of in (*sets, {})}
         self._signals = {key: signal for key, signal in self._signals.items() if key in keys}

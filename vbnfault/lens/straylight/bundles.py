@@ -123,7 +123,8 @@ class TraceOptions(TypedDict, total=False):
     halved
         Whether to trace only one side of the plane of axis and Sun if all boxes are symmetric about this plane.
     stretch
-        float64[step], at least 1: factor on what of the margin exceeds `steps.FRINGES_END`. Default: 1.
+        float64[step], at least 0: fraction by which the part of the margin beyond `steps.FRINGES_END` is
+        lengthened at each step. Default: 0.
     """
 
     centred: bool
@@ -435,7 +436,7 @@ class Tracer:
         start = self._start(rays, side, centred, even)
         count, soft = dr.width(start.x), width is not None
         per_width = (np.zeros(len(self.rows)) if width is None else 1 / width).astype(np.float32)
-        stretch = np.asarray(options.get("stretch", np.ones(len(self.rows))) - 1, dtype=np.float32)
+        stretch = options.get("stretch", np.zeros(len(self.rows))).astype(np.float32)
         sides = 2 if even and self._bladed else 1
         none, unit = dr.zeros(be.Float, count), dr.full(be.Float, 1, count)
         outside, margin = self._hood_rim(start)

@@ -47,7 +47,9 @@ _RAMP, _RAMP_PX = FRINGES_END, 24.0
 _FRAME_PIXELS = 16  # smallest number of pixels of a level across the frame
 _SPREAD = 0.25, 256.0  # bounds of the size of rims' images relative to the paraxial size
 _SPREAD_SHARP = 4.0  # upper bound of the same in estimates of sharpness
-_STRETCH = 64.0  # upper bound of the ratio of edges' widths on the sensor
+# Upper bound of the width of an edge on the sensor, in widths of the edge that limits the ghost. With a larger one, a
+# ramp would lie within a cell, and the lattice of rays would show.
+_WIDEST = 3.0
 _LEAST = 1e-10  # irradiance over the Sun's below which a ghost is omitted
 _SPARE = 8  # ghosts traced beyond those wanted: a few rays may pass the lattice of the peaks alone
 
@@ -96,7 +98,7 @@ class ParaxialTracer(Tracer):
         side = np.broadcast_to(np.asarray(across, dtype=np.int64), len(rays))
         start = self._start(rays, side, options.get("centred", False), False)
         per_width = be.Float((np.zeros(len(self.rows)) if width is None else 1 / width).astype(np.float32))
-        stretch = be.Float(np.asarray(options.get("stretch", np.ones(len(self.rows))) - 1, dtype=np.float32))
+        stretch = be.Float(options.get("stretch", np.zeros(len(self.rows))).astype(np.float32))
         blades = self._blades
         x, y = start.x, start.y
         sx, sy = start.dx / start.dz, start.dy / start.dz
@@ -289,7 +291,7 @@ class FlareModel:
             kind=edge_kind(steady[least], self._fresnel[least]),
             width=width,
             # beyond the fringes, margins of all rims count the same distances on the sensor
-            stretch=np.clip(width * self._px / own_px[route], 1, _STRETCH),
+            stretch=np.clip(width * self._px / own_px[route], 1, _WIDEST) - 1,
             magnification=np.abs(t.matrix[:, 0, 0]) * sharp,
         )
 

@@ -488,8 +488,8 @@ class _Cells:
     def pixels(self) -> tuple[Any, Any]:
         """Return approximately how many pixels a cell covers, and whether the cell is drawn by points instead.
 
-        The number is 0 for cells without light in the part that is drawn, and for those drawn by points. Of the
-        latter, only those with light that may reach the frame are returned.
+        The number is 0 for cells without light in the part that is drawn, and for those drawn by points. Only cells
+        whose light may reach the frame are drawn by points.
         """
         dr, ends = backend().dr, self.ends()
         number, folds = self.pixel_rows(ends)[2], ends[3] & self._near_and_lit(ends[1])
@@ -497,7 +497,7 @@ class _Cells:
         return number, folds
 
     def points(self) -> Any:
-        """Return by how many points a cell is drawn."""
+        """Return the number of points that stand for each cell, for cells that are drawn by points."""
         be = backend()
         dr = be.dr
         across, down = self.points_along()
@@ -506,7 +506,7 @@ class _Cells:
         return number
 
     def _near_and_lit(self, factors: list[Any]) -> Any:
-        """Return which cells, drawn by points, may reach the frame and have light in the part that is drawn."""
+        """Return which cells have light in the drawn part that may reach the frame if it is drawn by points."""
         far = _WANDER * (self.high[0] - self.low[0] + self.high[1] - self.low[1]) + 2
         near = (self.high[0] > -far) & (self.low[0] < self.width + far)
         near &= (self.high[1] > -far) & (self.low[1] < self.height + far)

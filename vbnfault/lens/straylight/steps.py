@@ -41,7 +41,9 @@ _LOST, _FAR = -1e6, -1e4  # margin of rays that do not reach the sensor, and the
 _BEYOND_EDGE = -1.0  # margin at which a soft edge ends in the dark
 _LIMIT_SHARPNESS = 100.0  # sharpness of an edge where rays miss a surface or are totally reflected
 _LEAST_SLOPE = 1e-3  # smallest |dz| of a lost ray
-FRINGES_END = 7.0  # margin from which on the light of an edge is even; margins beyond may be stretched
+# Margin beyond which margins may be stretched. It exceeds `raster.EDGE_HIGH`, where the profile of an edge ends, so
+# that stretching does not change the profile between two rays.
+FRINGES_END = 7.0
 
 
 @dataclass(eq=False)
@@ -61,7 +63,7 @@ class Step:
     per_rim, sharpness
         1 / (radius of the rim), and 1 / (width of its soft edge, as a fraction of the radius).
     stretch
-        Factor on what of the margin exceeds `FRINGES_END`, less 1; see `stretched`.
+        By which fraction the part of the margin beyond `FRINGES_END` is lengthened.
     mirror, stop
         Whether the ray is reflected, and whether the surface is the stop.
     onward
@@ -291,10 +293,10 @@ def _rims_after(
 
 
 def stretched(margin: Any, stretch: Any) -> Any:
-    """Return margins whose part beyond `FRINGES_END` is multiplied by 1 + `stretch`.
+    """Return margins with the part beyond `FRINGES_END` lengthened by the fraction `stretch`.
 
-    Widths of edges differ between the rims of a path. Without this, a ghost that passes far inside a rim with a
-    wide edge would seem to be near an edge everywhere.
+    Margins count widths of edges, and these widths differ between the rims of a path. Without the stretch, all rays
+    of a ghost far inside a rim with a wide edge would count as near this edge.
     """
     dr = backend().dr
     return dr.fma(dr.maximum(margin - FRINGES_END, 0), stretch, margin)
