@@ -412,8 +412,8 @@ def test_ghosts_far_inside_a_wide_edge_are_drawn_coarsely(monkeypatch: pytest.Mo
         pictures.append(made.image(10.0, 30.0).astype(float))
     assert drawn[1] < 0.5 * drawn[0]
     before, after = pictures
-    # Far from edges, light is interpolated from pixels 4 times as wide as before. Single pixels in dark corners differ
-    # by 0.4 %. With _WIDEST = 64 a sawtooth of the lattice of rays showed along the edges.
+    # Far from edges, light is interpolated from pixels 4 times as wide as before. Single pixels in dark corners
+    # differ by 0.4 %. With _WIDEST = 64 the lattice of rays showed along the edges, as a sawtooth.
     lit = before > 0.01 * before.mean()
     assert np.abs(after[lit] / before[lit] - 1).max() < 0.005
     assert after.mean() == pytest.approx(before.mean(), rel=1e-3)

@@ -47,8 +47,8 @@ _RAMP, _RAMP_PX = FRINGES_END, 24.0
 _FRAME_PIXELS = 16  # smallest number of pixels of a level across the frame
 _SPREAD = 0.25, 256.0  # bounds of the size of rims' images relative to the paraxial size
 _SPREAD_SHARP = 4.0  # upper bound of the same in estimates of sharpness
-# Upper bound of the width of an edge on the sensor, in widths of the edge that limits the ghost. With a larger one, a
-# ramp would lie within a cell, and the lattice of rays would show.
+# Upper bound of the width of an edge on the sensor, in widths of the edge that limits the ghost. With a larger one,
+# a ramp would lie within a cell, and the lattice of rays would show.
 _WIDEST = 3.0
 _LEAST = 1e-10  # irradiance over the Sun's below which a ghost is omitted
 _SPARE = 8  # ghosts traced beyond those wanted: a few rays may pass the lattice of the peaks alone
