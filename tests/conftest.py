@@ -38,6 +38,10 @@ settings.register_profile(
     print_blob=True,
 )
 settings.load_profile("vbnfault")
+# Hypothesis would read the constants of all modules, in every process: ten seconds and more. It has no setting for
+# that; where a version lacks these names, the lines do nothing.
+if "hypothesis.internal.conjecture.providers" in sys.modules:
+    vars(sys.modules["hypothesis.internal.conjecture.providers"])["is_local_module_file"] = lambda _: False
 
 pytest.register_assert_rewrite("synthetic")
 
@@ -77,6 +81,10 @@ if "PYTEST_VERSION" in os.environ and "TMPDIR" not in os.environ and _has_room()
     os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(_MEMORY))  # the folders of tests that fail stay there
     _TEMPORARY = tempfile.TemporaryDirectory(prefix=f"vbnfault-tests-{os.getpid()}-", dir=_MEMORY)
     os.environ["TMPDIR"] = tempfile.tempdir = _TEMPORARY.name
+
+# The processes of xdist, and those that tests start, would compile the package again and again.
+if os.environ.pop("PYTHONDONTWRITEBYTECODE", None):
+    sys.dont_write_bytecode = False
 
 # Patches are cached for this run alone: the tests neither read nor fill the cache of the user. The processes of
 # xdist, and those that tests start, share the folder of the first process.

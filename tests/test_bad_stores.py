@@ -156,7 +156,7 @@ def test_root_attributes_of_the_wrong_type_are_one_sentence(
         "store": 7,
         "store.mask_kinds": 7,
         "store.wavelength_nm": "x",
-        "store.attitude_references": ["sun"],
+        "store.attitude_references": ["sun", "moon"],
         "store.centre_of_mass_T_m": [1.0, 2.0],
         "store.height": 0,
         "store.shard_samples": -1,

@@ -21,7 +21,7 @@ from vbnfault.lens.glass import (
     register,
 )
 from vbnfault.lens.prescription_file import write_lens
-from vbnfault.lens.zemax import _FORMULAS, read_catalogue
+from vbnfault.lens.zemax import _FORMULAS, read_catalogue, read_lens
 from vbnfault.scene import config
 from vbnfault.world import assemble
 
@@ -125,6 +125,13 @@ def written(folder: Path, text: str = TRIPLET, name: str = "lens.zmx") -> Path:
 
 
 # --- lens files -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("distance", "given"), [("INFINITY", False), ("1e10", False), ("500", True)])
+def test_a_near_object_is_named_in_the_source(tmp_path: Path, distance: str, given: bool) -> None:
+    text = TRIPLET.replace(OBJECT, OBJECT.replace("INFINITY", distance))
+    source = read_lens(written(tmp_path, text))[0]["source"]
+    assert source.endswith("object at 500 mm; camera.focus_distance_m is used instead") == given
 
 
 def test_the_unit_scales_every_length(tmp_path: Path) -> None:

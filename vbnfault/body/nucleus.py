@@ -92,8 +92,11 @@ def _lobe(points: Float64, lobe: tuple, cuts: tuple) -> Float64:
 
 def _smooth_min(a: NDArray, b: NDArray, width: float) -> NDArray:
     """Return the minimum, rounded where a and b differ by less than `width`."""
-    h = np.maximum(width - np.abs(a - b), 0.0) / width
-    return np.minimum(a, b) - h**3 * width / 6.0
+    least = np.minimum(a, b)
+    near = np.flatnonzero(np.abs(a - b) < width)
+    h = (width - np.abs(a[near] - b[near])) / width
+    least[near] -= h**3 * width / 6.0
+    return least
 
 
 def _smooth_step(low: float, high: float, x: NDArray) -> NDArray:

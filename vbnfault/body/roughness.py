@@ -7,7 +7,6 @@ points a distance L apart, with heights measured against the local shape. On a s
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -92,18 +91,10 @@ def _mean_square(points: Float64, normals: NDArray, tree: cKDTree, centre: int, 
     height, x, y = np.einsum("ni,ij->jn", offset, axes) / reach
     terms = np.column_stack([np.ones_like(x), x, y, x * x, x * y, y * y])
     height = reach * (height - np.einsum("nk,k->n", terms, np.linalg.lstsq(terms, height, rcond=None)[0]))
-    i, j = _pairs(len(near))
-    apart = reach * np.hypot(x[i] - x[j], y[i] - y[j])
-    chosen = (apart > baseline / _BIN) & (apart < baseline * _BIN)
-    return float(np.mean((height[i] - height[j])[chosen] ** 2)) if chosen.any() else None
-
-
-@lru_cache(maxsize=4)
-def _pairs(count: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the indices of all pairs of `count` points; nearly all windows have the same number of points."""
-    i, j = np.triu_indices(count, 1)
-    i.flags.writeable = j.flags.writeable = False
-    return i, j
+    shortest, longest = baseline / reach / _BIN, baseline / reach * _BIN
+    i, j = cKDTree(np.column_stack([x, y])).query_pairs(longest, output_type="ndarray").T
+    apart = (x[i] - x[j]) ** 2 + (y[i] - y[j]) ** 2 > shortest**2
+    return float(np.mean((height[i] - height[j])[apart] ** 2)) if apart.any() else None
 
 
 def mean_edge_m(vertices_m: NDArray, faces: NDArray) -> float:

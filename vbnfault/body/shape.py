@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
 from ..core import meshes, user_files
@@ -88,6 +87,8 @@ def load_shape(path: str | Path, unit: Unit = "auto") -> tuple[Float64, Int32]:
 
 def _read_with_trimesh(path: Path, data: bytes) -> tuple[Float64, NDArray[np.int64]]:
     """Read a PLY or STL file."""
+    import trimesh  # takes a third of a second to import: for shapes of files only
+
     logger = logging.getLogger("trimesh")
     level = logger.level
     logger.setLevel(logging.CRITICAL + 1)  # trimesh would log parser errors with their tracebacks
@@ -185,6 +186,8 @@ def _wound_outwards(vertices: Float64, faces: NDArray, source: str) -> tuple[NDA
     """Wind all faces outwards, and return also the list of repairs. Raises InputError if that is impossible."""
     repairs = []
     if not _consistent(faces):
+        import trimesh
+
         mesh = trimesh.Trimesh(vertices, faces, process=False)
         trimesh.repair.fix_winding(mesh)
         faces = np.array(mesh.faces, dtype=np.int64)

@@ -30,7 +30,8 @@ without stop and aperture only set distances and are left out.
 
 Records that change the light's path and are not read (COORDBRK and other surface types, mirrors, apertures that are
 not circular or not centred) are refused in a sentence. Fields, wavelengths, pick-ups, solves, tolerances, drawing
-and coatings are ignored: `camera.lens_coating` coats all surfaces.
+and coatings are ignored: `camera.lens_coating` coats all surfaces. So is the distance of the object, which `source`
+then gives; `camera.focus_distance_m` sets it.
 
 **Glass catalogues.** NM begins a glass: name, number of the dispersion formula, and more. CD has the coefficients,
 IT internal transmittances: wavelength in µm, fraction, thickness in mm. A line that begins with a number goes on
@@ -64,6 +65,7 @@ _REFUSED = {
     "USOB": "an obscuration of the user's shape",
     "OBDC": "an aperture off the axis",
 }
+_FAR_MM = 1e7  # distance of the object from which on it counts as infinite; some files write 1e10 for infinity
 _NOT_RECORDED = (1.5, 40.0)  # nd and vd that older files have for every glass of a catalogue
 
 _PARAMETERS = range(1, 9)  # of an EVENASPH: coefficients of r², r⁴, …
@@ -333,6 +335,9 @@ def read_lens(path: Path) -> tuple[dict[str, Any], tuple[GlassCatalogue, ...], t
         )
     catalogues = _beside(path, names)
     source = "; ".join(notes) or f"Zemax file {path.name}"
+    object_mm = surfaces[0].thickness * unit_mm
+    if math.isfinite(object_mm) and object_mm < _FAR_MM:
+        source += f"; the file has its object at {object_mm:g} mm; camera.focus_distance_m is used instead"
     rows, numbers = _rows(surfaces[1:-1], unit_mm, catalogues)
     return {"name": name, "source": source, "surface": rows}, catalogues, numbers
 

@@ -180,7 +180,6 @@ def _pyramid() -> Any:
 
 def _pebbles(rng: np.random.Generator) -> NDArray[np.float64]:
     """Return slopes float64[y, x, 2] of a periodic layer of pebbles of all sizes."""
-    row, column = np.indices((_SIDE, _SIDE))
     highest = np.zeros((_SIDE, _SIDE))
     for cell in _PEBBLE_CELLS:
         count = _SIDE // cell
@@ -188,13 +187,16 @@ def _pebbles(rng: np.random.Generator) -> NDArray[np.float64]:
         radius = cell * (0.15 + 0.25 * rng.random((count, count)) ** 2)
         tall = radius * (0.4 + 0.5 * rng.random((count, count))) * (rng.random((count, count)) < _PEBBLE_SHARE)
         turn, squeeze = rng.random((count, count)) * np.pi, 1 + 0.6 * rng.random((count, count))
-        for down in (-1, 0, 1):
-            for right in (-1, 0, 1):
-                j, i = row // cell + down, column // cell + right
-                wrapped = (j % count, i % count)
-                y, x = row - cell * (j + position[0][wrapped]), column - cell * (i + position[1][wrapped])
-                c, s = np.cos(turn[wrapped]), np.sin(turn[wrapped])
-                square = ((c * x + s * y) ** 2 + (squeeze[wrapped] * (c * y - s * x)) ** 2) / radius[wrapped] ** 2
-                highest = np.maximum(highest, tall[wrapped] * (1 - square**1.5))
+        of = np.nonzero(tall)
+        # rows and columns that the pebble of a cell may cover, and their distances from its middle
+        about = np.arange(-(cell // 2), cell + cell // 2)
+        row, column = (cell * k[:, None] + about for k in of)
+        y, x = (about - cell * p[of][:, None] for p in position)
+        y, x = y[:, :, None], x[:, None, :]
+        c, s, q, r = (a[of][:, None, None] for a in (np.cos(turn), np.sin(turn), squeeze, radius))
+        square = ((c * x + s * y) ** 2 + (q * (c * y - s * x)) ** 2) / r**2
+        n, j, i = np.nonzero(square < 1)
+        height = tall[of][n] * (1 - square[n, j, i] ** 1.5)
+        np.maximum.at(highest, (row[n, j] % _SIDE, column[n, i] % _SIDE), height)
     slopes = np.stack([0.5 * (np.roll(highest, -1, axis) - np.roll(highest, 1, axis)) for axis in (1, 0)], axis=-1)
     return np.asarray(np.clip(slopes, -_STEEPEST, _STEEPEST))

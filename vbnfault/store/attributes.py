@@ -44,6 +44,8 @@ _LENGTHS = {
     "centre_of_mass_T_m": (3,),
     "rendered_shape": (0, 2),
 }
+# Fields of `StoreSpec` whose texts are among these.
+_CHOICES = {"attitude_references": ("sun", "nadir", "centre")}
 # Fields of `StoreSpec` that count something, and the least that they may be.
 _LEAST = {"height": 1, "width": 1, "shard_samples": 0}
 # Fields of `StoreSpec` with one element for each class, or none.
@@ -119,6 +121,9 @@ def check_plain_spec(plain: Any, spec: type) -> None:
             raise InputError(f"store.{field.name} = {shown(value)}: must be {_in_words(kind)}")
         if field.name in _LEAST and value < _LEAST[field.name]:
             raise InputError(f"store.{field.name} = {shown(value)}: must be at least {_LEAST[field.name]}")
+        choices = _CHOICES.get(field.name)
+        if choices is not None and not {*value} <= {*choices}:
+            raise InputError(f"store.{field.name} = {shown(value)}: elements must be among {', '.join(choices)}")
         lengths = _LENGTHS.get(field.name)
         if field.name in _OF_CLASSES:
             lengths = 0, len(plain.get("faults", ()))

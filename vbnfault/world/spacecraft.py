@@ -11,10 +11,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -22,6 +21,9 @@ from ..core import meshes, user_files
 from ..core.errors import InputError
 from ..core.frames import rx, ry, rz
 from ..core.meshes import MeshPart
+
+if TYPE_CHECKING:
+    import trimesh  # takes a third of a second to import: for the parts of the default spacecraft only
 
 F64 = NDArray[np.float64]
 Unit = Literal["m", "cm", "mm"]
@@ -527,11 +529,15 @@ def _part(name: str, mesh: trimesh.Trimesh, material: str) -> Part:
 
 def _box(centre: tuple[float, ...], size: tuple[float, ...]) -> trimesh.Trimesh:
     """Return a box along the axes."""
+    import trimesh
+
     return trimesh.creation.box(size, trimesh.transformations.translation_matrix(centre))
 
 
 def _rod(start: tuple[float, ...], end: tuple[float, ...], radius: float, sections: int = 20) -> trimesh.Trimesh:
     """Return a cylinder between two points."""
+    import trimesh
+
     return trimesh.creation.cylinder(radius, segment=np.array([start, end]), sections=sections)
 
 
@@ -539,6 +545,8 @@ def _revolved(
     profile: list[tuple[float, float]], apex: tuple[float, ...], towards: tuple[float, ...]
 ) -> trimesh.Trimesh:
     """Return the surface of a profile (radius, height) turned about the axis from `apex` along `towards`."""
+    import trimesh
+
     mesh = trimesh.creation.revolve(np.array(profile), sections=32)
     mesh.apply_transform(trimesh.geometry.align_vectors((0, 0, 1), np.array(towards) / np.linalg.norm(towards)))
     return mesh.apply_translation(apex)
