@@ -5,8 +5,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import gc
-import importlib
 import os
+import pickle
 import signal
 import socket
 import subprocess
@@ -25,7 +25,7 @@ import study_kit
 import test_plugins
 from conftest import small_scene
 from dask import config as dask_config
-from synthetic import SAMPLES, Broken, Session, end_unless, fake_sample, make_spec, run, site_of
+from synthetic import SAMPLES, Broken, Session, fake_sample, make_spec, run, site_of
 
 from vbnfault import store as st
 from vbnfault.core import toml_files
@@ -77,7 +77,7 @@ class Disturbing:
         return fake_sample(make_spec(), index, site=int(site_of(index + 1)[-1]))
 
     def _worker_dies(self) -> None:
-        os.kill(os.getpid(), signal.SIGKILL)
+        end_watched_worker()
 
     _worker_dies_once = _worker_dies
 
@@ -111,19 +111,34 @@ class Disturbing:
 
 @dataclass(frozen=True)
 class Deadly:
-    """A factory that kills every other process that receives it, after the imports that a session needs.
-
-    Dask does not start a worker again that dies while it is still being started.
-    """
+    """A factory that kills every other process that receives it."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return end_after_imports, (os.getpid(),)
+        return end_elsewhere, (os.getpid(),)
 
 
-def end_after_imports(process: int) -> None:
-    """Import what a session needs, and kill this process unless it is `process`."""
-    importlib.import_module("vbnfault.dataset.from_scene")
-    end_unless(process)
+def end_elsewhere(process: int) -> None:
+    """Kill this worker unless its process is `process`."""
+    if os.getpid() != process:
+        end_watched_worker()
+
+
+def status_of(dask_worker: Any) -> str:
+    """Return the status of a worker or of the nanny that started it."""
+    return str(dask_worker.status.name)
+
+
+def end_watched_worker() -> None:
+    """Kill this worker once its nanny would start it again: a nanny that is still starting a worker gives it up."""
+    worker = distributed.get_worker()
+
+    def is_watched() -> bool:
+        asked = worker.rpc(worker.nanny).run(function=pickle.dumps(status_of))
+        answer = asyncio.run_coroutine_threadsafe(asked, worker.loop.asyncio_loop).result()
+        return bool(answer["result"] == "running")
+
+    wait_until(is_watched)
+    os.kill(os.getpid(), signal.SIGKILL)
 
 
 @pytest.fixture(scope="module")
@@ -354,7 +369,7 @@ class Dying(study_kit.Stopping):
     def evaluate(self, evaluation: Any) -> Any:
         if evaluation.index == 77 and not self.happened.exists():
             self.happened.touch()
-            os.kill(os.getpid(), signal.SIGKILL)
+            end_watched_worker()
         return super().evaluate(evaluation)
 
 
