@@ -123,9 +123,9 @@ def end_elsewhere(process: int) -> None:
         end_watched_worker()
 
 
-def status_of(dask_worker: Any) -> str:
-    """Return the status of a worker or of the nanny that started it."""
-    return str(dask_worker.status.name)
+def watches(dask_worker: Any) -> bool:
+    """Return whether a nanny has started its process, the first or a later one, and waits for its end."""
+    return all(its.status is distributed.Status.running for its in (dask_worker, dask_worker.process))
 
 
 def end_watched_worker() -> None:
@@ -133,9 +133,9 @@ def end_watched_worker() -> None:
     worker = distributed.get_worker()
 
     def is_watched() -> bool:
-        asked = worker.rpc(worker.nanny).run(function=pickle.dumps(status_of))
+        asked = worker.rpc(worker.nanny).run(function=pickle.dumps(watches))
         answer = asyncio.run_coroutine_threadsafe(asked, worker.loop.asyncio_loop).result()
-        return bool(answer["result"] == "running")
+        return bool(answer["result"])
 
     wait_until(is_watched)
     os.kill(os.getpid(), signal.SIGKILL)
@@ -146,8 +146,13 @@ def processes() -> Iterator[Any]:
     """Yield a cluster of two worker processes, which are started again when they die."""
     import dask.config
 
+    settings = {
+        "distributed.scheduler.allowed-failures": 0,
+        # a worker that is missed for 15 s would not come back, however busy the machine is
+        "distributed.deploy.lost-worker-timeout": "1 hour",
+    }
     with (
-        dask.config.set({"distributed.scheduler.allowed-failures": 0}),
+        dask.config.set(settings),
         distributed.LocalCluster(
             n_workers=2, threads_per_worker=1, processes=True, memory_limit=0, dashboard_address=None
         ) as cluster,
