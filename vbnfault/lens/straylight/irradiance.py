@@ -33,12 +33,17 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 MODELS = ("traced", "paraxial")
-_UNEVEN = 0.3  # uneven fraction of a ghost above which twice as many rays are traced
+# Uneven fraction of a ghost above which twice as many rays are traced across it; so they are for a ghost that is in
+# focus to first order and that aberrations spread.
+_UNEVEN = 0.3
 _RAYS_AT_ONCE = 1 << 16  # of the wavelengths that are always traced, to bound memory
 _ACROSS_FOCUSED = 25  # rays across a ghost for each sample of the Sun's disc
 _SUBDIVISIONS = 8  # of the interval between two nodes, where colours separate
 _APART_PX = 2.0  # pixels of a ghost's level: colours farther apart than this need more wavelengths
 _FOCUSED = 0.35  # width of an edge in radii of its rim above which the disc is sampled
+# The same relative to the true size of the image of the rim. Aberrations may spread a ghost that is in focus to
+# first order over a hundred times its paraxial size; the Sun's disc then only softens its edge.
+_FOCUSED_TRULY = 0.1
 _DISC_RINGS = 3
 _LARGE_PX = 150.0  # radius of a rim's image from which on the image is large
 _PLAIN = 0.03  # edges below this fraction of the summed irradiance are drawn one level coarser
@@ -143,8 +148,12 @@ def _at_node(rays: Rays, node: int) -> Rays:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Detail:
-    """Hold how finely each route is drawn: columns of `BundleDrawing` by route, and edge widths by step."""
+    """Hold how each route is drawn: whether from samples of the Sun's disc, how finely, and edge widths by step.
 
+    The levels and the other columns of `BundleDrawing` are by route.
+    """
+
+    sampled: NDArray[np.bool_]
     level: NDArray[np.int64]
     inner_level: NDArray[np.int64]
     rough_level: NDArray[np.int64]
@@ -247,8 +256,7 @@ class FlareModel:
         disc = np.abs(rim / a)
         bounds = zip(t.first_step[:-1], t.first_step[1:], strict=True)
         self._least = np.array([first + int(np.argmin(disc[first:last])) for first, last in bounds], dtype=np.int64)
-        self._sampled = self._sun[self._least] > _FOCUSED
-        self._sun[self._sampled[route]] = 0
+        self._focused = np.hypot(self._sun, self._fresnel)[self._least] > _FOCUSED
         self._detail = self._details(np.zeros(len(t.routes), dtype=np.int64), np.ones(len(t.routes)))
 
     def _details(self, coarser: NDArray[np.int64], spread: F64) -> _Detail:
@@ -262,10 +270,15 @@ class FlareModel:
         px = self._px * spread[route]
         # parts of an image are spread less than most of it; the sharpest part decides
         sharp = np.minimum(spread, _SPREAD_SHARP)
-        blur_px = np.hypot(self._sun[least], self._fresnel[least]) * self._px[least] * sharp
+        sampled = (self._sun[least] > _FOCUSED) & (self._sun[least] > _FOCUSED_TRULY * spread)
+        larger = np.where(self._focused, spread, 1.0)[route]
+        sun = np.where(sampled[route], 0.0, self._sun / larger)
+        fresnel = self._fresnel / np.sqrt(larger)  # the phase over the rim's plane curves in proportion
+        blur_px = np.hypot(sun[least], fresnel[least]) * self._px[least] * sharp
         # the disc's samples lie about a third of its radius apart
         sun_px = self.sun_radius_rad * np.abs(t.matrix[:, 0, 1]) / self.canvas.pitch_mm
-        blur_px = np.where(self._sampled, 0.3 * sun_px, blur_px)
+        spread_px = np.where(self._focused, np.maximum(2.0 * sun_px, blur_px), blur_px)
+        blur_px = np.where(sampled, 0.3 * sun_px, spread_px)
 
         def level(px_: F64) -> NDArray[np.int64]:
             """Return the coarsest level whose pixels are no larger than `px_` pixels."""
@@ -274,12 +287,13 @@ class FlareModel:
         # a ghost may change over a fraction of the frame, and coarser pixels would flatten it
         most = min(max(min(self.canvas.shape) // _FRAME_PIXELS, 1).bit_length() - 1, LEVELS - 1)
         edge = np.minimum(level(blur_px / 1.5) + coarser, most)
-        steady = np.hypot(self._sun, 0.5 * 2.0 ** edge[route] / px)
-        width = np.clip(np.hypot(steady, self._fresnel), 1e-4, 0.5)
+        steady = np.hypot(sun, 0.5 * 2.0 ** edge[route] / px)
+        width = np.clip(np.hypot(steady, fresnel), 1e-4, 0.5)
         own_px = width[least] * self._px[least]
         one_px = own_px * sharp
         ramp = np.maximum(_RAMP, _RAMP_PX * 2.0**coarser / one_px)
         return _Detail(
+            sampled=sampled,
             level=edge,
             # the inner part may have pixels as wide as a quarter of the ramp
             inner_level=np.clip(level(ramp * one_px / sharp / 4), edge, most),
@@ -288,7 +302,7 @@ class FlareModel:
                 np.minimum(np.maximum(level(1.3 * sun_px), px[least] > _LARGE_PX), edge) + coarser, most
             ),
             ramp=ramp,
-            kind=edge_kind(steady[least], self._fresnel[least]),
+            kind=edge_kind(steady[least], fresnel[least]),
             width=width,
             # beyond the fringes, margins of all rims count the same distances on the sensor
             stretch=np.clip(width * self._px / own_px[route], 1, _WIDEST) - 1,
@@ -296,10 +310,20 @@ class FlareModel:
         )
 
     def _spread(self, arrivals: Arrivals, route: NDArray[np.int64]) -> F64:
-        """Return the size of each route's image relative to its paraxial size, float64[route], within bounds."""
+        """Return the size of each route's image relative to its paraxial size, float64[route], within bounds.
+
+        It is that of the parts which are spread least; of a ghost in focus to first order, that of the whole image,
+        whose parts may be spread by factors that differ a hundredfold.
+        """
         out = np.ones(len(self._tracer.routes))
         first = np.abs(self._tracer.matrix[route, 0, 0])
-        out[route] = np.clip(arrivals.magnification / np.maximum(first, 1e-9), *_SPREAD)
+        whole = (arrivals.most_mm - arrivals.least_mm).max(axis=1) / 2 / self.canvas.pitch_mm
+        relative = np.where(
+            self._focused[route],
+            whole / np.maximum(self._px[self._least][route], 1e-9),
+            arrivals.magnification / np.maximum(first, 1e-9),
+        )
+        out[route] = np.clip(relative, *_SPREAD)
         return out
 
     def worn(self, coating_loss: float) -> FlareModel:
@@ -352,8 +376,9 @@ class FlareModel:
         detail = self._details(self._fainter(rays, arrivals), self._spread(arrivals, rays.route))
         sums = Sums(self.canvas)
         cosine = float(np.cos(np.radians(sun_deg)))
-        across = np.where(arrivals.uneven > _UNEVEN, 2 * self._across - 1, self._across)
-        sampled = self._sampled[rays.route]
+        sampled = detail.sampled[rays.route]
+        finely = (arrivals.uneven > _UNEVEN) | (self._focused[rays.route] & ~sampled)
+        across = np.where(finely, 2 * self._across - 1, self._across)
         for of_disc in (False, True):
             group = np.flatnonzero(sampled == of_disc)
             # one half of the lattices mirrors the other only if it does for all of them, in whatever part
