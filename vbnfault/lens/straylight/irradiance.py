@@ -33,8 +33,8 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 MODELS = ("traced", "paraxial")
-# Uneven fraction of a ghost above which twice as many rays are traced across it; so they are for a ghost that is in
-# focus to first order and that aberrations spread.
+# Uneven fraction of a ghost above which twice as many rays are traced across it. So they are across ghosts that are
+# in focus to first order and that aberrations spread.
 _UNEVEN = 0.3
 _RAYS_AT_ONCE = 1 << 16  # of the wavelengths that are always traced, to bound memory
 _ACROSS_FOCUSED = 25  # rays across a ghost for each sample of the Sun's disc
@@ -148,12 +148,14 @@ def _at_node(rays: Rays, node: int) -> Rays:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Detail:
-    """Hold how each route is drawn: whether from samples of the Sun's disc, how finely, and edge widths by step.
+    """Hold how each route is drawn: from samples of the Sun's disc or not, how finely, and edge widths by step.
 
-    The levels and the other columns of `BundleDrawing` are by route.
+    `spread_out` are routes in focus to first order, whose ghosts aberrations spread. All but the edge widths and
+    `stretch` are by route.
     """
 
     sampled: NDArray[np.bool_]
+    spread_out: NDArray[np.bool_]
     level: NDArray[np.int64]
     inner_level: NDArray[np.int64]
     rough_level: NDArray[np.int64]
@@ -270,15 +272,16 @@ class FlareModel:
         px = self._px * spread[route]
         # parts of an image are spread less than most of it; the sharpest part decides
         sharp = np.minimum(spread, _SPREAD_SHARP)
-        sampled = (self._sun[least] > _FOCUSED) & (self._sun[least] > _FOCUSED_TRULY * spread)
-        larger = np.where(self._focused, spread, 1.0)[route]
+        spread_out = self._focused & (spread > _SPREAD_SHARP)
+        sampled = (self._sun[least] > _FOCUSED) & ~(spread_out & (self._sun[least] < _FOCUSED_TRULY * spread))
+        larger = np.where(spread_out, spread, 1.0)[route]
         sun = np.where(sampled[route], 0.0, self._sun / larger)
         fresnel = self._fresnel / np.sqrt(larger)  # the phase over the rim's plane curves in proportion
         blur_px = np.hypot(sun[least], fresnel[least]) * self._px[least] * sharp
         # the disc's samples lie about a third of its radius apart
         sun_px = self.sun_radius_rad * np.abs(t.matrix[:, 0, 1]) / self.canvas.pitch_mm
-        spread_px = np.where(self._focused, np.maximum(2.0 * sun_px, blur_px), blur_px)
-        blur_px = np.where(sampled, 0.3 * sun_px, spread_px)
+        blur_px = np.where(spread_out, np.maximum(2.0 * sun_px, blur_px), blur_px)
+        blur_px = np.where(sampled, 0.3 * sun_px, blur_px)
 
         def level(px_: F64) -> NDArray[np.int64]:
             """Return the coarsest level whose pixels are no larger than `px_` pixels."""
@@ -294,6 +297,7 @@ class FlareModel:
         ramp = np.maximum(_RAMP, _RAMP_PX * 2.0**coarser / one_px)
         return _Detail(
             sampled=sampled,
+            spread_out=spread_out & ~sampled,
             level=edge,
             # the inner part may have pixels as wide as a quarter of the ramp
             inner_level=np.clip(level(ramp * one_px / sharp / 4), edge, most),
@@ -377,7 +381,7 @@ class FlareModel:
         sums = Sums(self.canvas)
         cosine = float(np.cos(np.radians(sun_deg)))
         sampled = detail.sampled[rays.route]
-        finely = (arrivals.uneven > _UNEVEN) | (self._focused[rays.route] & ~sampled)
+        finely = (arrivals.uneven > _UNEVEN) | detail.spread_out[rays.route]
         across = np.where(finely, 2 * self._across - 1, self._across)
         for of_disc in (False, True):
             group = np.flatnonzero(sampled == of_disc)
