@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+import subprocess
 import sys
 import tracemalloc
 from pathlib import Path
@@ -132,3 +133,39 @@ def test_memory_is_released_in_time(monkeypatch: pytest.MonkeyPatch) -> None:
         frees("_flush", 0)
         memory.release_unused(coming)
         assert released == want, (before, coming)
+
+
+ARENAS = """
+import ctypes, sys, threading
+from vbnfault.core import memory
+if sys.argv[1] == "shared":
+    memory.share_arenas()
+libc = ctypes.CDLL(None)
+libc.malloc.restype = ctypes.c_void_p
+all_run = threading.Barrier(8)
+
+def allocate():
+    libc.malloc(1000)
+    all_run.wait()
+
+threads = [threading.Thread(target=allocate) for _ in range(8)]
+for thread in threads: thread.start()
+for thread in threads: thread.join()
+libc.malloc_info(0, ctypes.c_void_p.in_dll(libc, "stdout"))
+libc.fflush(None)
+"""
+
+
+@pytest.mark.skipif(memory._malloc_trim() is None, reason="needs the GNU C library")
+def test_threads_share_two_arenas() -> None:
+    """Eight threads at once would otherwise have one each; a number that the user sets is kept."""
+
+    def arenas(how: str, **variables: str) -> int:
+        environment = {k: v for k, v in os.environ.items() if k != "MALLOC_ARENA_MAX"} | variables
+        command = [sys.executable, "-c", ARENAS, how]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+        return done.stdout.count("<heap nr=")
+
+    assert arenas("shared") == 2
+    assert arenas("not shared") > 2
+    assert arenas("shared", MALLOC_ARENA_MAX="3") == 3

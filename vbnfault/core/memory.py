@@ -18,6 +18,7 @@ from . import buffers
 # Resident memory in bytes that a process reaches before it releases any. To take memory back from the system costs
 # a tenth of a sample's time where every stage does it, so memory is released only where a step would pass this.
 _MOST = 1260 << 20
+_M_ARENA_MAX, _ARENAS = -8, 2  # option of `mallopt` in the GNU C library, and its value
 
 
 def release_unused(coming_bytes: int = 0, *, always: bool = False) -> None:
@@ -36,6 +37,16 @@ def release_unused(coming_bytes: int = 0, *, always: bool = False) -> None:
         if not always and _resident_bytes() + coming_bytes < _MOST:
             return
         release()
+
+
+def share_arenas() -> None:
+    """Let all threads allocate from two arenas of the GNU C library, unless the user has set their number.
+
+    By default, it gives up to eight per core. Each keeps what its threads have freed, and trimming finds little of
+    it: together they held 100 MB of a process that renders with two threads. Call this before threads start.
+    """
+    if "MALLOC_ARENA_MAX" not in os.environ and _malloc_trim() is not None:
+        ctypes.CDLL(None).mallopt(_M_ARENA_MAX, _ARENAS)
 
 
 def _forget() -> None:

@@ -16,7 +16,7 @@ from ..body.refine import GROWTH_POWER
 from ..camera import Camera
 from ..core import activity, tables
 from ..core.errors import InputError, in_file, shown, under_key
-from ..core.memory import release_unused
+from ..core.memory import release_unused, share_arenas
 from ..core.quantities import SOFT_KINDS, Sample
 from ..faults import Fault, dataset_order, from_dict, load_plugins, plugins_of
 from ..scene import config, plan
@@ -180,6 +180,7 @@ class Session:
         source: str = "scene",
         poses: object = None,
     ) -> None:
+        share_arenas()  # before terrain and renderer start their threads
         self.trajectory: Trajectory | None = None
         if poses is not None:
             self.trajectory = as_trajectory(poses)
