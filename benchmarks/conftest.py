@@ -37,3 +37,9 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: p
             f"vbnfault, {config.getoption('--size')} px, medians of {config.getoption('--rounds')}"
         )
         terminalreporter.write_line(table(seconds))
+
+
+@pytest.fixture
+def rounds(request: pytest.FixtureRequest) -> int:
+    """Return the number of timed rounds."""
+    return request.config.getoption("--rounds")

@@ -31,12 +31,6 @@ def workload(request: pytest.FixtureRequest) -> Workload:
     return Workload.load(request.config.getoption("--size"), facet_m=request.config.getoption("--facet-m"))
 
 
-@pytest.fixture
-def rounds(request: pytest.FixtureRequest) -> int:
-    """Return the number of timed rounds."""
-    return request.config.getoption("--rounds")
-
-
 def test_labelled_sample(
     benchmark: Any, workload: Workload, results: dict[str, float], rounds: int, tmp_path: Path
 ) -> None:

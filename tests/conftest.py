@@ -38,8 +38,8 @@ settings.register_profile(
     print_blob=True,
 )
 settings.load_profile("vbnfault")
-# Hypothesis would read the constants of all modules, in every process: ten seconds and more. It has no setting for
-# that; where a version lacks these names, the lines do nothing.
+# Hypothesis would parse all modules for constants, in every process, which costs more than most test files do. It
+# has no setting for that; where a version lacks these names, the lines do nothing.
 if "hypothesis.internal.conjecture.providers" in sys.modules:
     vars(sys.modules["hypothesis.internal.conjecture.providers"])["is_local_module_file"] = lambda _: False
 

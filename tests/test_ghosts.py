@@ -376,11 +376,12 @@ def test_a_ghost_that_aberrations_spread_is_drawn_as_its_rays_fall(
     picture = made.image(sun_deg, 0.0, only=ghost)[0].astype(float) * sensor.pitch_mm**2
     assert sum(traced_) == 1  # not one for each sample of the disc
     y, x = (np.indices(picture.shape) + 0.5 - side / 2) * sensor.pitch_mm
-    # 6 %: the edge, where the light of this ghost gathers, is softened by up to 1.5 pixels of the ghost's level
+    # 4 %: along the rim, 73 rays across lose half a cell, 1/72 of the radius or 2.8 % of the light; and the circles
+    # cut pixels of up to 4 pixels of the frame
     for radius_mm in (0.3, 0.6, 1.0, 2.0, 4.0):
         within = np.hypot(x - middle[0], y - middle[1]) < radius_mm
         expected = light[seen & (from_middle < radius_mm)].sum()
-        assert picture[within].sum() == pytest.approx(expected, abs=0.06 * light[seen].sum())
+        assert picture[within].sum() == pytest.approx(expected, abs=0.04 * light[seen].sum())
 
 
 def test_threads_do_not_change_a_bit() -> None:

@@ -16,6 +16,7 @@ from conftest import small_scene
 from vbnfault.core import memory
 from vbnfault.core.llvm import backend
 from vbnfault.pipeline import Session
+from vbnfault.pipeline import session as pipeline_session
 from vbnfault.pipeline.development import acting_at, without
 from vbnfault.pipeline.injection import inject_faults
 from vbnfault.pipeline.record import to_sample
@@ -169,3 +170,12 @@ def test_threads_share_two_arenas() -> None:
     assert arenas("shared") == 2
     assert arenas("not shared") > 2
     assert arenas("shared", MALLOC_ARENA_MAX="3") == 3
+
+
+def test_a_session_shares_arenas_before_anything_else(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Later, the threads of its terrain would each have one."""
+    done: list[str] = []
+    monkeypatch.setattr(pipeline_session, "share_arenas", lambda: done.append("arenas"))
+    monkeypatch.setattr(pipeline_session, "as_trajectory", lambda _: done.append("trajectory"))
+    Session(config.parse_scene(small_scene(), source="test"), poses=())
+    assert done == ["arenas", "trajectory"]

@@ -1,4 +1,4 @@
-"""Return memory that is no longer used to the operating system.
+"""Return memory that is no longer used to the operating system, and let threads share what they allocate from.
 
 drjit and the C library keep freed memory for later use. Over the stages of a sample the kept parts add up to
 several hundred MB, because each stage needs arrays of other sizes. To release them takes some milliseconds.

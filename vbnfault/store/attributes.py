@@ -44,7 +44,7 @@ _LENGTHS = {
     "centre_of_mass_T_m": (3,),
     "rendered_shape": (0, 2),
 }
-# Fields of `StoreSpec` whose texts are among these.
+# The texts in these fields of `StoreSpec` must be among those listed.
 _CHOICES = {"attitude_references": ("sun", "nadir", "centre")}
 # Fields of `StoreSpec` that count something, and the least that they may be.
 _LEAST = {"height": 1, "width": 1, "shard_samples": 0}

@@ -33,16 +33,16 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 MODELS = ("traced", "paraxial")
-# Uneven fraction of a ghost above which twice as many rays are traced across it. So they are across ghosts that are
-# in focus to first order and that aberrations spread.
+# Twice as many rays are traced across a ghost whose uneven fraction is larger, and across one that aberrations
+# spread (`_Detail.spread_out`).
 _UNEVEN = 0.3
 _RAYS_AT_ONCE = 1 << 16  # of the wavelengths that are always traced, to bound memory
 _ACROSS_FOCUSED = 25  # rays across a ghost for each sample of the Sun's disc
 _SUBDIVISIONS = 8  # of the interval between two nodes, where colours separate
 _APART_PX = 2.0  # pixels of a ghost's level: colours farther apart than this need more wavelengths
 _FOCUSED = 0.35  # width of an edge in radii of its rim above which the disc is sampled
-# The same relative to the true size of the image of the rim. Aberrations may spread a ghost that is in focus to
-# first order over a hundred times its paraxial size; the Sun's disc then only softens its edge.
+# Aberrations may spread a ghost that is in focus to first order over a hundred times its paraxial size. Where the
+# Sun's width is less than this fraction of the true radius, it only softens the edge, and the disc is not sampled.
 _FOCUSED_TRULY = 0.1
 _DISC_RINGS = 3
 _LARGE_PX = 150.0  # radius of a rim's image from which on the image is large
@@ -150,7 +150,7 @@ def _at_node(rays: Rays, node: int) -> Rays:
 class _Detail:
     """Hold how each route is drawn: from samples of the Sun's disc or not, how finely, and edge widths by step.
 
-    `spread_out` are routes in focus to first order, whose ghosts aberrations spread. All but the edge widths and
+    `spread_out` marks routes in focus to first order whose ghosts aberrations spread. All fields but `width` and
     `stretch` are by route.
     """
 
@@ -272,13 +272,14 @@ class FlareModel:
         px = self._px * spread[route]
         # parts of an image are spread less than most of it; the sharpest part decides
         sharp = np.minimum(spread, _SPREAD_SHARP)
-        spread_out = self._focused & (spread > _SPREAD_SHARP)
-        sampled = (self._sun[least] > _FOCUSED) & ~(spread_out & (self._sun[least] < _FOCUSED_TRULY * spread))
+        spread_out = self._focused & (spread > np.maximum(self._sun[least] / _FOCUSED_TRULY, _SPREAD_SHARP))
+        sampled = (self._sun[least] > _FOCUSED) & ~spread_out
         larger = np.where(spread_out, spread, 1.0)[route]
         sun = np.where(sampled[route], 0.0, self._sun / larger)
         fresnel = self._fresnel / np.sqrt(larger)  # the phase over the rim's plane curves in proportion
         blur_px = np.hypot(sun[least], fresnel[least]) * self._px[least] * sharp
-        # the disc's samples lie about a third of its radius apart
+        # The disc's samples lie about a third of its radius apart. Of a ghost that is spread, the disc blurs every
+        # part over its diameter.
         sun_px = self.sun_radius_rad * np.abs(t.matrix[:, 0, 1]) / self.canvas.pitch_mm
         blur_px = np.where(spread_out, np.maximum(2.0 * sun_px, blur_px), blur_px)
         blur_px = np.where(sampled, 0.3 * sun_px, blur_px)
@@ -297,7 +298,7 @@ class FlareModel:
         ramp = np.maximum(_RAMP, _RAMP_PX * 2.0**coarser / one_px)
         return _Detail(
             sampled=sampled,
-            spread_out=spread_out & ~sampled,
+            spread_out=spread_out,
             level=edge,
             # the inner part may have pixels as wide as a quarter of the ramp
             inner_level=np.clip(level(ramp * one_px / sharp / 4), edge, most),
