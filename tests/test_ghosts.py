@@ -492,38 +492,38 @@ def test_a_sun_that_cannot_be() -> None:
 
 
 @pytest.mark.parametrize("kind", ["traced", "paraxial"])
-def test_the_brightest_ghosts_are_listed_without_the_work_for_the_others(
-    kind: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Those with the highest peaks are the same with all ghosts traced and with few, to the last digit."""
+def test_the_brightest_ghosts_are_listed(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are those of the list of all ghosts, to the last digit, and each wavelength is traced once."""
     made = model(load_lens("nikkor_28_f2p8"), wavelength_nm=np.array([450.0, 550.0, 650.0]), model=kind)
-    bundles: list[int] = []
-    together = ghosts._traced_together
+    lattices: list[int] = []
+    kept = ghosts.peaks
 
-    def counted(tracer: Tracer, rays: Rays, *more: Any) -> Any:
-        bundles.append(len(rays))
-        return together(tracer, rays, *more)
+    def counted(spots: Spots, *more: Any) -> Any:
+        lattices.append(int(spots.across[0]))
+        return kept(spots, *more)
 
-    monkeypatch.setattr(ghosts, "_traced_together", counted)
+    monkeypatch.setattr(ghosts, "peaks", counted)
     for worn in (0.0, 0.3):
         lens = made.worn(worn)
-        every = sorted(lens.ghosts(11.0, 20.0), key=lambda g: -g.peak_irradiance_fraction)
+        every = lens.ghosts(11.0, 20.0)
         assert len(every) > 30
-        bundles.clear()
-        few = sorted(lens.ghosts(11.0, 20.0, most=6), key=lambda g: -g.peak_irradiance_fraction)
-        assert few[:6] == every[:6]
-        assert bundles == [6 + irradiance._SPARE] * 3
-        assert lens.ghosts(11.0, 20.0, most=1000) == lens.ghosts(11.0, 20.0)
+        assert [ghost.pair for ghost in every] == sorted(ghost.pair for ghost in every)
+        lattices.clear()
+        few = lens.ghosts(11.0, 20.0, most=6)
+        assert lattices == [48] * 3
+        highest = sorted(every, key=lambda g: -g.peak_irradiance_fraction)[:6]
+        assert few == tuple(sorted(highest, key=lambda g: g.pair))
+        assert lens.ghosts(11.0, 20.0, most=1000) == every
 
 
 def test_the_peak_of_a_ghost_is_that_of_its_densest_cell() -> None:
     """Light over area of the cells whose corners pass all rims, from the traced rays, bundle by bundle."""
     made = model(load_lens("nikkor_28_f2p8"), wavelength_nm=np.array([550.0]))
     tracer, rays, _ = made._boxes(11.0, 0.0)
-    found = ghosts.peaks(tracer, rays, 11.0)
-    assert len(np.unique(found)) > 30
-    side = ghosts._PEAK
+    side = 48
     spots = tracer.trace(rays, side, centred=True)
+    found = ghosts.peaks(spots, side, 11.0)
+    assert len(np.unique(found)) > 30
     x, y, fraction, radius = (
         v.numpy().reshape(-1, side, side) for v in (spots.x_mm, spots.y_mm, spots.fraction, spots.radius)
     )
@@ -537,4 +537,5 @@ def test_the_peak_of_a_ghost_is_that_of_its_densest_cell() -> None:
         # 1e-5: the area is a difference of products in single precision, which may be fused on the device
         assert found[k] == pytest.approx(densest * cell, rel=1e-5)
         if k < 5:
-            assert ghosts.peaks(tracer, rays.take(np.array([k])), 11.0)[0] == found[k]
+            alone = tracer.trace(rays.take(np.array([k])), side, centred=True)
+            assert ghosts.peaks(alone, side, 11.0)[0] == found[k]

@@ -32,6 +32,7 @@ from .dark import (
     rate_e_s,
     silicon_factor,
 )
+from .noise import normal_field
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -404,7 +405,7 @@ def _pattern(
     stays their standard deviation.
     """
     if pixel > 0:
-        out = stream(seed, name).standard_normal(shape, dtype=np.float32)
+        out = normal_field(shape, stream(seed, name))
         out *= np.float32(pixel)
         if freedom is not None:
             # t = normal / √(χ² / ν), of variance ν / (ν - 2); χ² is twice a gamma variate of shape ν/2

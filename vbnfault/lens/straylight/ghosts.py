@@ -29,7 +29,7 @@ _COARSE = 25  # rays across a box, to locate boxes
 FINE = 768  # rays across a box, to compute flux and position
 FINE_OF_FOUR = 192
 _STEEP = 0.3  # rise of the relative radius over a cell, above which neighbouring rays ended at different rims
-_PEAK = 64  # rays across a box, to locate the peak
+PEAK = 64  # rays across a box, to locate the peak
 _TOGETHER = 1 << 22  # rays traced at a time, to limit memory
 _SHARP = 1e-3  # default width of soft edges while boxes are located
 _LEAST_SPREAD = 0.25  # fraction of a ghost's image that is magnified less than `Arrivals.magnification`
@@ -344,20 +344,20 @@ def named(made: Tracer, rays: Rays, names: Collection[tuple[int, ...]]) -> NDArr
 
 
 def traced(
-    made: Tracer, rays: Rays, sun_deg: float, turn_rad: float, across: int, peak: F64 | None = None
+    made: Tracer, rays: Rays, sun_deg: float, turn_rad: float, across: int, peak_across: int = PEAK
 ) -> tuple[Ghost, ...]:
     """Return flux, centroid and spread on the sensor plane of each ghost's ray bundle, `across` rays wide.
 
-    `peak` is the result of `peaks` for these bundles, if it is known.
+    The peak is that of `peaks` with `peak_across` rays; the rays are traced once if both numbers are the same.
     """
     pupil = np.pi / 4 * paraxial_properties(made.lens).entrance_pupil_diameter_mm ** 2
     out = []
     together = max(1, _TOGETHER // across**2)
     for first in range(0, len(rays), together):
-        within = np.arange(first, min(first + together, len(rays)))
-        part = rays.take(within)
-        own = peaks(made, part, sun_deg) if peak is None else peak[within]
-        out += _traced_together(made, part, across, turn_rad, pupil, own)
+        part = rays.take(np.arange(first, min(first + together, len(rays))))
+        spots = made.trace(part, across, centred=True)
+        coarse = spots if peak_across == across else made.trace(part, peak_across, centred=True)
+        out += _described(made, spots, across, turn_rad, pupil, peaks(coarse, peak_across, sun_deg))
     return tuple(sorted(out, key=lambda g: g.pair))
 
 
@@ -379,13 +379,12 @@ def lit_cells(spots: Spots, across: int) -> Any:
     return spots.fraction * _inside(spots.radius, across)
 
 
-def _traced_together(
-    made: Tracer, rays: Rays, across: int, turn: float, pupil_mm2: float, peak: F64
+def _described(
+    made: Tracer, spots: Spots, across: int, turn: float, pupil_mm2: float, peak: F64
 ) -> list[Ghost]:
-    """Return the ghosts of bundles that are traced together."""
-    be = backend()
+    """Return the ghosts of bundles that were traced together."""
+    be, rays = backend(), spots.rays
     dr, Float64 = be.dr, be.Float64
-    spots = made.trace(rays, across, centred=True)
     weight = Float64(lit_cells(spots, across))
     x, y = Float64(spots.x_mm), Float64(spots.y_mm)
     parts = (weight, weight * x, weight * y, weight * (x * x + y * y))
@@ -425,18 +424,18 @@ def _inside(radius: Any, across: int) -> Any:
     return dr.select(rise < _STEEP, part, dr.select(radius <= 1, 1.0, 0.0))
 
 
-def peaks(made: Tracer, rays: Rays, sun_deg: float) -> F64:
+def peaks(spots: Spots, across: int, sun_deg: float) -> F64:
     """Return each ghost's largest irradiance over that of the Sun, float64[bundle].
 
-    It is taken over the cells of a lattice. A ghost of only a few rays has no whole cell, and its peak is 0.
+    It is taken over the cells of centred lattices, `across` rays wide. A ghost of only a few rays has no whole cell,
+    and its peak is 0.
     """
-    be = backend()
+    be, rays = backend(), spots.rays
     dr = be.dr
-    spots = made.trace(rays, _PEAK, centred=True)
-    here = dr.arange(be.UInt32, len(rays) * _PEAK**2)
-    column, row = here % _PEAK, here // _PEAK % _PEAK
+    here = dr.arange(be.UInt32, len(rays) * across**2)
+    column, row = here % across, here // across % across
     inner = (column > 0) & (row > 0)
-    left, below = (dr.select(inner, here - step, here) for step in (1, _PEAK))
+    left, below = (dr.select(inner, here - step, here) for step in (1, across))
 
     def at(values: Any, index: Any) -> Any:
         return dr.gather(be.Float, values, index)
@@ -447,8 +446,8 @@ def peaks(made: Tracer, rays: Rays, sun_deg: float) -> F64:
     ux, uy, vx, vy = (v - at(v, index) for index in (left, below) for v in (x, y))
     area = dr.abs(ux * vy - uy * vx)
     density = dr.select(whole & (area > 0), spots.fraction / area, 0)
-    highest = dr.block_reduce(dr.ReduceOp.Max, density, _PEAK**2).numpy()
-    cell = 4 * rays.box_mm[:, 2] * rays.box_mm[:, 3] / _PEAK**2
+    highest = dr.block_reduce(dr.ReduceOp.Max, density, across**2).numpy()
+    cell = 4 * rays.box_mm[:, 2] * rays.box_mm[:, 3] / across**2
     return np.asarray(highest * cell * np.cos(np.radians(sun_deg)), dtype=np.float64)
 
 

@@ -22,7 +22,7 @@ from ...core.llvm import backend
 from ...core.memory import release_unused
 from ..prescription import Prescription
 from .bundles import Rays, Spots, TraceOptions, Tracer, name_of
-from .ghosts import Arrivals, boxes, fluxes_mm2, named, peaks, traced
+from .ghosts import Arrivals, boxes, fluxes_mm2, named, traced
 from .paraxial import Ghost, along, mean_ghost
 from .pyramid import LEVELS, Canvas, Pyramid
 from .raster import PARTS, BundleDrawing, Sums, edge_kind
@@ -56,7 +56,6 @@ _SPREAD_SHARP = 4.0  # upper bound of the same in estimates of sharpness
 # a ramp would lie within a cell, and the lattice of rays would show.
 _WIDEST = 3.0
 _LEAST = 1e-10  # irradiance over the Sun's below which a ghost is omitted
-_SPARE = 8  # ghosts traced beyond those wanted: a few rays may pass the lattice of the peaks alone
 
 
 class ParaxialTracer(Tracer):
@@ -432,24 +431,21 @@ class FlareModel:
     ) -> tuple[Ghost, ...]:
         """Return the ghosts of a point Sun that reach the frame, each the mean of all bands.
 
-        With `most`, those with the highest peaks are among the result, as many as it says; flux and position of
-        most other ghosts are then not computed.
+        The peak is the largest of the cells between `across` rays along each side. With `most`, only so many ghosts
+        with the highest peaks are returned.
         """
         turn = float(np.radians(azimuth_deg))
         made, rays, arrivals = self._boxes(sun_deg, turn)
         rays = rays.take(self._in_frame(arrivals) & (arrivals.peak > _LEAST))
         if not len(rays):
             return ()
-        nodes = range(0, len(self._fine), _SUBDIVISIONS)
-        peak = np.stack([peaks(made, _at_node(rays, node), sun_deg) for node in nodes])
-        if most is not None and most + _SPARE < len(rays):
-            highest = np.sort(np.argsort(-peak.sum(axis=0), kind="stable")[: most + _SPARE])
-            rays, peak = rays.take(highest), peak[:, highest]
         by_name: dict[tuple[int, ...], list[tuple[float, Ghost]]] = {}
-        for node, own in zip(nodes, peak, strict=True):
-            for ghost in traced(made, _at_node(rays, node), sun_deg, turn, across, own):
+        for node in range(0, len(self._fine), _SUBDIVISIONS):
+            for ghost in traced(made, _at_node(rays, node), sun_deg, turn, across, across):
                 by_name.setdefault(ghost.pair, []).append((1 / len(self.nodes_nm), ghost))
-        return tuple(mean_ghost(ghosts) for _, ghosts in sorted(by_name.items()))
+        peak = {name: sum(part * g.peak_irradiance_fraction for part, g in of) for name, of in by_name.items()}
+        highest = sorted(sorted(by_name), key=lambda name: -peak[name])[:most]
+        return tuple(mean_ghost(by_name[name]) for name in sorted(highest))
 
     def _fainter(self, rays: Rays, arrivals: Arrivals) -> NDArray[np.int64]:
         """Return the levels to add where edges are too faint to show in the sum of all ghosts, by route."""
