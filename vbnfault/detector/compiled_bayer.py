@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..core import buffers
 from ..core.llvm import backend
 from .demosaic import HARD_NOISE, HARD_RATIO, LEAST_PX, Mask, Method, colour_sites
-from .display import Display, luminance
+from .display import LUMINANCE_WEIGHTS, Display
 from .mosaic import Pattern
 
 Raw = NDArray[np.uint16]
@@ -62,8 +62,7 @@ def image(mosaic: Raw, pattern: Pattern, saturated: Raw, display: Display) -> U8
     whole: U8 = buffers.empty((2 * down, 2 * across, 4), np.uint8)
     for y, of_row in enumerate(rows):
         whole[y::2] = np.array(of_row, copy=False).view(np.uint8).reshape(down, 2 * across, 4)
-    out = np.ascontiguousarray(whole[:height, :width])
-    return np.asarray(cv2.insertChannel(luminance(cv2.cvtColor(out, cv2.COLOR_RGBA2RGB)), out, 3))
+    return np.ascontiguousarray(whole[:height, :width])
 
 
 def _neighbourhoods(mosaic: Raw, saturated: Mask, tiles: tuple[int, int]) -> tuple[Lanes, Lanes]:
@@ -123,7 +122,7 @@ class _Tile:
         self._scale = [be.dr.opaque(be.Float64, v) for v in display.scale]
 
     def levels(self, values: Lanes, lit: Lanes, y: int, x: int) -> Any:
-        """Return R, G and B of one pixel in a word, R in its lowest byte.
+        """Return R, G, B and the luminance of one pixel in a word, R in its lowest byte.
 
         `values` are the raw numbers by row and column, and `lit` the same with saturated ones infinite.
         """
@@ -148,15 +147,16 @@ class _Tile:
         top = _extreme(dr.maximum, [lit[cy + dy][cx + dx] for dy, dx in reach])
         lowest = _extreme(dr.minimum, [at(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1)])
         maybe = (top - lowest > self._noise) & (top - lowest > lowest - self._black)
-        out = be.UInt32(0)
+        out, light = be.UInt32(0), be.Float(0.0)
         for k, name in enumerate(self._kernels(y, x)):
             value = middle
             if name is not None:
                 eighths, near = kernels[name]
                 value = self._bounded(eighths * 0.125, near, top, lit[cy][cx] - self._black, maybe)
-            level = dr.round(be.Float64(value - self._black) * self._scale[k])
-            out |= be.UInt32(be.Int32(dr.clip(level, 0, 255))) << (8 * k)
-        return out
+            level = be.Int32(dr.clip(dr.round(be.Float64(value - self._black) * self._scale[k]), 0, 255))
+            out |= be.UInt32(level) << (8 * k)
+            light = dr.fma(be.Float(level), float(LUMINANCE_WEIGHTS[k]), light)
+        return out | be.UInt32(be.Int32(dr.round(light))) << 24
 
     def _kernels(self, y: int, x: int) -> tuple[str | None, str | None, str | None]:
         """Return the kernels of Malvar's for R, G and B at a pixel of the tile; None for its own colour."""

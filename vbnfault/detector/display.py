@@ -50,6 +50,11 @@ def levels(mosaic: NDArray[Any], pattern: Pattern, method: Method, saturated: Ma
     return np.asarray(cv2.multiply(above, (*display.scale, 0.0), dtype=cv2.CV_8U))
 
 
+# The weights of R, G and B in whole 65536ths, whose sum is 1: all products with levels, and their sums, are exact in
+# single precision. So every order of the sum, fused or not, gives the same bits.
+LUMINANCE_WEIGHTS = np.rint(LUMINANCE.astype(np.float64) * 65536) / 65536
+
+
 def luminance(rgb: U8) -> U8:
-    """Return the luminance, uint8[y, x], of R, G and B, uint8[y, x, 3]."""
-    return np.asarray(cv2.transform(rgb, LUMINANCE.reshape(1, 3).astype(np.float64))).reshape(rgb.shape[:2])
+    """Return the luminance, uint8[y, x], of R, G and B, uint8[y, x, 3]; halves become the even level."""
+    return np.asarray(cv2.transform(rgb, LUMINANCE_WEIGHTS.reshape(1, 3))).reshape(rgb.shape[:2])
