@@ -23,7 +23,7 @@ from vbnfault.detector.charge import (
 )
 
 # more rows than a block, and no multiple of one
-SHAPE = (2 * blocks.ROWS_PER_BLOCK_OF_A_PLANE + 7, 11)
+SHAPE = (2 * blocks.ROWS_PER_BLOCK + 7, 11)
 
 # moves an image so that charge that moved up moves in the named direction
 TURN: dict[str, Callable[[np.ndarray], np.ndarray]] = {
@@ -274,7 +274,7 @@ def test_cti_against_arctic(passes: int, tolerance: float) -> None:
 
 
 def test_cti_against_a_register_clocked_trap_by_trap() -> None:
-    image = scene(1, (blocks.ROWS_PER_BLOCK_OF_A_PLANE + 9, 3))
+    image = scene(1, (blocks.ROWS_PER_BLOCK + 9, 3))
     got = cti(image, TRAPS, cloud=CLOUD, transfer_s=1.0, transfers_before=3, passes=2, trail_left_out=1e-6)
     truth = np.transpose([clocked_traps(c, TRAPS, CLOUD, 1.0, before=3) for c in image.T])
     effect = np.abs(truth - image).max()
@@ -395,12 +395,14 @@ def test_rows_are_read_one_after_the_other() -> None:
 
 
 def test_waiting_charge_gathers_light() -> None:
-    signal, rate = scene(8), scene(9)
-    got = parasitic_light(signal, rate, sensitivity=1 / 50_000, row_period_s=1e-2)
+    signal = scene(8)
+    rate = signal.astype(np.float64) / 4e-3
+    got = parasitic_light(signal, 4e-3, sensitivity=1 / 50_000, row_period_s=1e-2)
     wait = 1e-2 * np.arange(len(signal))[:, None]
+    # two roundings to single precision: of the factor and of the product
     np.testing.assert_allclose(got, signal + rate * wait / 50_000, rtol=3 * 2.0**-24)
     np.testing.assert_array_equal(got[0], signal[0])  # read at once
-    upside_down = parasitic_light(signal, rate, sensitivity=1.0, row_period_s=1.0, direction="down")
+    upside_down = parasitic_light(signal, 4e-3, sensitivity=1.0, row_period_s=1.0, direction="down")
     np.testing.assert_array_equal(upside_down[-1], signal[-1])
     assert (upside_down[0] > signal[0]).all()
 
@@ -439,7 +441,8 @@ ONE = [TrapSpecies(density_per_px=1.0, release_time_s=1.0)]
         ),
         (lambda: row_wait_s(0, row_period_s=1.0), "height_px = 0"),
         (lambda: row_wait_s(3, row_period_s=1.0, direction="left"), "direction = 'left': must be up or down"),
-        (lambda: parasitic_light(IMAGE, IMAGE, sensitivity=2.0, row_period_s=1.0), "sensitivity = 2"),
+        (lambda: parasitic_light(IMAGE, 1.0, sensitivity=2.0, row_period_s=1.0), "sensitivity = 2"),
+        (lambda: parasitic_light(IMAGE, 0.0, sensitivity=0.5, row_period_s=1.0), "exposure_s = 0: must be above 0"),
     ],
 )
 def test_bad_numbers_are_refused_in_a_sentence(call: Callable[[], object], message: str) -> None:

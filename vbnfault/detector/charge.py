@@ -434,7 +434,7 @@ def row_wait_s(height_px: int, *, row_period_s: float, direction: str = "up") ->
 
 def parasitic_light(
     signal_e: F32,
-    rate_e_s: F32,
+    exposure_s: float,
     *,
     sensitivity: float,
     row_period_s: float,
@@ -442,13 +442,16 @@ def parasitic_light(
 ) -> F32:
     """Return the electrons of a global shutter, float32[y, x], including light that falls on the waiting charge.
 
-    The stored charge gains sensitivity × rate × waiting time of its row. `sensitivity` in [0, 1] is the parasitic
-    light sensitivity: that of the storage node over that of the photodiode (1/50 000 for a CMV4000, recalled from
-    its data sheet). Raises InputError for it and as `row_wait_s` does.
+    The scene shines on during the wait as it did during the exposure, so the stored charge gains sensitivity ×
+    signal / exposure × waiting time of its row. `sensitivity` in [0, 1] is the parasitic light sensitivity: that of
+    the storage node over that of the photodiode (1/50 000 for a CMV4000, recalled from its data sheet). Raises
+    InputError for it, for an exposure of 0 or less, and as `row_wait_s` does.
     """
     _fraction(sensitivity=sensitivity)
+    if not exposure_s > 0:
+        raise InputError(f"exposure_s = {exposure_s:g}: must be above 0")
     wait = row_wait_s(len(signal_e), row_period_s=row_period_s, direction=direction)
-    return signal_e + rate_e_s * (sensitivity * wait).astype(np.float32)[:, None]
+    return signal_e * (1 + sensitivity / exposure_s * wait).astype(np.float32)[:, None]
 
 
 # ---------------------------------------------------------------------------------------------------- helpers

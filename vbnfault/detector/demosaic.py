@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import InputError
-from .blocks import pool
 from .mosaic import Pattern, channel_of, plane_of
 
 F32 = NDArray[np.float32]
@@ -161,12 +160,10 @@ def bounded_at_edges(
     measured = cv2.copyMakeBorder(signal, halo, halo, halo, halo, _MIRROR)
     brightest = measured if bright is signal else cv2.copyMakeBorder(bright, halo, halo, halo, halo, _MIRROR)
 
-    def bound_block(start: int) -> None:
+    for start in starts:
         block = rgb[start : start + _ROWS_PER_BLOCK]
         rows = slice(start, start + len(block) + 2 * halo)
         edges.bound(block, measured[rows], brightest[rows])
-
-    list(pool().map(bound_block, starts))
     return rgb
 
 
@@ -370,7 +367,7 @@ def _checked(raw: NDArray[Any]) -> F32:
 
 
 def _in_blocks(step: Callable[[F32, Pattern], Sequence[F32]], raw: F32, pattern: Pattern, method: Method) -> F32:
-    """Return R, G, B, float32[y, x, 3], computed in blocks of rows with a mirrored halo, in two threads.
+    """Return R, G, B, float32[y, x, 3], computed in blocks of rows with a mirrored halo.
 
     Blocks fit the cache.
     """
@@ -378,12 +375,10 @@ def _in_blocks(step: Callable[[F32, Pattern], Sequence[F32]], raw: F32, pattern:
     padded = cv2.copyMakeBorder(raw, halo, halo, halo, halo, _MIRROR)
     out = np.empty((*raw.shape, 3), dtype=np.float32)
 
-    def fill_block(start: int) -> None:
+    for start in range(0, len(raw), _ROWS_PER_BLOCK):
         block = out[start : start + _ROWS_PER_BLOCK]
         planes = step(padded[start : start + len(block) + 2 * halo], pattern)
         cv2.merge([plane[halo:-halo, halo:-halo] for plane in planes], block)
-
-    list(pool().map(fill_block, range(0, len(raw), _ROWS_PER_BLOCK)))
     return out
 
 

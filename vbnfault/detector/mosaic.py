@@ -14,7 +14,6 @@ from pydantic import Field
 
 from ..core.errors import InputError, shown
 from ..core.tables import table_class
-from .blocks import pool
 
 F32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -117,15 +116,11 @@ def sample(planes: F32, pattern: Pattern) -> F32:
     out = np.empty(planes.shape[:2], dtype=np.float32)
     rows, columns = pattern.shape
     height = rows * max(1, _BLOCK_ROWS // rows)  # whole tiles, so that each block begins with the tile's first row
-
-    def fill(start: int) -> None:
+    for start in range(0, len(out), height):
         block = slice(start, start + height)
         for y in range(rows):
             for x in range(columns):
                 out[block][y::rows, x::columns] = planes[block][y::rows, x::columns, pattern.tile[y][x]]
-
-    # numpy releases the interpreter lock while it copies
-    list(pool().map(fill, range(0, len(out), height)))
     return out
 
 

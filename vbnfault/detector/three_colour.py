@@ -22,7 +22,7 @@ from ..core import buffers
 from ..core.errors import InputError
 from ..core.quantities import RGBI, Electrons, Irradiance, RawDN
 from . import compiled
-from .blocks import blockwise, pool
+from .blocks import blockwise
 from .display import luminance
 from .efficiency import QuantumEfficiency, white_balance
 from .noise import NormalField, counts_of_one_mean, draw_normals, poisson_on_dark, variates_by_code
@@ -48,11 +48,11 @@ class Noise:
 
     @classmethod
     def draw(cls, shape: tuple[int, int], shot: np.random.Generator, read: np.random.Generator) -> Noise:
-        """Draw two fields of normal variates for a (height, width) sensor, in two threads."""
+        """Draw two fields of normal variates for a (height, width) sensor."""
         codes = buffers.empty((*shape, 3, 2), np.uint16)
         views = codes[..., 0], codes[..., 1]
-        fields = pool().map(lambda rng, view: draw_normals((*shape, 3), rng, view), (shot, read), views)
-        return cls(codes=codes, shot=next(fields), read=next(fields))
+        fields = [draw_normals((*shape, 3), rng, view) for rng, view in zip((shot, read), views, strict=True)]
+        return cls(codes=codes, shot=fields[0], read=fields[1])
 
     @cached_property
     def outermost_pixels(self) -> NDArray[np.intp]:

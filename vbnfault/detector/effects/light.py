@@ -59,9 +59,10 @@ class Smear(Effect):
         weight, step = steps[sensor.architecture]
         if not weight or exposure_s <= 0:
             return signal
-        rate, direction = signal * np.float32(1 / exposure_s), exposure.device.direction
+        direction = exposure.device.direction
         if step is None:
             return parasitic_light(
-                signal, rate, sensitivity=move.leak, row_period_s=move.row_readout_s, direction=direction
+                signal, exposure_s, sensitivity=move.leak, row_period_s=move.row_readout_s, direction=direction
             )
+        rate = signal * np.float32(1 / exposure_s)
         return along_columns(sensor, direction, partial(step, exposure_s=exposure_s), rate)

@@ -379,9 +379,7 @@ def lit_cells(spots: Spots, across: int) -> Any:
     return spots.fraction * _inside(spots.radius, across)
 
 
-def _described(
-    made: Tracer, spots: Spots, across: int, turn: float, pupil_mm2: float, peak: F64
-) -> list[Ghost]:
+def _described(made: Tracer, spots: Spots, across: int, turn: float, pupil_mm2: float, peak: F64) -> list[Ghost]:
     """Return the ghosts of bundles that were traced together."""
     be, rays = backend(), spots.rays
     dr, Float64 = be.dr, be.Float64
@@ -427,8 +425,8 @@ def _inside(radius: Any, across: int) -> Any:
 def peaks(spots: Spots, across: int, sun_deg: float) -> F64:
     """Return each ghost's largest irradiance over that of the Sun, float64[bundle].
 
-    It is taken over the cells of centred lattices, `across` rays wide. A ghost of only a few rays has no whole cell,
-    and its peak is 0.
+    It is taken over the cells of centred lattices, `across` rays wide. A ghost of only a few rays has no whole
+    cell, and its peak is 0.
     """
     be, rays = backend(), spots.rays
     dr = be.dr
