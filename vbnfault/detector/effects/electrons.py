@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core import buffers
 from .. import compiled
 from ..dark import Telegraph, silicon_factor
 from ..transfer import passing_dark_e
@@ -21,7 +22,8 @@ class DarkCurrent(Effect):
     def apply(self, signal: F32, exposure: Exposure) -> F32:
         """Return the electrons with dark current, without telegraph signals."""
         device, factor = exposure.device, dark_factor(exposure)
-        out = np.asarray(cv2.scaleAdd(device.dark_rate_e_s, exposure.exposure_s * factor, signal))
+        out: F32 = buffers.empty(signal.shape)
+        cv2.scaleAdd(device.dark_rate_e_s, exposure.exposure_s * factor, signal, dst=out)
         moved = device.transfer_dark_e
         if moved is None:
             return out

@@ -8,6 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from ...core import buffers
 from ..charge import parasitic_light, smear, smear_interline
 from ..transfer import along_columns
 from .contract import F32, Effect, Exposure, FaultStep
@@ -21,7 +22,9 @@ class Response(Effect):
 
     def apply(self, signal: Any, exposure: Exposure) -> F32:
         """Return the photo-electrons of each pixel."""
-        return np.asarray(cv2.multiply(signal, exposure.device.response))
+        out: F32 = buffers.empty(signal.shape)
+        cv2.multiply(signal, exposure.device.response, dst=out)
+        return out
 
 
 class LightStep(FaultStep):

@@ -21,7 +21,7 @@ T = TypeVar("T")
 
 LEVELS = 6
 MARGIN = 4  # pixels around each level, for cells that lie partly outside
-_STRIP = 32  # rows
+_STRIP = 128  # rows; shorter steps wait for the interpreter's lock
 _CALM_SIGMA = 0.8  # sigma by which a coarser level is smoothed, in pixels of this level
 
 
@@ -110,16 +110,16 @@ def summed(canvas: Canvas, levels: Sequence[NDArray[Any]], unit: float | None = 
 def bands_mixed(array: F32, weights: F64) -> F32:
     """Return float32[band, y, x] summed over the bands with float64[channel, band], float32[channel, y, x]."""
     # the rows of a strip stay in the cache; BLAS is slow for so few weights, and its bits depend on the threads
-    factors = weights.astype(np.float32)
+    factors = weights.tolist()
     out = buffers.empty((len(factors), *array.shape[1:]))
     starts = range(0, array.shape[1], _STRIP)
 
     def mix(strip: int) -> None:
         rows = slice(starts[strip], starts[strip] + _STRIP)
         for plane, row in zip(out[:, rows], factors, strict=True):
-            np.multiply(array[0, rows], row[0], out=plane)
+            cv2.multiply(array[0, rows], row[0], dst=plane)
             for band, factor in zip(array[1:, rows], row[1:], strict=True):
-                plane += band * factor
+                cv2.scaleAdd(band, factor, plane, dst=plane)
 
     in_layers(mix, len(starts))
     return out
