@@ -358,8 +358,14 @@ def test_what_overflows_from_a_track_is_in_its_mask() -> None:
     assert footprint is not None
     change = np.abs(frame.images.image.array.astype(int) - frame.images.clean.array).max(axis=2)
     assert change[~footprint].max() > 5
-    # noise rounds to another number here and there, where a trail is too weak to show without it
-    assert change[~frame.labels.masks[0]].max(initial=0) <= 1
+    # How far the charge runs depends on its shot noise, which the mask does not know. So pixels beyond the end of a
+    # trail may change by some standard deviations of the track's charge, and by what the white balance makes of it.
+    unmasked = change[~frame.labels.masks[0]]
+    tracks, detector = frame.drawn["cosmic_rays"]["tracks"], s.base_camera.detector
+    noise_e = np.sqrt(max(track["electrons"] for track in tracks))
+    gain = 255 * float(detector.device.white_balance.max()) / detector.sensor.readout.white_e
+    assert unmasked.max(initial=0) <= 1 + 3 * gain * noise_e
+    assert np.count_nonzero(unmasked) <= len(tracks)
     assert not (footprint & ~frame.labels.masks[0]).any()
 
 
