@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -20,10 +21,18 @@ from vbnfault.lens.glass import C_NM, D_NM, F_NM, from_abbe
 from vbnfault.lens.rays import ghost, trace
 from vbnfault.lens.straylight.paraxial import paraxial_ghosts, transmittance
 
-pytest.importorskip("optiland", reason="optiland (of the extra 'test') is not installed")
+if TYPE_CHECKING:
+    import sequential_oracle as oracle
+    from optiland.fileio import load_zemax_file
 
-import sequential_oracle as oracle
-from optiland.fileio import load_zemax_file
+
+@pytest.fixture(scope="module", autouse=True)
+def _optiland() -> None:
+    """Import optiland for the tests alone: each process of tests collects all files, and this takes seconds."""
+    pytest.importorskip("optiland", reason="optiland (of the extra 'test') is not installed")
+    globals()["oracle"] = importlib.import_module("sequential_oracle")
+    globals()["load_zemax_file"] = importlib.import_module("optiland.fileio").load_zemax_file
+
 
 # Of every lens the five ghosts with the most light from 8° off the axis, of those that rays take from 0° and 16°
 # too. Left out is the Tessar's pair 5, 7, whose rays leave at all angles up to 90°: on an unbounded plane their
