@@ -233,6 +233,7 @@ class FlareModel:
         self._reach_mm = float(np.hypot(*shape) / 2 * pitch_mm)
         self._last_boxes: tuple[tuple[float, float], tuple[Tracer, Rays, Arrivals]] | None = None
         self._last_worn: tuple[float, FlareModel] | None = None
+        self._whole: FlareModel | None = None  # the model with whole coatings, if they are worn here
         self._soften()
 
     def _soften(self) -> None:
@@ -338,7 +339,7 @@ class FlareModel:
         if last is None or last[0] != coating_loss:
             other = copy.copy(self)
             other._tracer = self._tracer.worn(coating_loss)
-            other._last_boxes = other._last_worn = None
+            other._whole, other._last_boxes, other._last_worn = self, None, None
             self._last_worn = last = coating_loss, other
         return last[1]
 
@@ -402,7 +403,11 @@ class FlareModel:
         key, last = (sun_deg, turn), self._last_boxes
         if last is None or last[0] != key:
             made = self._tracer.turned(turn)
-            last = key, (made, *boxes(made, sun_deg, self._detail.width, self._reach_mm))
+            if self._whole is None:
+                found = boxes(made, sun_deg, self._detail.width, self._reach_mm)
+            else:  # worn coatings change how bright ghosts are, but not where they are
+                found = self._whole._boxes(sun_deg, turn)[1:]
+            last = key, (made, *found)
             self._last_boxes = last
         return last[1]
 
