@@ -315,14 +315,19 @@ def test_a_paraboloid_focuses_every_ray_and_an_asphere_is_met() -> None:
     """A concave paraboloidal mirror met twice would be a telescope: its rays cross the axis at half its radius."""
     mirror = Surface(radius_mm=-200.0, thickness_mm=0.0, medium=AIR, semi_diameter_mm=60.0, conic=-1.0)
     rays = np.array([[20.0, 0.0, -1.0], [0.0, 55.0, -1.0], [-10.0, 30.0, -1.0]])
-    hit, normal = trace_module._meet(mirror, rays, np.tile([0.0, 0.0, 1.0], (3, 1)))
+
+    def meet(surface: Surface, directions: Any) -> tuple[Any, Any]:
+        """Points and normals, [ray, 3]; the function holds vectors by component."""
+        return tuple(v.T for v in trace_module._meet(surface, rays.T.copy(), directions.T.copy()))
+
+    hit, normal = meet(mirror, np.tile([0.0, 0.0, 1.0], (3, 1)))
     incoming = np.array([0.0, 0.0, 1.0])
     out = incoming - 2 * (normal @ incoming)[:, None] * normal
     crossing = hit[:, 2] - out[:, 2] * (hit * out)[:, :2].sum(axis=1) / (out[:, :2] ** 2).sum(axis=1)
     np.testing.assert_allclose(crossing, -100.0, rtol=1e-12)
     bent = replace(mirror, conic=0.4, aspheric_mm=(1e-6, -3e-10))
     direction = np.tile([0.05, -0.02, 0.9], (3, 1))
-    hit, normal = trace_module._meet(bent, rays, direction / np.linalg.norm(direction, axis=1, keepdims=True))
+    hit, normal = meet(bent, direction / np.linalg.norm(direction, axis=1, keepdims=True))
     np.testing.assert_allclose(hit[:, 2], bent.sag_mm(np.hypot(hit[:, 0], hit[:, 1])), atol=1e-12)
     step = 1e-4
     for axis in (0, 1):  # the normal is across the surface: a step along it stays on the surface to second order
