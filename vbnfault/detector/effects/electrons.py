@@ -22,8 +22,8 @@ class DarkCurrent(Effect):
     def apply(self, signal: F32, exposure: Exposure) -> F32:
         """Return the electrons with dark current, without telegraph signals."""
         device, factor = exposure.device, dark_factor(exposure)
-        out: F32 = buffers.empty(signal.shape)
-        cv2.scaleAdd(device.dark_rate_e_s, exposure.exposure_s * factor, signal, dst=out)
+        dark_s = exposure.exposure_s * factor
+        out = np.asarray(cv2.scaleAdd(device.dark_rate_e_s, dark_s, signal, dst=buffers.empty(signal.shape)))
         moved = device.transfer_dark_e
         if moved is None:
             return out

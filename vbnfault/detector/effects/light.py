@@ -22,9 +22,7 @@ class Response(Effect):
 
     def apply(self, signal: Any, exposure: Exposure) -> F32:
         """Return the photo-electrons of each pixel."""
-        out: F32 = buffers.empty(signal.shape)
-        cv2.multiply(signal, exposure.device.response, dst=out)
-        return out
+        return np.asarray(cv2.multiply(signal, exposure.device.response, dst=buffers.empty(signal.shape)))
 
 
 class LightStep(FaultStep):
