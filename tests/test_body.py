@@ -11,6 +11,7 @@ import trimesh
 
 from vbnfault.body import Body, check_mesh, choose_sites, embedded_nucleus, load_body, load_shape, local_level
 from vbnfault.body.noise import gradient_noise
+from vbnfault.body.nucleus import made_nucleus
 from vbnfault.body.shape import face_normals_areas, signed_volume
 from vbnfault.core.errors import InputError
 
@@ -199,11 +200,17 @@ def _section_area(mesh: trimesh.Trimesh, origin: object, axis: np.ndarray) -> fl
 
 
 def test_nucleus_is_the_same_every_time() -> None:
-    first = embedded_nucleus()
+    """Made anew, read from disk and kept by the process."""
+    made = made_nucleus()
+    kept = embedded_nucleus()
     embedded_nucleus.cache_clear()
-    again = embedded_nucleus()
-    np.testing.assert_array_equal(first[0], again[0])
-    np.testing.assert_array_equal(first[1], again[1])
+    read = embedded_nucleus()
+    assert read[0] is not kept[0]
+    for again in (kept, read):
+        for a, b in zip(made, again, strict=True):
+            np.testing.assert_array_equal(a, b)
+            assert a.dtype == b.dtype
+            assert not b.flags.writeable
 
 
 def test_noise_is_a_function_of_place() -> None:

@@ -8,15 +8,19 @@ neck, layered cliffs, plains with flat floors, and pits with steep walls.
 from __future__ import annotations
 
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 import scipy.sparse
 import scipy.sparse.csgraph
-import skimage.measure
 from numpy.typing import NDArray
 
+from ..core.array_files import ArrayFiles, code_hash
 from .noise import fractal_noise, gradient_noise
 from .shape import Float64, Int32, check_mesh, vertex_normals
+
+NUCLEI = ArrayFiles(kind="nucleus", content="embedded nucleus")
+_SOURCES, _ARRAYS = ("noise", "shape"), ("vertices_m", "faces")
 
 _SEED = 67
 _SPACING_KM = 0.066
@@ -177,8 +181,26 @@ def _umbrella(faces: Int32, count: int) -> scipy.sparse.csr_matrix:
 def embedded_nucleus() -> tuple[Float64, Int32]:
     """Return the procedural nucleus: float64[n, 3] in metres and int32[m, 3], closed, wound outwards, read-only.
 
-    The result is deterministic and is made once per process (about two seconds).
+    The result is deterministic. It is made once per machine, in about a second, and kept on disk (`array_files`).
+
+    Raises
+    ------
+    InputError
+        $VBNFAULT_CACHE_GIB is unusable.
     """
+    here = Path(__file__)
+    key = code_hash([here, *(here.with_name(f"{name}.py") for name in _SOURCES)], ["scikit-image"])
+    kept = NUCLEI.kept(key, lambda: dict(zip(_ARRAYS, made_nucleus(), strict=True)))
+    vertices, faces = (kept[name] for name in _ARRAYS)
+    vertices.setflags(write=False)
+    faces.setflags(write=False)
+    return vertices, faces
+
+
+def made_nucleus() -> tuple[Float64, Int32]:
+    """Return `embedded_nucleus`, made anew."""
+    import skimage.measure
+
     low, high = np.array([-2.95, -2.25, -2.15]), np.array([2.95, 2.35, 2.10])
     shape = np.ceil((high - low) / _SPACING_KM).astype(int) + 1
     axes = [low[k] + _SPACING_KM * np.arange(shape[k]) for k in range(3)]
@@ -203,10 +225,7 @@ def embedded_nucleus() -> tuple[Float64, Int32]:
             normals = vertex_normals(vertices, faces)
             move -= normals * np.einsum("ij,ij->i", move, normals)[:, None]
         vertices = vertices + 0.55 * move
-    vertices, faces = check_mesh(_METRES_PER_KM * vertices, faces, "embedded nucleus")
-    vertices.setflags(write=False)
-    faces.setflags(write=False)
-    return vertices, faces
+    return check_mesh(_METRES_PER_KM * vertices, faces, "embedded nucleus")
 
 
 def _largest_piece(faces: Int32, count: int) -> Int32:

@@ -42,7 +42,7 @@ _MAGIC = b"vbnfault patch 1"
 _HEADER = struct.Struct("<16sQ")  # magic, and the number of bytes of the table that follows
 _ALIGNED_BYTES = 64  # each array begins at a multiple of this
 _STALE_S = 3600.0  # an unfinished file older than this belongs to no running process
-_KINDS = ("patch", "ghosts")  # prefixes of names; the suffix is the same word
+_KINDS = ("patch", "ghosts", "nucleus")  # prefixes of names; the suffix is the same word
 _UNFINISHED = ".part"
 
 
@@ -76,12 +76,15 @@ def cache_limit_bytes() -> int:
     return int(gib * 2**30)
 
 
-def code_hash(sources: Sequence[Path]) -> str:
-    """Return the sha256 (hex) of source files, the versions of numerical libraries and the platform."""
+def code_hash(sources: Sequence[Path], libraries: Sequence[str] = ()) -> str:
+    """Return the sha256 (hex) of source files, the versions of numerical libraries and the platform.
+
+    `libraries` are further ones that compute the arrays.
+    """
     parts = hashlib.sha256()
     for path in sources:
         parts.update(path.read_bytes())
-    versions = [importlib.metadata.version(name) for name in _LIBRARIES]
+    versions = [importlib.metadata.version(name) for name in (*_LIBRARIES, *libraries)]
     parts.update(json.dumps([versions, platform.machine(), sys.byteorder]).encode())
     return parts.hexdigest()
 
