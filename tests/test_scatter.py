@@ -449,3 +449,17 @@ def test_bad_values_are_told(more: dict[str, Any], words: str) -> None:
 def test_a_bad_baffle_is_told() -> None:
     with pytest.raises(InputError, match="radius_mm = 9: must be from 10 to inf"):
         baffle_transmission(1.0, length_mm=5.0, radius_mm=9.0, entrance_radius_mm=10.0)
+
+
+def test_the_table_of_dust_is_the_same_from_disk() -> None:
+    """Kept by the process, read from disk, and computed for some of its sizes."""
+    edges, angles, kept = scatter._intensities(scatter.DUST_INDEX)
+    scatter._intensities.cache_clear()
+    read = scatter._intensities(scatter.DUST_INDEX)[2]
+    assert read is not kept
+    np.testing.assert_array_equal(read, kept)
+    assert not read.flags.writeable
+    some = slice(0, None, 200)
+    middle = np.sqrt(edges[1:] * edges[:-1])[some]
+    # a matrix product of other rows may be summed in another order
+    np.testing.assert_allclose(scatter.scattered_intensity(middle, np.cos(angles)), kept[some], rtol=1e-9)

@@ -42,7 +42,7 @@ _MAGIC = b"vbnfault patch 1"
 _HEADER = struct.Struct("<16sQ")  # magic, and the number of bytes of the table that follows
 _ALIGNED_BYTES = 64  # each array begins at a multiple of this
 _STALE_S = 3600.0  # an unfinished file older than this belongs to no running process
-_KINDS = ("patch", "ghosts", "nucleus")  # prefixes of names; the suffix is the same word
+_KINDS = ("patch", "ghosts", "nucleus", "mie")  # prefixes of names; the suffix is the same word
 _UNFINISHED = ".part"
 
 

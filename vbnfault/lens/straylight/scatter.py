@@ -8,13 +8,17 @@ fraction of the light that the surface scatters forwards: the total integrated s
 
 from __future__ import annotations
 
+import hashlib
+import json
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import erf, exprel, j1
 
+from ...core.array_files import ArrayFiles, code_hash
 from ...core.errors import InputError
 from ..coating import reflect_transmit
 from ..footprint import disc_overlap
@@ -43,6 +47,7 @@ _CC1246_SLOPE = 0.926
 _CC1246_AREA_UM2 = 0.1e12  # 0.1 m²
 _SMALLEST_UM = 1.0  # smallest diameter of the standard's distribution
 _MIE_LARGEST = 500.0  # size parameter above which diffraction and geometrical optics are used
+_TABLES = ArrayFiles(kind="mie", content="table of dust's scattering")
 _BIN = 0.01  # width of bins in ln(size parameter)
 _ANGLES = 321
 _LOOKUP = 1 << 16
@@ -255,12 +260,19 @@ def _intensities(index: complex) -> tuple[F64, F64, F64]:
     """Return the intensity at all sizes and forward angles.
 
     The result is the bin edges of the size parameter, the angles in rad, and the table float64[bin, angle]. One
-    table serves all wavelengths, because the index is a constant.
+    table serves all wavelengths, because the index is a constant. It takes a second and is kept on disk.
     """
     largest = np.pi * 1e3 * 1000.0 / RANGE_NM[0]
     edges = np.exp(np.arange(0.0, np.log(largest) + _BIN, _BIN))
     angles = np.geomspace(1e-5, np.pi / 2, _ANGLES)
-    table = scattered_intensity(np.sqrt(edges[1:] * edges[:-1]), np.cos(angles), index=index)
+
+    def computed() -> dict[str, F64]:
+        return {"intensity": scattered_intensity(np.sqrt(edges[1:] * edges[:-1]), np.cos(angles), index=index)}
+
+    here = Path(__file__)
+    code = code_hash([here, here.parents[1] / "coating.py"], ["miepython"])
+    key = hashlib.sha256(json.dumps([code, index.real, index.imag]).encode()).hexdigest()
+    table = _TABLES.kept(key, computed)["intensity"]
     for array in (edges, angles, table):
         array.setflags(write=False)
     return edges, angles, table
