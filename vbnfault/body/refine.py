@@ -103,7 +103,7 @@ def refine(points: Float64, normals: Float64, faces: Int32, limit: EdgeLimit) ->
         a, b = (points.take(ends[..., k], axis=0) for k in (0, 1))  # takes half as long as an index in brackets
         length = np.sqrt(np.einsum("fki,fki->fk", b - a, b - a))
         long = length > limit.along(a, b)
-        finished = ~long.any(axis=1)
+        finished = ~(long[:, 0] | long[:, 1] | long[:, 2])  # numpy's `any` takes ten times as long for three
         done.append(active[finished])
         active, long, length = active[~finished], long[~finished], length[~finished]
         if not len(active):
@@ -119,7 +119,7 @@ def split(
 ) -> tuple[Float64, Float64, NDArray[np.int64]]:
     """Insert the midpoints of the marked edges, and cut the triangles that have one, two or three of them."""
     ends = faces[:, [[1, 2], [2, 0], [0, 1]]][marked]
-    low, high = ends.min(axis=1), ends.max(axis=1)
+    low, high = np.minimum(ends[:, 0], ends[:, 1]), np.maximum(ends[:, 0], ends[:, 1])
     count = len(points)
     keys, inverse = np.unique(low * count + high, return_inverse=True)
     i, j = keys // count, keys % count
@@ -127,7 +127,8 @@ def split(
     middle = np.full(faces.shape, -1, dtype=np.int64)
     middle[marked] = count + inverse.ravel()
 
-    how_many = marked.sum(axis=1)
+    one, other, third = marked.T.astype(np.int8)
+    how_many = one + other + third
     out = [faces[how_many == 0]]
 
     marked_once = how_many == 1
@@ -169,9 +170,15 @@ def _midpoints(p: Float64, q: Float64, n_p: Float64, n_q: Float64) -> tuple[Floa
     bulge = (
         -(np.einsum("ij,ij->i", along, n_p)[:, None] * n_p - np.einsum("ij,ij->i", along, n_q)[:, None] * n_q) / 8.0
     )
-    size = np.linalg.norm(bulge, axis=1)
-    most = _MAX_BULGE * np.linalg.norm(along, axis=1)
+    size = _length(bulge)
+    most = _MAX_BULGE * _length(along)
     bulge *= np.minimum(1.0, most / np.maximum(size, 1e-12))[:, None]
     normal = n_p + n_q
-    length = np.linalg.norm(normal, axis=1)
+    length = _length(normal)
     return 0.5 * (p + q) + bulge, normal / np.where(length > 1e-9, length, 1.0)[:, None]
+
+
+def _length(vectors: Float64) -> Float64:
+    """Return the lengths of vectors float64[n, 3], in half the time of `numpy.linalg.norm`."""
+    x, y, z = vectors.T
+    return np.sqrt(x * x + y * y + z * z)
