@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 @pytest.fixture(scope="module", autouse=True)
 def _optiland() -> None:
-    """Import optiland for the tests alone: each process of tests collects all files, and this takes seconds."""
+    """Import optiland, which is slow, where its tests run: every process of the suite collects all files."""
     pytest.importorskip("optiland", reason="optiland (of the extra 'test') is not installed")
     globals()["oracle"] = importlib.import_module("sequential_oracle")
     globals()["load_zemax_file"] = importlib.import_module("optiland.fileio").load_zemax_file

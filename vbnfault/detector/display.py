@@ -50,8 +50,8 @@ def levels(mosaic: NDArray[Any], pattern: Pattern, method: Method, saturated: Ma
     return np.asarray(cv2.multiply(above, (*display.scale, 0.0), dtype=cv2.CV_8U))
 
 
-# The weights of R, G and B in whole 65536ths, whose sum is 1. Their products with levels, and the sums of these,
-# are exact in single precision, so that every order of the sum, fused or not, gives the same bits.
+# The weights of R, G and B are rounded to whole 65536ths, and their sum is 1. Their products with levels, and the
+# sums of these, are exact in single precision, so every order of the sum, fused or not, gives the same bits.
 LUMINANCE_WEIGHTS = np.rint(LUMINANCE.astype(np.float64) * 65536) / 65536
 
 

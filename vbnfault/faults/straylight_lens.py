@@ -50,9 +50,6 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 _MOST_GHOSTS = 24
-# Rays across each listed ghost: flux and radius differ by at most 1.5 % from those of 192 rays, peaks at folds of
-# light by 10 %.
-_ACROSS = 32
 _LEAST_SUN_RAD = 1e-5
 
 
@@ -367,7 +364,7 @@ class _LensStraylight(LensFault):
         made = flare_model(*key).worn(context.coating_loss)
         shared = _shared_while_new(context)
         by_peak = sorted(
-            shared.once("ghosts", (*key, sun), lambda: made.ghosts(*sun, across=_ACROSS, most=_MOST_GHOSTS)),
+            shared.once("ghosts", (*key, sun), lambda: made.ghosts(*sun, most=_MOST_GHOSTS)),
             key=lambda g: -g.peak_irradiance_fraction,
         )
         return [

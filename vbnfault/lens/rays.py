@@ -100,6 +100,7 @@ def trace(
     steps = forward(lens) if path is None else tuple(path)
     vertex, index = lens.vertices_mm, lens.indices(wavelength_nm)
     sensor = paraxial_properties(lens).bfd_mm if sensor_mm is None else sensor_mm
+    # vectors are held by component, [3, n]: numpy is slow where it works on groups of three numbers
     p = np.array(np.reshape(origins_mm, (-1, 3)).T, dtype=np.float64, order="C")
     d = np.array(np.reshape(directions, (-1, 3)).T, dtype=np.float64, order="C")
     d /= np.sqrt(_dot(d, d))
@@ -130,10 +131,6 @@ def trace(
         relative_radius=radius,
         rows=tuple(row for row, _ in steps),
     )
-
-
-# Vectors are held by component, float64[3, n]: numpy then works on whole arrays and not on groups of three numbers,
-# in a third of the time.
 
 
 def _dot(a: F64, b: F64) -> F64:
