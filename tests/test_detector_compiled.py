@@ -16,7 +16,7 @@ EXPOSURE_S = 0.02
 
 
 def draw(seed: int, shape: tuple[int, int]) -> Noise:
-    return Noise.draw(shape, np.random.default_rng([seed, 1]), np.random.default_rng([seed, 2]))
+    return Noise.draw(shape, np.random.default_rng(seed))
 
 
 def with_outermost(noise: Noise) -> Noise:
@@ -63,16 +63,17 @@ def test_variates_are_those_of_the_whole_field() -> None:
         np.testing.assert_array_equal(field.of_pixels(pixels).values(), values.reshape(-1, 3)[pixels])
         again = np.array([[1, 0]])
         np.testing.assert_array_equal(field.of_pixels(pixels).of_pixels(again).values()[0, 0], values[0, 0])
-    assert (values == 5).sum() == (values == -5).sum() == 6
+    assert (values == 5).sum() == np.count_nonzero(field.codes == 65535) >= 6
+    assert (values == -5).sum() == np.count_nonzero(field.codes == 0) >= 6
 
 
-def test_both_fields_are_those_of_their_generators() -> None:
+def test_both_fields_are_the_halves_of_one_field() -> None:
     noise = draw(4, (33, 17))
-    for field, key in ((noise.shot, 1), (noise.read, 2)):
-        alone = draw_normals((33, 17, 3), np.random.default_rng([4, key]))
-        np.testing.assert_array_equal(field.codes, alone.codes)
-        np.testing.assert_array_equal(field.values(), alone.values())
+    both = draw_normals((33, 17, 3, 2), np.random.default_rng(4))
+    for k, field in enumerate((noise.shot, noise.read)):
+        np.testing.assert_array_equal(field.values(), both.values()[..., k])
         inner = (field.codes > 0) & (field.codes < 65535)
+        assert len(field.tail) == np.count_nonzero(~inner)
         np.testing.assert_array_equal(field.values()[inner], variates_by_code()[field.codes[inner]])
 
 
@@ -143,12 +144,6 @@ def test_shapes_that_differ_are_refused() -> None:
         detector.develop(light, EXPOSURE_S, None, base=(other, detector.develop(other, EXPOSURE_S, None)))
 
 
-def test_codes_with_gaps_that_differ_are_refused() -> None:
-    codes = np.zeros((4, 6, 3), np.uint16)
-    with pytest.raises(ValueError, match="must be equally spaced"):
-        draw_normals((4, 3, 3), np.random.default_rng(1), codes[:, ::2])
-
-
 @pytest.mark.parametrize("noisy", [True, False])
 def test_values_of_the_same_signal_are_taken_from_the_other_image(noisy: bool) -> None:
     detector, shape = ThreeColourDetector(), (70, 50)
@@ -187,18 +182,19 @@ def test_a_signal_that_is_no_number_does_not_end_the_process(noisy: bool) -> Non
     assert ((image[1, :, :3] > 0) & (image[1, :, :3] < 255)).all()
 
 
-def test_exposures_and_variates_share_one_kernel() -> None:
-    """A kernel takes a hundred times as long to compile as to run."""
+def test_exposures_and_variates_share_kernels() -> None:
+    """A kernel takes a hundred times as long to compile as to run. There are three: variates, levels, luminance."""
     dr = backend().dr
     shape, signal = (64, 64), sky((64, 64), 0.5)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
-        hashes = set()
+        hashes: list[set[str]] = []
         for k in range(6):
             detector = ThreeColourDetector(read_noise_e_rms=5.0 + k, bias_dn=10 * k, dark_current_e_s=float(k))
             light = Electrons(array=signal * np.float32(k + 1), white_e=detector.white_e)
             memory = np.zeros(signal.size + k, np.float32)[k:].reshape(signal.shape)  # anywhere in memory
             memory[...] = light.array
             detector.develop(light.with_array(memory), 0.01 * (k + 1), draw(k, shape))
-            hashes |= {kernel["hash"] for kernel in dr.kernel_history() if "hash" in kernel}
-    assert len(hashes) == 1
+            hashes.append({kernel["hash"] for kernel in dr.kernel_history() if "hash" in kernel})
+    assert len(hashes[0]) == 3
+    assert all(of_exposure == hashes[0] for of_exposure in hashes)

@@ -103,7 +103,7 @@ def backend() -> Any:
     import drjit
     import drjit.llvm as types
 
-    names = ("Float", "Float64", "UInt8", "UInt32", "Int32", "UInt64", "Int64")
+    names = ("Float", "Float64", "UInt8", "UInt32", "Int32", "UInt64", "Int64", "Array4u")
     return SimpleNamespace(dr=drjit, **{name: getattr(types, name) for name in names})
 
 

@@ -20,6 +20,7 @@ from scipy.special import ndtr
 
 from ..core import buffers
 from ..core.llvm import backend
+from .display import LUMINANCE_WEIGHTS, with_luminance
 from .noise import (
     ALL_TERMS_BELOW_E,
     EXACT_POISSON_BELOW_E,
@@ -61,8 +62,8 @@ class Curve:
     dark_counts_e: F32
 
 
-def levels(curve: Curve, signal: F32, codes: NDArray[np.uint16] | None, base: tuple[F32, U8] | None = None) -> U8:
-    """Return the 8 bit levels of R, G and B, uint8[y, x, 3].
+def image(curve: Curve, signal: F32, codes: NDArray[np.uint16] | None, base: tuple[F32, U8] | None = None) -> U8:
+    """Return the 8 bit levels of R, G and B, and the luminance as I, uint8[y, x, 4].
 
     Parameters
     ----------
@@ -98,8 +99,36 @@ def levels(curve: Curve, signal: F32, codes: NDArray[np.uint16] | None, base: tu
     out = be.UInt8(found)
     dr.eval(out)
     dr.sync_thread()
-    array: U8 = np.array(out, copy=False).reshape(signal.shape)
+    rgb: U8 = np.array(out, copy=False)
+    return _with_luminance(rgb).reshape(*signal.shape[:2], 4)
+
+
+def _with_luminance(rgb: U8) -> U8:
+    """Return R, G, B and the luminance, uint8[4 * pixel], of R, G and B, uint8[3 * pixel]."""
+    pixels = len(rgb) // 3
+    if pixels % 4:
+        return with_luminance(rgb.reshape(1, pixels, 3)).reshape(-1)
+    be = backend()
+    dr = be.dr
+    group = dr.arange(be.UInt32, pixels // 4)
+    words = be.UInt32(rgb.view(np.uint32))
+    a, b, c = (dr.gather(be.UInt32, words, 3 * group + k) for k in range(3))  # they hold four pixels
+    four = a & 0xFFFFFF, a >> 24 | (b & 0xFFFF) << 8, b >> 16 | (c & 0xFF) << 16, c >> 8
+    out = dr.empty(be.UInt32, pixels)
+    dr.scatter(out, be.Array4u(*(pixel | _luminance(pixel) << 24 for pixel in four)), group)
+    dr.eval(out)
+    dr.sync_thread()
+    array: U8 = np.array(out, copy=False).view(np.uint8)
     return array
+
+
+def _luminance(pixel: Any) -> Any:
+    """Return the luminance of pixels of which R is the lowest byte, as UInt32."""
+    be = backend()
+    light = be.Float(0.0)
+    for k, weight in enumerate(LUMINANCE_WEIGHTS):
+        light = be.dr.fma(be.Float(be.Int32(pixel >> (8 * k) & 0xFF)), float(weight), light)
+    return be.UInt32(be.Int32(be.dr.round(light)))
 
 
 class _Trace:

@@ -18,12 +18,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import buffers
 from ..core.errors import InputError
 from ..core.quantities import RGBI, Electrons, Irradiance, RawDN
 from . import compiled
 from .blocks import blockwise
-from .display import luminance
+from .display import with_luminance
 from .efficiency import QuantumEfficiency, white_balance
 from .noise import NormalField, counts_of_one_mean, draw_normals, poisson_on_dark, variates_by_code
 
@@ -47,12 +46,15 @@ class Noise:
     read: NormalField
 
     @classmethod
-    def draw(cls, shape: tuple[int, int], shot: np.random.Generator, read: np.random.Generator) -> Noise:
+    def draw(cls, shape: tuple[int, int], rng: np.random.Generator) -> Noise:
         """Draw two fields of normal variates for a (height, width) sensor."""
-        codes = buffers.empty((*shape, 3, 2), np.uint16)
-        views = codes[..., 0], codes[..., 1]
-        fields = [draw_normals((*shape, 3), rng, view) for rng, view in zip((shot, read), views, strict=True)]
-        return cls(codes=codes, shot=fields[0], read=fields[1])
+        both = draw_normals((*shape, 3, 2), rng)
+        place, which = np.divmod(both.tail, 2)
+        fields = [
+            NormalField(codes=both.codes[..., k], tail=place[which == k], tail_values=both.tail_values[which == k])
+            for k in (0, 1)
+        ]
+        return cls(codes=both.codes, shot=fields[0], read=fields[1])
 
     @cached_property
     def outermost_pixels(self) -> NDArray[np.intp]:
@@ -93,7 +95,7 @@ class ThreeColourDetector:
 
     def draw_noise(self, shape: tuple[int, int], rng: Callable[[str], np.random.Generator]) -> Noise:
         """Draw the variates of one exposure. `rng` returns the random generator for a name."""
-        return Noise.draw(shape, rng("shot"), rng("read"))
+        return Noise.draw(shape, rng("noise"))
 
     @property
     def adc_max_dn(self) -> int:
@@ -190,8 +192,7 @@ class ThreeColourDetector:
                 )
         codes = None if noise is None else noise.codes
         known = None if base is None else (base[0].array, base[1].array)
-        rgb = compiled.levels(curve_of(self, float(exposure_s)), expected.array, codes, known)
-        image = blockwise(_with_luminance, rgb)
+        image = compiled.image(curve_of(self, float(exposure_s)), expected.array, codes, known)
         if noise is not None and len(noise.outermost_pixels):
             beyond = noise.outermost_pixels[None]
             light = expected.array.reshape(-1, 3)[beyond]
@@ -228,7 +229,7 @@ class ThreeColourDetector:
         def show(dn: F32) -> NDArray[np.uint8]:
             # OpenCV multiplies with 64 bits, rounds to even and saturates at 0 and 255 as it converts
             rgb = cv2.multiply(dn - black, (*scale.tolist(), 0.0), dtype=cv2.CV_8U)
-            return _with_luminance(np.asarray(rgb))
+            return with_luminance(np.asarray(rgb))
 
         return show
 
@@ -239,11 +240,6 @@ class ThreeColourDetector:
         dark_dn = self.bias_dn + self.dark_current_e_s * exposure_s * self.gain_dn_per_e
         black = np.float32(min(dark_dn, self.adc_max_dn - 0.01 * (self.adc_max_dn - self.bias_dn)))
         return black, (255.0 / (self.adc_max_dn - float(black)) * self.white_balance).astype(np.float32)
-
-
-def _with_luminance(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return R, G, B and the luminance as I, uint8[y, x, 4], of R, G and B, uint8[y, x, 3]."""
-    return np.asarray(cv2.insertChannel(luminance(rgb), cv2.cvtColor(rgb, cv2.COLOR_RGB2RGBA), 3))
 
 
 @lru_cache(maxsize=8)
