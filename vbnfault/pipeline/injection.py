@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
@@ -14,7 +13,6 @@ from .development import Development, Draws, acting_at, informs
 from .spec import Draw, Injection, Pose, Rendering, SampleSpec, SceneExposure, stored_layers
 
 _DRAW_TRIES = 8
-_THREADS = 2  # for the effects of faults
 _TWINS_BYTES = 120 << 20  # that two images without a fault take while they are computed, for 1024×1024 pixels
 # If a step changes a pixel by this many DN, the change survives every later optical step within the paper's tables
 # (cos⁴ at 255 → 105 keeps 41 %). Such a fault counts as visible without a full comparison.
@@ -52,7 +50,6 @@ def inject_faults(
         rng=spec.rng,
         twins=[name for name in spec.faults if f"without_{name}" in stored_layers(spec.scene, spec.faults)],
     )
-    development.signal({}, [])  # before two threads need it
     in_vain = _in_vain(spec, development, commanded)
     if redrawn and asking_for_another_view(spec, in_vain):
         return Injection(draws={}, development=development, in_vain=in_vain)
@@ -60,12 +57,9 @@ def inject_faults(
     # every view uses new draws: a draw that is invisible in one view is not tried again in the next
     attempt = (views - 1) * _DRAW_TRIES
     last = attempt + _DRAW_TRIES - 1
-    # noise and the clean image use one core, the optics of the faults another
-    with ThreadPoolExecutor(1) as aside:
-        clean = aside.submit(development.image, {})
-        draws = draw_faults(spec, development, commanded, {}, attempt)
-        _prepare_signals(development, draws)
-        clean.result()
+    development.image({})  # pixels of the other images are taken from the clean one
+    draws = draw_faults(spec, development, commanded, {}, attempt)
+    _prepare_signals(development, draws)
     release_unused(_TWINS_BYTES)
     while invisible := _invisible(development, draws, stored="mask_effect" in spec.scene.dataset.layers):
         draws = {name: draw for name, draw in draws.items() if name not in invisible}
@@ -156,16 +150,13 @@ def _invisible(development: Development, draws: Draws, *, stored: bool) -> list[
         if not draws:
             return []
         development.image(draws, noisy=False)  # all effects need it
-        # without a fault that informs others, their light is computed anew, with both cores and much memory
-        alone = [name for name in draws if informs(draws[name].fault)]
-        # numpy and OpenCV use one core for most steps of the others
-        others = [name for name in draws if name not in alone]
-        with ThreadPoolExecutor(_THREADS) as pool:
-            invisible = dict(zip(others, pool.map(is_invisible, others), strict=True))
-        if alone:
+        # without a fault that informs others, their light is computed anew, with much memory
+        last = [name for name in draws if informs(draws[name].fault)]
+        invisible = {name: is_invisible(name) for name in draws if name not in last}
+        if last:
             development.forget_steps(draws)
             release_unused(_TWINS_BYTES)
-            invisible |= {name: is_invisible(name) for name in alone}
+            invisible |= {name: is_invisible(name) for name in last}
         return [name for name in draws if invisible[name]]
     doubtful = sorted(_doubtful(development, draws))
     return [n for n in doubtful if not _shows_on_some_rows(development, draws, n) and is_invisible(n)]
