@@ -44,7 +44,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
-import flight_replay
+import flight_frames
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
@@ -86,7 +86,7 @@ def read_pairs(folder: Path) -> list[tuple[str, U8, U8]]:
             f"{folder}: has {len(names)} pairs NAME_real.png, NAME_rendered.png; needs at least 4"
         )
     return [
-        (name, *(flight_replay.read_frame(folder, f"{name}_{which}") for which in ("real", "rendered")))
+        (name, *(flight_frames.read_frame(folder, f"{name}_{which}") for which in ("real", "rendered")))
         for name in names
     ]
 
@@ -98,7 +98,7 @@ def positions(
 
     A frame whose sky is clipped to 0 has no sky and no limb to compare.
     """
-    looks = [flight_replay.look(image) for image in (real, rendered)]
+    looks = [flight_frames.look(image) for image in (real, rendered)]
     lit = [one.lit for one in looks]
     if place != "body" and looks[0].clipped:
         return np.zeros((0, 2), dtype=np.int64)

@@ -41,7 +41,7 @@ def examined(place: str, *, blur_px: float) -> dict[str, tuple[float, float, flo
 def test_patches_lie_where_their_place_says() -> None:
     real, rendered = frame(1), frame(2)
     rng = np.random.default_rng(0)
-    lit = [flight_classifier.flight_replay.look(image).lit for image in (real, rendered)]
+    lit = [flight_classifier.flight_frames.look(image).lit for image in (real, rendered)]
     for place, low, high in (("body", 0.9, 1.0), ("limb", 0.3, 0.7), ("sky", 0.0, 0.0)):
         corners = flight_classifier.positions(real, rendered, SIZE, place, 6, rng)
         assert len(corners) >= 3

@@ -17,6 +17,7 @@ from vbnfault.detector.sensor import load_sensor
 from vbnfault.scene.trajectory import load_trajectory
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+import flight_frames
 import flight_replay
 
 FRAMES = Path(__file__).resolve().parents[2] / "shared/data/flight/navcam"
@@ -43,10 +44,10 @@ def disc(x: float, y: float, radius: float = 40.0, size: int = 160) -> np.ndarra
 
 def test_a_shift_is_found_and_undone() -> None:
     real, rendered = disc(83.3, 77.8), disc(80.0, 80.0)
-    shift = flight_replay.shift_between(*map(flight_replay.look, (real, rendered)), search_px=8)
+    shift = flight_frames.shift_between(*map(flight_frames.look, (real, rendered)), search_px=8)
     assert shift == pytest.approx((3.3, -2.2), abs=0.15)
-    aligned = flight_replay.look(ndimage.shift(rendered, shift[::-1], order=3, mode="nearest"))
-    figures = flight_replay.compare(flight_replay.look(real), aligned, np.array([1.0, 0.0]))
+    aligned = flight_frames.look(ndimage.shift(rendered, shift[::-1], order=3, mode="nearest"))
+    figures = flight_frames.compare(flight_frames.look(real), aligned, np.array([1.0, 0.0]))
     assert figures["iou"] > 0.985
     assert figures["rank"] > 0.95
     assert figures["limb_px"] <= 1.0
@@ -63,8 +64,8 @@ def test_a_turned_and_larger_image_is_found() -> None:
     real = cv2.warpAffine(
         rendered, onto, rendered.shape[::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT
     )
-    looks = flight_replay.look(real), flight_replay.look(rendered)
-    found = flight_replay.similarity_between(*looks, flight_replay.shift_between(*looks, search_px=8))
+    looks = flight_frames.look(real), flight_frames.look(rendered)
+    found = flight_frames.similarity_between(*looks, flight_frames.shift_between(*looks, search_px=8))
     corners = np.array([[40.0, 120.0, 80.0], [80.0, 80.0, 40.0], [1.0, 1.0, 1.0]])
     np.testing.assert_allclose(found @ corners, onto @ corners, atol=0.1)
 
@@ -93,11 +94,11 @@ def test_a_mended_pose_moves_the_image_as_the_similarity() -> None:
 
 def test_an_image_moves_by_whole_pixels_and_continues_as_its_mirror_image() -> None:
     image = np.arange(20.0).reshape(4, 5)
-    moved = flight_replay.shifted(image, (2, -1))
+    moved = flight_frames.shifted(image, (2, -1))
     assert np.array_equal(moved[:3, 2:], image[1:, :3])
     assert np.array_equal(moved[3, 2:], image[3, :3])
     assert np.array_equal(moved[:3, :2], image[1:, 1::-1])
-    assert np.array_equal(flight_replay.shifted(image, (0, 0)), image)
+    assert np.array_equal(flight_frames.shifted(image, (0, 0)), image)
 
 
 def test_raw_images_are_stretched_by_a_root_and_halved() -> None:
@@ -113,8 +114,8 @@ def test_raw_images_are_stretched_by_a_root_and_halved() -> None:
 
 
 def test_a_larger_body_has_a_smaller_overlap_and_a_limb_farther_out() -> None:
-    a, b = flight_replay.look(disc(80, 80, 40)), flight_replay.look(disc(80, 80, 44))
-    figures = flight_replay.compare(a, b, np.array([0.0, -1.0]))
+    a, b = flight_frames.look(disc(80, 80, 40)), flight_frames.look(disc(80, 80, 44))
+    figures = flight_frames.compare(a, b, np.array([0.0, -1.0]))
     assert figures["iou"] == pytest.approx((40 / 44) ** 2, abs=0.01)
     assert figures["limb_px"] == pytest.approx(4, abs=0.5)
 
@@ -128,8 +129,8 @@ def test_the_sky_tells_background_glow_columns_and_tracks() -> None:
     image += 0.8 * rng.normal(size=160)[None]
     image[20:24, 10:13] += 60
     image[140, 120:131] += 40
-    one = flight_replay.look(image)
-    figures = flight_replay.sky_figures(one, one.lit)
+    one = flight_frames.look(image)
+    figures = flight_frames.sky_figures(one, one.lit)
     scale = one.bright - one.background
     assert figures["glow_0.5"] > 1.5 * figures["glow_2"] > figures["sky"] * 0.5
     assert figures["column"] * scale == pytest.approx(0.8, rel=0.35)
@@ -148,7 +149,7 @@ def test_a_noisy_frame_is_rendered_with_the_higher_gain(tmp_path: Path) -> None:
         noise = np.random.default_rng(3).normal(size=body.shape)
         sky = 8 + np.sqrt(rounding + excess * (photons + dark / 8**2)) * noise
         sky += np.arange(len(sky)) % 3 - 1  # a pattern of columns is no noise
-        real = flight_replay.look(np.where(body > 40, body, sky))
+        real = flight_frames.look(np.where(body > 40, body, sky))
         # of 19,000 differences, each with two neighbours, the variance has a deviation of 1.3 %; the excess, 1.6 %
         assert flight_replay.noise_excess(real) == pytest.approx(excess, rel=4 * 0.016)
         chosen = flight_replay.exposed_as(scene, real, ("low", "high")).camera.detector
@@ -160,15 +161,15 @@ def test_the_black_of_a_frame_is_that_of_its_sky(tmp_path: Path) -> None:
     noise = np.random.default_rng(4).normal(size=(2, *body.shape))
     skies_dn = 5.0, 3.8
     real, rendered = (
-        flight_replay.look(np.where(body > 40, body, flight_replay._STRETCH * np.sqrt(sky_dn) + 0.6 * grain))
+        flight_frames.look(np.where(body > 40, body, flight_replay._STRETCH * np.sqrt(sky_dn) + 0.6 * grain))
         for sky_dn, grain in zip(skies_dn, noise, strict=True)
     )
     # of 81 pixels, a mean of a level of 9 has a deviation of 0.07, or 0.08 DN, and the median of many far less
     assert flight_replay.black_excess_dn(real, rendered) == pytest.approx(1.2, abs=0.04)
     assert flight_replay.black_excess_dn(rendered, real) == pytest.approx(-1.2, abs=0.04)
-    bright = flight_replay.look(np.where(body > 40, body, 20.0))  # smear or glow, and no black
+    bright = flight_frames.look(np.where(body > 40, body, 20.0))  # smear or glow, and no black
     assert flight_replay.black_excess_dn(bright, rendered) == 0
-    clipped = flight_replay.look(np.where(body > 40, body, 0.0))
+    clipped = flight_frames.look(np.where(body > 40, body, 0.0))
     assert flight_replay.black_excess_dn(clipped, rendered) == 0
 
     scene = vbnfault.load_scene("navcam67p")
@@ -188,7 +189,7 @@ def test_centre_and_limb_of_the_body_lie_where_the_table_says(frames: Path, real
         pose = table.pose(k)
         seen = (body.vertices_m - pose.camera_position_T_m) @ pose.T_from_C
         xy = seen[:, :2] / seen[:, 2:] * focal_px + 256
-        lit = flight_replay.look(flight_replay.read_frame(frames, table.name[k])).lit
+        lit = flight_frames.look(flight_frames.read_frame(frames, table.name[k])).lit
         y, x = np.nonzero(lit)
         sun_C = pose.T_from_C.T @ pose.sun_direction_T
         towards = sun_C[:2] / np.linalg.norm(sun_C[:2])
@@ -209,7 +210,7 @@ def test_a_replay_of_real_frames_agrees(frames: Path, real_shape: Path) -> None:
     session = vbnfault.Session(scene, poses=table)
     detectors = [scene.camera.detector] * 2
     row = 12
-    frame = flight_replay.reduced(flight_replay.read_frame(frames, table.name[row]), 128)
+    frame = flight_frames.reduced(flight_frames.read_frame(frames, table.name[row]), 128)
     figures = flight_replay.replay(session, table, row, frame, detectors, mendings=1).figures
     assert figures["iou"] > 0.915
     assert figures["rank"] > 0.83
