@@ -107,6 +107,13 @@ def pytest_collection() -> Generator[None, Any, Any]:
 
 
 @pytest.fixture(scope="module", autouse=True)
+def spared_what_lives_on() -> None:
+    """Spare the garbage collector what earlier test files left in caches."""
+    gc.collect()
+    gc.freeze()
+
+
+@pytest.fixture(scope="module", autouse=True)
 def one_render_thread() -> None:
     """The processes of xdist share the cores: each renders with one thread, where a test asks for no more."""
     if "PYTEST_XDIST_WORKER" in os.environ and "drjit" in sys.modules:
