@@ -1,4 +1,4 @@
-"""Develop three-colour images with one compiled kernel, and draw the shot noise of mosaics with another.
+"""Develop three-colour images with compiled kernels, and draw the shot noise of mosaics with another.
 
 A kernel keeps all intermediate results in registers.
 

@@ -13,7 +13,7 @@ from .development import Development, Draws, acting_at, informs
 from .spec import Draw, Injection, Pose, Rendering, SampleSpec, SceneExposure, stored_layers
 
 _DRAW_TRIES = 8
-_TWINS_BYTES = 120 << 20  # that two images without a fault take while they are computed, for 1024×1024 pixels
+_TWINS_BYTES = 120 << 20  # more than an image without a fault takes while it is computed, for 1024×1024 pixels
 # If a step changes a pixel by this many DN, the change survives every later optical step within the paper's tables
 # (cos⁴ at 255 → 105 keeps 41 %). Such a fault counts as visible without a full comparison.
 _CLEARLY_VISIBLE_DN = 6.0
