@@ -125,9 +125,6 @@ from vbnfault.core import resources
 from vbnfault.detector.sensor import load_sensor
 from vbnfault.scene.trajectory import FlownPose, Trajectory, load_trajectory
 
-F32 = NDArray[np.float32]
-Mask = NDArray[np.bool_]
-
 _SEARCH_PX = 16  # largest shift, for frames of 512 px
 BINNING = 2  # the frames have half the native size
 # Weights of native pixels in each axis of the halving. Noise of neighbours in the sky of the frames correlates by

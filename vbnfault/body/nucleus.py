@@ -198,7 +198,7 @@ def embedded_nucleus() -> tuple[Float64, Int32]:
 
 
 def made_nucleus() -> tuple[Float64, Int32]:
-    """Return `embedded_nucleus`, made anew."""
+    """Compute the vertices and faces of `embedded_nucleus` without the cache on disk."""
     import skimage.measure
 
     low, high = np.array([-2.95, -2.25, -2.15]), np.array([2.95, 2.35, 2.10])

@@ -1,6 +1,6 @@
-"""Develop three-colour images with compiled kernels, and draw the shot noise of mosaics with another.
+"""Develop three-colour images, and draw the shot noise of mosaics, with compiled kernels.
 
-A kernel keeps all intermediate results in registers.
+Each kernel keeps its intermediate results in registers.
 
 Every value takes the steps of `three_colour.ThreeColourDetector` in the same order and precision, so that it has
 the bits that these steps give one after the other (tests/test_detector_compiled.py). Only the exponential function
@@ -10,6 +10,7 @@ one of the 65,536 quantiles of the variates.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -104,7 +105,7 @@ def image(curve: Curve, signal: F32, codes: NDArray[np.uint16] | None, base: tup
 
 
 def _with_luminance(rgb: U8) -> U8:
-    """Return R, G, B and the luminance, uint8[4 * pixel], of R, G and B, uint8[3 * pixel]."""
+    """Return `display.with_luminance` of R, G and B in a row, uint8[3 * pixel], as uint8[4 * pixel]."""
     pixels = len(rgb) // 3
     if pixels % 4:
         return with_luminance(rgb.reshape(1, pixels, 3)).reshape(-1)
@@ -112,22 +113,28 @@ def _with_luminance(rgb: U8) -> U8:
     dr = be.dr
     group = dr.arange(be.UInt32, pixels // 4)
     words = be.UInt32(rgb.view(np.uint32))
-    a, b, c = (dr.gather(be.UInt32, words, 3 * group + k) for k in range(3))  # they hold four pixels
+    a, b, c = (dr.gather(be.UInt32, words, 3 * group + k) for k in range(3))  # three words hold four pixels
     four = a & 0xFFFFFF, a >> 24 | (b & 0xFFFF) << 8, b >> 16 | (c & 0xFF) << 16, c >> 8
     out = dr.empty(be.UInt32, pixels)
-    dr.scatter(out, be.Array4u(*(pixel | _luminance(pixel) << 24 for pixel in four)), group)
+    dr.scatter(out, be.Array4u(*(pixel | _luminance_of(pixel) << 24 for pixel in four)), group)
     dr.eval(out)
     dr.sync_thread()
     array: U8 = np.array(out, copy=False).view(np.uint8)
     return array
 
 
-def _luminance(pixel: Any) -> Any:
-    """Return the luminance of pixels of which R is the lowest byte, as UInt32."""
+def _luminance_of(pixel: Any) -> Any:
+    """Return the luminance, as UInt32, of pixels that hold R, G and B in the three lowest bytes of a word."""
+    Int32 = backend().Int32
+    return luminance(Int32(pixel >> (8 * k) & 0xFF) for k in range(3))
+
+
+def luminance(rgb: Iterable[Any]) -> Any:
+    """Return `display.luminance`, as UInt32, of the levels of R, G and B, three arrays Int32."""
     be = backend()
     light = be.Float(0.0)
-    for k, weight in enumerate(LUMINANCE_WEIGHTS):
-        light = be.dr.fma(be.Float(be.Int32(pixel >> (8 * k) & 0xFF)), float(weight), light)
+    for level, weight in zip(rgb, LUMINANCE_WEIGHTS, strict=True):
+        light = be.dr.fma(be.Float(level), float(weight), light)
     return be.UInt32(be.Int32(be.dr.round(light)))
 
 

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from ..core import buffers
 from ..core.llvm import backend
+from .compiled import luminance
 from .demosaic import HARD_NOISE, HARD_RATIO, LEAST_PX, Mask, Method, colour_sites
-from .display import LUMINANCE_WEIGHTS, Display
+from .display import Display
 from .mosaic import Pattern
 
 Raw = NDArray[np.uint16]
@@ -147,16 +148,15 @@ class _Tile:
         top = _extreme(dr.maximum, [lit[cy + dy][cx + dx] for dy, dx in reach])
         lowest = _extreme(dr.minimum, [at(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1)])
         maybe = (top - lowest > self._noise) & (top - lowest > lowest - self._black)
-        out, light = be.UInt32(0), be.Float(0.0)
+        rgb = []
         for k, name in enumerate(self._kernels(y, x)):
             value = middle
             if name is not None:
                 eighths, near = kernels[name]
                 value = self._bounded(eighths * 0.125, near, top, lit[cy][cx] - self._black, maybe)
-            level = be.Int32(dr.clip(dr.round(be.Float64(value - self._black) * self._scale[k]), 0, 255))
-            out |= be.UInt32(level) << (8 * k)
-            light = dr.fma(be.Float(level), float(LUMINANCE_WEIGHTS[k]), light)
-        return out | be.UInt32(be.Int32(dr.round(light))) << 24
+            rgb.append(be.Int32(dr.clip(dr.round(be.Float64(value - self._black) * self._scale[k]), 0, 255)))
+        red, green, blue = (be.UInt32(level) for level in rgb)
+        return red | green << 8 | blue << 16 | luminance(rgb) << 24
 
     def _kernels(self, y: int, x: int) -> tuple[str | None, str | None, str | None]:
         """Return the kernels of Malvar's for R, G and B at a pixel of the tile; None for its own colour."""

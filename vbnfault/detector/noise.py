@@ -105,7 +105,7 @@ def _outermost(codes: NDArray[np.uint16]) -> NDArray[np.intp]:
 
 
 def uniform_codes(size: int, key: NDArray[np.uint64]) -> tuple[NDArray[np.uint16], NDArray[np.intp]]:
-    """Return uniform numbers of 16 bits, uint16[size], and the indices of the outermost ones, intp[n], ascending.
+    """Return uniform numbers of 16 bits, uint16[size], and the indices of those that are 0 or 65535, intp[n].
 
     Word i of 64 bits, which holds four numbers, is the finalizer of SplitMix64 (Steele, Lea and Flood 2014, OOPSLA,
     doi 10.1145/2660193.2660195) of i times the golden ratio plus `key[0]`; `key[1]` is mixed in halfway, so that
