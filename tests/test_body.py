@@ -200,7 +200,7 @@ def _section_area(mesh: trimesh.Trimesh, origin: object, axis: np.ndarray) -> fl
 
 
 def test_nucleus_is_the_same_every_time() -> None:
-    """Made anew, read from disk and kept by the process."""
+    """The nucleus that is computed equals the one that the process keeps and the one that is read from disk."""
     made = made_nucleus()
     kept = embedded_nucleus()
     embedded_nucleus.cache_clear()

@@ -452,7 +452,7 @@ def test_a_bad_baffle_is_told() -> None:
 
 
 def test_the_table_of_dust_is_the_same_from_disk() -> None:
-    """Kept by the process, read from disk, and computed for some of its sizes."""
+    """The table that the process keeps equals the one read from disk and, at some sizes, the one computed."""
     edges, angles, kept = scatter._intensities(scatter.DUST_INDEX)
     scatter._intensities.cache_clear()
     read = scatter._intensities(scatter.DUST_INDEX)[2]
