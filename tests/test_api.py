@@ -164,6 +164,17 @@ def test_a_merge_of_one_text_is_refused(tmp_path: Path) -> None:
         vbnfault.merge("a.zarr", tmp_path / "out.zarr")
 
 
+def test_options_and_overrides_of_another_type_are_refused_in_a_sentence(tmp_path: Path) -> None:
+    """A number, or a list of assignments as the command line takes them, would end in an AttributeError."""
+    with pytest.raises(InputError, match=r"overrides = \['camera.fov_deg=3'\]: must be a table of dotted keys"):
+        vbnfault.load_scene("quickstart", ["camera.fov_deg=3"])  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=r"options = \{'workers': 2\}: must be BuildOptions$"):
+        vbnfault.build(small(), tmp_path / "s.zarr", {"workers": 2})  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=r"options = 2: must be BuildOptions$"):
+        vbnfault.retake(tmp_path / "a.zarr", small(), tmp_path / "s.zarr", 2)  # type: ignore[call-overload]
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("path", [None, 3, b"x", []])
 def test_what_is_no_path_is_refused_in_a_sentence(tmp_path: Path, path: Any) -> None:
     calls: list[Callable[[], object]] = [

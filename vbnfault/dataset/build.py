@@ -122,6 +122,16 @@ class BuildOptions:
             if self.overwrite:
                 raise InputError("--shard-range and --overwrite exclude each other: delete the store first")
 
+    @classmethod
+    def of(cls, options: BuildOptions | None, keywords: Mapping[str, Any]) -> BuildOptions:
+        """Return `options`, or the default ones, with `keywords` in place of their fields.
+
+        Raises InputError if `options` is of another type, or a value is outside its range.
+        """
+        if not isinstance(options, cls | None):
+            raise InputError(f"options = {shown(options)}: must be BuildOptions")
+        return replace(options or cls(), **keywords)
+
     def shards_of(self, count: int) -> range:
         """Return the shards to make of a store of `count` shards. Raises InputError if it has no such shards."""
         part = range(count) if self.shard_range is None else self.shard_range

@@ -123,7 +123,7 @@ def build_scene(
     VbnfaultError
         If the files cannot be written, the disk is too small, or the cluster fails.
     """
-    options = dataclasses.replace(options or build.BuildOptions(), **keywords)
+    options = build.BuildOptions.of(options, keywords)
     if not isinstance(scene, Scene):
         source, scene = source or str(scene), config.load_scene(scene)
     source, out = source or "scene", store.located(out)

@@ -113,7 +113,7 @@ def retake(
     BuildFailed, Interrupted, VbnfaultError
         As for `build`.
     """
-    options = dataclasses.replace(options or build.BuildOptions(), **keywords)
+    options = build.BuildOptions.of(options, keywords)
     if not isinstance(scene, Scene):
         source, scene = source or str(scene), config.load_scene(scene)
     source, target = source or "scene", store.located(out)

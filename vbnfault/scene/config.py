@@ -184,6 +184,8 @@ def load_scene(name_or_path: str | Path, overrides: Mapping[str, Any] | None = N
     mesh or a texture) starts from the file's folder, or from the working folder where nothing lies there. A path in
     `overrides` starts from the working folder.
     """
+    if not isinstance(overrides, Mapping | None):
+        raise InputError(f"overrides = {shown(overrides)}: must be a table of dotted keys and their values")
     path = resources.find("scenes", name_or_path)
     table = toml_files.read_toml(path)
     tables.replace(table, overrides or {}, source=str(path))
