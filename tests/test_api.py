@@ -168,11 +168,26 @@ def test_options_and_overrides_of_another_type_are_refused_in_a_sentence(tmp_pat
     """A number, or a list of assignments as the command line takes them, would end in an AttributeError."""
     with pytest.raises(InputError, match=r"overrides = \['camera.fov_deg=3'\]: must be a table of dotted keys"):
         vbnfault.load_scene("quickstart", ["camera.fov_deg=3"])  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=r"5 = 3: the key must be a text"):
+        vbnfault.load_scene("quickstart", {5: 3})  # type: ignore[dict-item]
     with pytest.raises(InputError, match=r"options = \{'workers': 2\}: must be BuildOptions$"):
         vbnfault.build(small(), tmp_path / "s.zarr", {"workers": 2})  # type: ignore[arg-type]
     with pytest.raises(InputError, match=r"options = 2: must be BuildOptions$"):
         vbnfault.retake(tmp_path / "a.zarr", small(), tmp_path / "s.zarr", 2)  # type: ignore[call-overload]
     assert not list(tmp_path.iterdir())
+
+
+def test_a_misspelt_name_and_one_without_its_ending_get_a_suggestion(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match=r"^quickstrt: neither .* name \(did you mean quickstart\?\); scenes: "):
+        vbnfault.load_scene("quickstrt")
+    Path("mine.toml").write_text('title = "mine"\n')
+    with pytest.raises(InputError, match=r"^mine: neither .* name \(did you mean mine\.toml\?\); scenes: "):
+        vbnfault.load_scene("mine")
+    with pytest.raises(InputError, match=r"^zzz: neither a file nor a packaged name; lenses: "):
+        vbnfault.load_lens("zzz")
 
 
 @pytest.mark.parametrize("path", [None, 3, b"x", []])

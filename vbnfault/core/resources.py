@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import stat
 from pathlib import Path
 
@@ -10,6 +11,7 @@ from .path_checks import check_path, file_status, kind_of, path_of, shown_path, 
 
 # Folder of the package vbnfault.
 PACKAGE = Path(__file__).resolve().parents[1]
+_SINGULAR = {"scenes": "scene", "lenses": "lens", "detectors": "detector", "studies": "study"}
 
 
 def data_dir(kind: str) -> Path:
@@ -30,8 +32,9 @@ def packaged(kind: str) -> dict[str, Path]:
 def find(kind: str, name_or_path: str | Path) -> Path:
     """Return the path as given, or the packaged file of that name. Raises InputError, which lists these names."""
     what = kind.rsplit("/", 1)[-1]
-    path = path_of(name_or_path, what)
-    check_path(str(name_or_path), what)
+    one = _SINGULAR.get(what, what)
+    path = path_of(name_or_path, one)
+    check_path(str(name_or_path), one)
     status = file_status(path)
     if path.suffix or status:
         if status and stat.S_ISREG(status.st_mode):
@@ -42,4 +45,9 @@ def find(kind: str, name_or_path: str | Path) -> Path:
     known = packaged(kind)
     if str(name_or_path) in known:
         return known[str(name_or_path)]
-    raise InputError(f"{shown_path(name_or_path)}: neither a file nor a packaged name; {what}: {', '.join(known)}")
+    beside = Path(f"{name_or_path}.toml")
+    near = [str(beside)] if file_status(beside) else difflib.get_close_matches(str(name_or_path), known, n=1)
+    hint = f" (did you mean {shown_path(near[0])}?)" if near else ""
+    raise InputError(
+        f"{shown_path(name_or_path)}: neither a file nor a packaged name{hint}; {what}: {', '.join(known)}"
+    )

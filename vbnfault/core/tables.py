@@ -138,6 +138,10 @@ def replace(table: dict[str, Any], values: Mapping[str, Any], *, source: str) ->
     """
     for key, given in values.items():
         value = _as_plain(given)
+        if not isinstance(key, str):
+            raise InputError(
+                f"{source}: {shown(key)} = {shown(value)}: the key must be a text, such as 'dataset.seed'"
+            )
         *parents, leaf = dotted(key).split(".")
         node: Any = table
         for i, parent in enumerate(parents):

@@ -113,9 +113,9 @@ def described(store: Store, numbers: Statistics) -> list[str]:
     lines += [
         "## Provenance",
         "",
-        "Every parameter of the scene, and where its value comes from. `default`: the default of "
+        "Every parameter of the scene, and where its value comes from. `default`: it equals the default of "
         "vbnfault. `set`: the "
-        "scene file or its command sets it. Pairs of faults are bounds; each sample's drawn values "
+        "scene file or its command sets another one. Pairs of faults are bounds; each sample's drawn values "
         "are in the array "
         "`parameters`. A value `sha256:...` is the digest of the contents of a file.",
         "",

@@ -332,7 +332,8 @@ def _check_grid(opened: Store, session: pipeline.Session, source: str) -> None:
     if needed[0] > had[0] or needed[1] > had[1]:
         raise InputError(
             f"{source}: {lens}: needs light from {max(needed)} px around the frame, and {opened.path} has "
-            f"{min(had)} px; a lens with as much distortion or less can be used, or none"
+            f"{min(had)} px; take a lens with as much distortion or less, or none, or build the store with "
+            "this lens"
         )
 
 
