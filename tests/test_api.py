@@ -177,6 +177,29 @@ def test_options_and_overrides_of_another_type_are_refused_in_a_sentence(tmp_pat
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    ("given", "sentence"),
+    [
+        ({"sun_deg": "16"}, "sun_deg = '16': must be from 0 to 90, and a number"),
+        ({"sun_deg": None}, "sun_deg = None: must be from 0 to 90, and a number"),
+        ({"sun_deg": 16, "pixels": "128"}, "pixels = '128': must be from 16 to 4096, and a number"),
+        ({"sun_deg": 16, "pixels": 128.5}, "pixels = 128.5: must be a whole number"),
+        (
+            {"sun_deg": 16, "wavelength_nm": [550, 600]},
+            r"wavelength_nm = \[550, 600\]: must be from 250 to 2500, and a number",
+        ),
+    ],
+)
+def test_a_flare_of_what_is_no_number_is_refused_in_a_sentence(given: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence):
+        vbnfault.trace_flare("tessar_50_f2p8", **given)
+
+
+def test_a_session_of_a_path_is_refused_in_a_sentence() -> None:
+    with pytest.raises(InputError, match=r"scene = 'quickstart': must be a Scene, as vbnfault\.load_scene returns"):
+        vbnfault.Session("quickstart")  # type: ignore[arg-type]
+
+
 def test_a_misspelt_name_and_one_without_its_ending_get_a_suggestion(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

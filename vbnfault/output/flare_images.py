@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..camera import Camera
 from ..core import spectra
-from ..core.errors import InputError
+from ..core.errors import InputError, shown
 from ..core.images import srgb8, write_exr, write_png
 from ..core.quantities import Electrons
 from ..detector import ThreeColourDetector
@@ -88,8 +89,11 @@ class FlareRequest:
     def __post_init__(self) -> None:
         for name, lowest, highest in RANGES:
             value = getattr(self, name)
-            if value is not None and not lowest <= value <= highest:
-                raise InputError(f"{name} = {value}: must be from {lowest:g} to {highest:g}")
+            optional = name == "white" and value is None
+            if not optional:
+                _check_number(name, value, lowest, highest)
+        if self.pixels != int(self.pixels):
+            raise InputError(f"pixels = {self.pixels:g}: must be a whole number")
         if self.sun_deg == 90:
             raise InputError("sun_deg = 90: must be from 0 to below 90")
         if self.model not in MODELS:
@@ -129,9 +133,16 @@ def wavelengths_nm(single_nm: float | None = None) -> F64:
     """
     if single_nm is None:
         return spectra.band_nodes_nm(400.0, 700.0, _BANDS)
-    if not 250 <= single_nm <= 2500:
-        raise InputError(f"wavelength_nm = {single_nm:g}: must be from 250 to 2500")
+    _check_number("wavelength_nm", single_nm, 250, 2500)
     return np.array([float(single_nm)])
+
+
+def _check_number(name: str, value: Any, lowest: float, highest: float) -> None:
+    """Raise InputError for what is no number, and for a number outside its range."""
+    if not isinstance(value, Real):
+        raise InputError(f"{name} = {shown(value)}: must be from {lowest:g} to {highest:g}, and a number")
+    if not lowest <= float(value) <= highest:
+        raise InputError(f"{name} = {float(value):g}: must be from {lowest:g} to {highest:g}")
 
 
 def layers(request: FlareRequest) -> dict[str, F32]:

@@ -180,6 +180,8 @@ class Session:
         source: str = "scene",
         poses: object = None,
     ) -> None:
+        if not isinstance(scene, Scene):
+            raise InputError(f"scene = {shown(scene)}: must be a Scene, as vbnfault.load_scene returns it")
         share_arenas()  # before terrain and renderer start their threads
         self.trajectory: Trajectory | None = None
         if poses is not None:
