@@ -72,11 +72,11 @@ temperatures that are drawn put the level up to 1.7 DN off. On the 33 frames:
 
 The last three columns are the patches that the classifier tells, with `--splits 4` and for `TEXTURE` `--draws 4`;
 50 % would be none. With `--draws 8` the body of `TEXTURE` has 75.2 %, single draws have 72 to 79 %. With
-`patch.scarps = 0.3` it has 76.5 % in the same draws, and with 0.5, in the first four of them, 78.0 % (here 74.6
-%). The settings were chosen by it on the same frames, so others may be told more often. What had given the images
-away most were mottled plains and a core of the point spread that was too wide: real ground is either smooth or
-rough, and boulders and shadows on it are sharp. Obliquely lit ground is still too rough in its smoothest tenth,
-and real scarps throw thin dark lines where ours throw spots.
+`patch.scarps = 0.3` it has 76.5 % in the same draws, and with 0.5, in the first four of them, 78.0 %, where
+`TEXTURE` has 74.6 %. The settings were chosen by the classifier on the same frames, so others may be told more
+often. What had given the images away most were mottled plains and a core of the point spread that was too wide:
+real ground is either smooth or rough, and boulders and shadows on it are sharp. Obliquely lit ground is still too
+rough in its smoothest tenth, and real scarps throw thin dark lines where ours throw spots.
 
 The sky of 31 frames is the sum of six parts, fitted by least squares to means over 8 px: the halo of the limb;
 light scattered farther, 0.5 % of that of the body (0.4 to 0.8 % in four fifths of the frames; the wings of the

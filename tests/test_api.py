@@ -206,9 +206,9 @@ def test_a_misspelt_name_and_one_without_its_ending_get_a_suggestion(
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError, match=r"^quickstrt: neither .* name \(did you mean quickstart\?\); scenes: "):
         vbnfault.load_scene("quickstrt")
-    Path("mine.toml").write_text('title = "mine"\n')
-    with pytest.raises(InputError, match=r"^mine: neither .* name \(did you mean mine\.toml\?\); scenes: "):
-        vbnfault.load_scene("mine")
+    Path("a.toml").write_text('title = "mine"\n')
+    with pytest.raises(InputError, match=r"^a: neither .* name \(did you mean a\.toml\?\); scenes: "):
+        vbnfault.load_scene("a")
     with pytest.raises(InputError, match=r"^zzz: neither a file nor a packaged name; lenses: "):
         vbnfault.load_lens("zzz")
 

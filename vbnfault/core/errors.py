@@ -5,7 +5,8 @@ Each message is one sentence. The errors hold plain strings only, so that they c
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import difflib
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
 # The most characters of a message and of a value. Any key, value and allowed range are shorter. A longer text, such
@@ -73,6 +74,12 @@ def shown_whole(value: object) -> str:
         return repr(value)
     except (ValueError, RecursionError):  # it holds too long a number, or is nested too deep
         return f"a {type(value).__name__}"
+
+
+def suggestion(word: str, known: Iterable[str]) -> str:
+    """Return the known word that is nearest to an unknown one as " (did you mean ...?)", or "" if none is near."""
+    near = difflib.get_close_matches(word, list(known), n=1)
+    return f" (did you mean {near[0]}?)" if near else ""
 
 
 def without_middle(text: str, length: int = _LONGEST_VALUE) -> str:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import difflib
 import stat
 from pathlib import Path
 
-from .errors import InputError
+from .errors import InputError, suggestion
 from .path_checks import check_path, file_status, kind_of, path_of, shown_path, why_absent
 
 # Folder of the package vbnfault.
@@ -46,8 +45,8 @@ def find(kind: str, name_or_path: str | Path) -> Path:
     if str(name_or_path) in known:
         return known[str(name_or_path)]
     beside = Path(f"{name_or_path}.toml")
-    near = [str(beside)] if file_status(beside) else difflib.get_close_matches(str(name_or_path), known, n=1)
-    hint = f" (did you mean {shown_path(near[0])}?)" if near else ""
+    named = f" (did you mean {shown_path(beside)}?)" if file_status(beside) else ""
+    hint = named or suggestion(str(name_or_path), known)
     raise InputError(
         f"{shown_path(name_or_path)}: neither a file nor a packaged name{hint}; {what}: {', '.join(known)}"
     )

@@ -8,7 +8,6 @@ follow the checks, the error messages and the JSON Schema.
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import json
 import operator
 import os
@@ -21,7 +20,7 @@ import pydantic.dataclasses
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from . import path_checks, toml_files
-from .errors import InputError, shown
+from .errors import InputError, shown, suggestion
 
 T = TypeVar("T")
 
@@ -290,8 +289,7 @@ def sentence(details: Sequence[Any], schema: Mapping[str, Any], where: str = "")
 
 def did_you_mean(word: str, known: Sequence[str]) -> str:
     """Return the known word that is nearest to an unknown one as a suggestion, or the list of all known words."""
-    close = difflib.get_close_matches(word, known, n=1)
-    return f" (did you mean {close[0]}?)" if close else f"; known: {', '.join(known)}"
+    return suggestion(word, known) or f"; known: {', '.join(known)}"
 
 
 def _wrong(

@@ -124,7 +124,7 @@ class BuildOptions:
 
     @classmethod
     def of(cls, options: BuildOptions | None, keywords: Mapping[str, Any]) -> BuildOptions:
-        """Return `options`, or the default ones, with `keywords` in place of their fields.
+        """Return `options`, or the default options, with the fields replaced that `keywords` names.
 
         Raises InputError if `options` is of another type, or a value is outside its range.
         """

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..camera import Camera
-from ..core import spectra
+from ..core import spectra, tables
 from ..core.errors import InputError, shown
 from ..core.images import srgb8, write_exr, write_png
 from ..core.quantities import Electrons
@@ -89,11 +89,10 @@ class FlareRequest:
     def __post_init__(self) -> None:
         for name, lowest, highest in RANGES:
             value = getattr(self, name)
-            optional = name == "white" and value is None
-            if not optional:
+            if name != "white" or value is not None:
                 _check_number(name, value, lowest, highest)
-        if self.pixels != int(self.pixels):
-            raise InputError(f"pixels = {self.pixels:g}: must be a whole number")
+        if tables.whole(self.pixels) is None:
+            raise InputError(f"pixels = {shown(self.pixels)}: must be a whole number")
         if self.sun_deg == 90:
             raise InputError("sun_deg = 90: must be from 0 to below 90")
         if self.model not in MODELS:
@@ -138,7 +137,7 @@ def wavelengths_nm(single_nm: float | None = None) -> F64:
 
 
 def _check_number(name: str, value: Any, lowest: float, highest: float) -> None:
-    """Raise InputError for what is no number, and for a number outside its range."""
+    """Raise InputError if the value is not a number, or is outside the range."""
     if not isinstance(value, Real):
         raise InputError(f"{name} = {shown(value)}: must be from {lowest:g} to {highest:g}, and a number")
     if not lowest <= float(value) <= highest:
