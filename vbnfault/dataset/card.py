@@ -115,8 +115,8 @@ def described(store: Store, numbers: Statistics) -> list[str]:
         "",
         "Every parameter of the scene, and where its value comes from. `default`: it equals the default of "
         "vbnfault. `set`: the scene file or its command sets another one. Pairs of faults are bounds; each "
-        "sample's drawn values are in the array `parameters`. A value `sha256:...` is the digest of the contents of a "
-        "file.",
+        "sample's drawn values are in the array `parameters`. A value `sha256:...` is the digest of the contents "
+        "of a file.",
         "",
         *markdown_table([["parameter", "value", "from"], *_provenance(attributes)]),
         "",
