@@ -248,14 +248,18 @@ class Direct(Light):
                 signals[0][span] = sums[-1]
                 signals[1][span] = samples.reshape(-1, spp)
 
-        done: tuple[slice, list[NDArray[np.float32]], NDArray[np.float16] | None] | None = None
+        def fetched(span: slice, sums: list[Any], samples: Any) -> None:
+            """Wait for the kernels of a part, and take what they give."""
+            take(span, [total.numpy() for total in sums], None if samples is None else samples.numpy())
+
+        queued: tuple[slice, list[Any], Any] | None = None
         for part in pixels.parts(max(1, WAVEFRONT // (spp * len(weights)))):
-            span, sums, samples = started(part)
-            if done is not None:  # numpy uses one core: it works while the kernels of the next part run
-                take(*done)
-            done = span, [total.numpy() for total in sums], None if samples is None else samples.numpy()
-        if done is not None:
-            take(*done)
+            following = started(part)
+            if queued is not None:  # the kernels of the next part run while numpy takes those of the last
+                fetched(*queued)
+            queued = following
+        if queued is not None:
+            fetched(*queued)
         return out, signals
 
     def mean_limb(self, signal: NDArray[np.float64]) -> tuple[float, ...] | None:
