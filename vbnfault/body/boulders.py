@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -14,7 +14,7 @@ from ..core.llvm import backend
 from .fields import GRADIENT_STD, Points
 from .noise import noise_key
 from .refine import split
-from .shape import Float64, Int32, face_normals_areas
+from .shape import Float64, Int32, face_centres, face_normals_areas
 from .spec import INDEX, PER_KM2, PatchSpec
 
 REFERENCE_M = 7.0
@@ -108,9 +108,18 @@ def add_boulders(ground: GroundMesh, spec: PatchSpec, *, rng: np.random.Generato
 
     `rng` draws the boulders; `spec.seed` selects the noise fields by which they cluster.
     """
+    with ThreadPoolExecutor(1) as aside:  # the tree keeps one core busy
+        tree = aside.submit(cKDTree, ground.points, balanced_tree=False, compact_nodes=False)
+        return _strewn(ground, spec, tree, rng=rng, budget=budget)
+
+
+def _strewn(
+    ground: GroundMesh, spec: PatchSpec, tree: Future[cKDTree], *, rng: np.random.Generator, budget: int
+) -> Boulders:
+    """Return the boulders of `add_boulders`; `tree` finds the ground's points."""
     points, faces = ground.points, ground.faces
     normals, _ = face_normals_areas(points, faces)
-    centre = points[faces].mean(axis=1)
+    centre = face_centres(points, faces)
     distance = np.sqrt(np.einsum("ni,ni->n", centre, centre))
     smallest = smallest_at(distance, spec.min_boulder_m, spec.boulder_near_m)
     bearing = smallest < LARGEST_M
@@ -129,13 +138,12 @@ def add_boulders(ground: GroundMesh, spec: PatchSpec, *, rng: np.random.Generato
     kept = np.sort(kept)
     kept = kept[np.argsort(level[kept], kind="stable")]
 
-    tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
     vertices, triangles, flat, positions, start = [np.empty((0, 3))], [np.empty((0, 3), np.int64)], [], [], 0
     for k in range(_LEVELS + 1):
         group = kept[level[kept] == k]
         if len(group):
             rocks, sphere_faces, centres = _rocks(
-                k, diameter[group], position[group], normals[face[group]], points, tree, rng
+                k, diameter[group], position[group], normals[face[group]], points, tree.result(), rng
             )
             offsets = start + np.arange(len(group))[:, None, None] * rocks.shape[1]
             vertices.append(rocks.reshape(-1, 3))
@@ -172,7 +180,7 @@ def _levels(diameter_m: Float64, facet_m: Float64, distance_m: Float64, budget: 
 def _favour(ground: GroundMesh, normals: Float64, faces: Int32, spec: PatchSpec) -> Float64:
     """Return the relative density of boulders on some faces, float64[m], from their normals and vertices."""
     dust, talus = ground.dust[faces], ground.talus[faces]
-    place = Points(ground.place_T_m[faces].mean(axis=1))
+    place = Points(face_centres(ground.place_T_m, faces))
     count = len(faces)
     broad = place.gradient(110.0, noise_key(spec.seed, 9001), count) / GRADIENT_STD
     close = place.gradient(23.0, noise_key(spec.seed, 9002), count) / GRADIENT_STD

@@ -6,16 +6,15 @@ The noise is a function of position and seed alone, so that every call returns t
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .blocks import in_blocks
+
 Float32 = NDArray[np.float32]
 UInt32 = NDArray[np.uint32]
 
-_CHUNK = 32_768  # points at once; the temporaries then fit the processor's cache, which more than halves the time
-_THREADS = 2
 _PRIMES = tuple(np.uint32(p) for p in (0x8DA6B343, 0xD8163841, 0xCB1AB31F))
 _MIX = (np.uint32(0x7FEB352D), np.uint32(0x846CA68B))
 
@@ -60,16 +59,10 @@ def noise_key(seed: int, stream: int) -> int:
     return (seed << 16) + stream
 
 
-def _by_chunks(kernel: Callable[[NDArray, UInt32], Float32], points: NDArray, seed: int, columns: int) -> Float32:
-    """Apply a noise kernel to chunks of the points, float32[n, columns]."""
-    out = np.empty((len(points), columns), dtype=np.float32)
+def _by_blocks(kernel: Callable[[NDArray, UInt32], Float32], points: NDArray, seed: int) -> Float32:
+    """Apply a noise kernel to all points, float32[n, column]."""
     word = seed_word(seed)
-
-    def apply(start: int) -> None:
-        out[start : start + _CHUNK] = kernel(points[start : start + _CHUNK], word)
-
-    with ThreadPoolExecutor(_THREADS) as pool:  # numpy uses one core
-        list(pool.map(apply, range(0, len(points), _CHUNK)))
+    (out,) = in_blocks(lambda block: (kernel(block, word),), points)
     return out
 
 
@@ -105,7 +98,7 @@ def gradient_noise(points: NDArray, seed: int) -> Float32:
     seed
         Any integer; its low 64 bits count.
     """
-    return _by_chunks(_gradient_kernel, points, seed, 1)[:, 0]
+    return _by_blocks(_gradient_kernel, points, seed)[:, 0]
 
 
 def fractal_noise(points_m: NDArray, seed: int, wavelengths_m: NDArray, amplitudes_m: NDArray) -> Float32:

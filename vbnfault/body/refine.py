@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .blocks import in_blocks
 from .shape import Float64, Int32
 
 # Splitting halves an edge, so final lengths lie between half the limit and the limit. With this ratio of limit to
@@ -99,10 +101,7 @@ def refine(points: Float64, normals: Float64, faces: Int32, limit: EdgeLimit) ->
     active = faces.astype(np.int64)
     bar = np.inf
     while len(active):
-        ends = active[:, [[1, 2], [2, 0], [0, 1]]]  # edge k is opposite corner k
-        a, b = (points.take(ends[..., k], axis=0) for k in (0, 1))  # takes half as long as an index in brackets
-        length = np.sqrt(np.einsum("fki,fki->fk", b - a, b - a))
-        long = length > limit.along(a, b)
+        length, long = in_blocks(partial(_edges, points, limit), active)
         finished = ~(long[:, 0] | long[:, 1] | long[:, 2])  # numpy's `any` is slow along an axis of three
         done.append(active[finished])
         active, long, length = active[~finished], long[~finished], length[~finished]
@@ -112,6 +111,14 @@ def refine(points: Float64, normals: Float64, faces: Int32, limit: EdgeLimit) ->
         chosen = long & (length > bar)
         points, normals, active = split(points, normals, active, chosen, length)
     return points, normals, np.concatenate(done).astype(np.int32)
+
+
+def _edges(points: Float64, limit: EdgeLimit, faces: NDArray[np.int64]) -> tuple[Float64, NDArray[np.bool_]]:
+    """Return the length of each edge of the faces, float64[m, 3], and whether it exceeds its limit, bool[m, 3]."""
+    ends = faces[:, [[1, 2], [2, 0], [0, 1]]]  # edge k is opposite corner k
+    a, b = (points.take(ends[..., k], axis=0) for k in (0, 1))  # takes half as long as an index in brackets
+    length = np.sqrt(np.einsum("fki,fki->fk", b - a, b - a))
+    return length, length > limit.along(a, b)
 
 
 def split(

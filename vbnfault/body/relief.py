@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from . import fractured
+from .blocks import in_blocks
 from .gravity import GRAVITATIONAL_CONSTANT
 from .noise import Float32
 from .octaves import Octaves, smooth_max, smooth_step
@@ -307,12 +308,16 @@ def _slumped(points: Float64, faces: Int32, height_m: Float64) -> Float64:
     # in a closed mesh, every edge occurs once in each direction; one of them is kept
     a, b = (np.concatenate([faces[:, k] for k in ends]) for ends in ((0, 1, 2), (1, 2, 0)))
     a, b = a[a < b], b[a < b]
-    off = points[a] - points[b]
-    most = _STEEPEST * np.sqrt(np.einsum("ni,ni->n", off, off))
+
+    def steepest(a: Int32, b: Int32) -> tuple[Float64]:
+        off = points.take(a, axis=0) - points.take(b, axis=0)
+        return (_STEEPEST * np.sqrt(np.einsum("ni,ni->n", off, off)),)
+
+    (most,) = in_blocks(steepest, a, b)
     height = height_m.copy()
     for _ in range(_SLUMPS):
         # edges that are nearly too steep may become so while others become flatter
-        near = np.abs(height[a] - height[b]) > 0.8 * most
+        near = np.abs(height.take(a) - height.take(b)) > 0.8 * most
         if not near.any():
             break
         i, j, limit = a[near], b[near], most[near]

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ..core import meshes, user_files
 from ..core.errors import InputError
 from . import formats
+from .blocks import in_blocks
 
 Unit = Literal["auto", "m", "km"]
 Float64 = NDArray[np.float64]
@@ -242,10 +243,26 @@ def vertex_normals(vertices: NDArray, faces: NDArray) -> Float64:
 def _face_crosses(vertices: NDArray, faces: NDArray) -> tuple[Float64, Float64, Float64]:
     """Return the cross products of two edges of each face, as three components float64[m]."""
     # axis by axis, because numpy is several times slower on arrays of triples
-    corners = [faces[:, k].astype(np.intp) for k in range(3)]
     axes = [np.ascontiguousarray(vertices[:, axis], dtype=np.float64) for axis in range(3)]
-    (ux, uy, uz), (vx, vy, vz) = ([of[corners[k]] - of[corners[0]] for of in axes] for k in (1, 2))
-    return uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+
+    def crosses(faces: NDArray) -> tuple[Float64, Float64, Float64]:
+        corners = [faces[:, k].astype(np.intp) for k in range(3)]
+        (ux, uy, uz), (vx, vy, vz) = ([of.take(corners[k]) - of.take(corners[0]) for of in axes] for k in (1, 2))
+        return uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+
+    x, y, z = in_blocks(crosses, faces)
+    return x, y, z
+
+
+def face_centres(vertices: NDArray, faces: NDArray) -> Float64:
+    """Return the means of the faces' corners, float64[m, 3]."""
+
+    def means(faces: NDArray) -> tuple[Float64]:
+        a, b, c = (vertices.take(faces[:, k], axis=0) for k in range(3))
+        return (((a + b) + c) / 3,)
+
+    (out,) = in_blocks(means, faces)
+    return out
 
 
 def _check_arrays(vertices: NDArray, faces: NDArray, source: str) -> None:
