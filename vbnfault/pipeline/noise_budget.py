@@ -189,7 +189,7 @@ class _Refined:
 
         The last round takes up to twice the limit in a pixel: where most lit pixels lie at hard edges of shadows,
         the limit would otherwise leave more than `_NOISY_FRACTION` of them with too much noise. A cell takes no
-        more than in the earlier rounds, because the table of points for 4096 samples takes half a second.
+        more than in the earlier rounds.
         """
         if not self._rounds:
             # the error over 3×3 pixels corrects what the ranges let expect

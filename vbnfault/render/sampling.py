@@ -73,7 +73,7 @@ class Strata:
         return mi.Float((h * 0x85EBCA77) >> 8) * 2.0**-24
 
     def disc(self, dimension: int) -> Any:
-        """Return a point of the unit disc; the samples of a pixel share one of 256 even sets, chosen by a hash.
+        """Return a point of the unit disc; the samples of a pixel share an even set of points, chosen by a hash.
 
         `dimension` separates uses: each takes different sets, in different orders. If `limb` is given, points of
         the Sun lie more densely where its disc is brighter.
@@ -82,7 +82,8 @@ class Strata:
         h ^= h >> 15
         h *= 0x85EBCA77
         h ^= h >> 13
-        index = ((h & (_DISC_SETS - 1)) << self._shift) + self.index
+        last = dr.opaque(mi.UInt32, _set_count(self.samples) - 1)
+        index = ((h & last) << self._shift) + self.index
         limb = self.limb if dimension == SUN_DIMENSION else None
         return dr.gather(mi.Point2f, _disc_table(self.samples, dimension, limb), index)
 
@@ -100,14 +101,22 @@ class Pixels:
             yield Pixels(min(most, self.count - start), self.first + start)
 
 
-_DISC_SETS = 256
+# Pixels of few samples share more sets, because these together cover the disc. All sets of a table are taken from a
+# cache, which holds tables of this many points.
+_MOST_SETS, _FEWEST_SETS = 256, 16
+_TABLE_POINTS = 1 << 14
+
+
+def _set_count(samples: int) -> int:
+    """Return the number of sets of `samples` points of the disc, a power of two like `samples`."""
+    return min(max(_TABLE_POINTS // samples, _FEWEST_SETS), _MOST_SETS)
 
 
 # An adaptive render with an aperture and bounces needs two or three tables for each of up to nine sample counts.
-# A table has 2 KiB per sample.
+# A table has 128 KiB, or more for many samples.
 @lru_cache(maxsize=32)
 def _disc_table(samples: int, dimension: int, limb: tuple[float, ...] | None = None) -> Any:
-    """Return stratified points of the unit disc: `_DISC_SETS` sets of `samples`, each set in its own order."""
+    """Return stratified points of the unit disc: `_set_count` sets of `samples`, each set in its own order."""
     points = disc_sets(samples, dimension) if limb is None else limb_sets(samples, dimension, limb)
     table = packets(mi.Float, points.astype(np.float32))
     dr.eval(table)
@@ -120,11 +129,11 @@ def limb_sets(samples: int, dimension: int, limb: tuple[float, ...]) -> NDArray[
     `limb` holds the coefficients of the powers of μ. The points are those of `disc_sets` with other radii: each
     ring has the same light, and the sets together cover it evenly, so their mean holds for few samples, too.
     """
-    points = disc_sets(samples, dimension)
+    points, ring = _ringed_sets(samples, dimension)
     radius = np.linalg.norm(points, axis=-1)
-    ring = radius.argsort(axis=1, kind="stable").argsort(axis=1, kind="stable")
     rng = np.random.Generator(np.random.Philox(np.random.SeedSequence((samples, dimension, 1))))
-    offset = rng.permuted(np.tile((np.arange(_DISC_SETS) + 0.5) / _DISC_SETS, (samples, 1)), axis=1).T
+    sets = len(points)
+    offset = rng.permuted(np.tile((np.arange(sets) + 0.5) / sets, (samples, 1)), axis=1).T
     within = (ring + np.take_along_axis(offset, ring, axis=1)) / samples
     # light within the circle on which the cosine is μ: ∫ Σ A_k μ^k d(μ²) from μ to 1
     cosine, power = np.linspace(0, 1, 4097), np.arange(len(limb)) + 2
@@ -143,30 +152,38 @@ def disc_sets(samples: int, dimension: int) -> NDArray[np.float64]:
     polynomial of that cosine and therefore adds no noise where the whole disc is visible. The parity of the sum of
     digits divides rings and sectors evenly between the two halves of a chessboard over the samples.
     """
-    rng = np.random.Generator(np.random.Philox(np.random.SeedSequence((samples, dimension))))
+    return _ringed_sets(samples, dimension)[0]
+
+
+def _ringed_sets(samples: int, dimension: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return `disc_sets`, and the number of the ring of each point from the middle outwards, int64[set, sample]."""
+    rng, sets = (
+        np.random.Generator(np.random.Philox(np.random.SeedSequence((samples, dimension)))),
+        _set_count(samples),
+    )
     if samples == 1:
-        radius, turn = np.sqrt(rng.random((_DISC_SETS, 1))), 2 * np.pi * rng.random((_DISC_SETS, 1))
-        return radius[..., None] * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+        radius, turn = np.sqrt(rng.random((sets, 1))), 2 * np.pi * rng.random((sets, 1))
+        points = radius[..., None] * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+        return points, np.zeros((sets, 1), np.int64)
     bits = samples.bit_length() - 1
     k = np.arange(samples)
     digits = (k[:, None] >> np.arange(bits)) & 1
     mirrored = digits @ (1 << np.arange(bits)[::-1])
     edge = (1 - np.arange(samples + 1) / samples) ** 1.5
     mean_mu = 2 / 3 * samples * (edge[:-1] - edge[1:])
-    ring = k ^ rng.integers(samples, size=(_DISC_SETS, 1))
-    sector = mirrored ^ rng.integers(samples, size=(_DISC_SETS, 1))
+    ring = k ^ rng.integers(samples, size=(sets, 1))
+    sector = mirrored ^ rng.integers(samples, size=(sets, 1))
     radius = np.sqrt(1 - mean_mu[ring] ** 2)
     turn = 2 * np.pi * (sector + rng.random(sector.shape)) / samples
     points = radius[..., None] * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
     # decide which points go to the white squares, and which to the black ones
     colour = (k ^ (k >> (bits + 1) // 2)) & 1
-    out = np.empty_like(points)
-    swap = rng.integers(2, size=_DISC_SETS)
+    halves = np.stack([np.flatnonzero(digits.sum(axis=1) & 1 == parity) for parity in (0, 1)])
+    swap = rng.integers(2, size=sets)
+    order = np.empty((sets, samples), np.int64)
     for parity in (0, 1):
-        of_half = np.argsort((digits.sum(axis=1) & 1) != (parity ^ swap)[:, None], axis=1, kind="stable")
-        chosen = rng.permuted(of_half[:, : samples // 2], axis=1)
-        out[:, colour == parity] = np.take_along_axis(points, chosen[..., None], axis=1)
-    return out
+        order[:, colour == parity] = rng.permuted(halves[parity ^ swap], axis=1)
+    return np.take_along_axis(points, order[..., None], axis=1), np.take_along_axis(ring, order, axis=1)
 
 
 class Optics:
