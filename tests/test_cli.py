@@ -376,6 +376,62 @@ def test_a_path_that_cannot_be_written_is_one_sentence(
     assert "sample.exr: cannot be written: Is a directory" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (
+            ("flare", "nikkor_35_f2p8", "--sun-deg", "10", "--out", "f.png", "--json", "no/f.json"),
+            "--json no/f.json",
+        ),
+        (("lens", "nikkor_35_f2p8", "--toml", "no/l.toml"), "--toml no/l.toml"),
+    ],
+)
+def test_a_missing_folder_is_named_before_the_work(
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture,
+    arguments: tuple[str, ...],
+    sentence: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run(monkeypatch, *arguments) == 2
+    printed = capsys.readouterr()
+    assert printed.err == f"vbnfault: {sentence}: must be in a folder that exists\n"
+    assert not printed.out
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_file_in_place_of_a_folder_is_named_before_the_work(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    taken = tmp_path / "taken.png"
+    taken.touch()
+    assert run(monkeypatch, "detector", "generic_cmos", "--out", taken) == 2
+    printed = capsys.readouterr()
+    assert printed.err == f"vbnfault: {taken}: cannot be written: it is a file, not a folder\n"
+    assert not printed.out
+
+
+def test_a_scene_in_place_of_a_lens_is_told_the_keys_once(
+    monkeypatch: pytest.MonkeyPatch, scene: Path, capsys: pytest.CaptureFixture
+) -> None:
+    assert run(monkeypatch, "lens", scene) == 2
+    message = capsys.readouterr().err
+    assert message.count("known: name") == 1
+    assert ": unknown keys; known: name" in message
+
+
+def test_a_misspelt_lens_is_named_before_what_does_not_fit_to_a_lens(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    """The scene's cos⁴ vignetting would be refused with any lens."""
+    assert run(monkeypatch, "describe", "paper67p", "--set", "camera.lens=nikor_35_f2p8") == 2
+    message = capsys.readouterr().err
+    assert (
+        "camera.lens: nikor_35_f2p8: neither a file nor a packaged name (did you mean nikkor_35_f2p8?)" in message
+    )
+
+
 def test_a_port_where_no_scheduler_answers_is_one_sentence(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -402,6 +458,13 @@ def test_no_usable_llvm_is_one_sentence_and_no_abort(scene: Path, tmp_path: Path
     assert "no usable LLVM" in done.stderr
     assert "version 14" in done.stderr
     assert len(done.stderr.splitlines()) == 1
+
+
+def test_list_without_a_kind_names_the_kinds(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    assert run(monkeypatch, "list") == 2
+    assert "must be one of scenes, bodies, lenses, detectors" in capsys.readouterr().err
 
 
 def test_list_schema_doctor_and_dry_run(

@@ -15,7 +15,7 @@ from .options import (
     LensArgument,
     PluginOption,
     check_image_path,
-    check_separate,
+    check_written,
     grouped,
     load_plugins,
     local_path,
@@ -90,7 +90,7 @@ def lens(
     from ..output import lens_sheet
 
     path = Path(f"{Path(lens).stem}.png") if out is None else out
-    check_separate(lens, {"--json": json_, "--toml": toml, "--out": path})
+    check_written(lens, {"--json": json_, "--toml": toml, "--out": path})
     prescription = adapted_lens(LensRequest(lens=lens, **vars(options)))
     check_image_path(path, ".png")
     source = f", {prescription.source}" if prescription.source else ""
@@ -173,7 +173,7 @@ def flare(
     ] = None,
 ) -> None:
     """Compute ghosts, starburst and glare of the Sun in a lens, as an image and as a table of every ghost."""
-    check_separate(lens, {"--json": json_, "--out": out})
+    check_written(lens, {"--json": json_, "--out": out})
     check_image_path(out, ".png", ".exr")
     from ..lens.adapt import LensRequest, adapted_lens
     from ..output import flare_images
@@ -205,6 +205,8 @@ def _print_ghosts(name: str, ghosts: tuple[Ghost, ...]) -> None:
     """Print the total flux of all ghosts and a table of the brightest."""
     total = sum(ghost.flux_fraction for ghost in ghosts)
     typer.echo(f"{name}: {len(ghosts)} ghosts hold {total:.3e} of the light that enters the pupil")
+    if len(ghosts) > _BRIGHTEST:
+        typer.echo(f"  the {_BRIGHTEST} with the highest peaks (--json writes all):")
     typer.echo("  rows        flux      peak E/E0     x mm      y mm   rms mm")
     for ghost in sorted(ghosts, key=lambda g: -g.peak_irradiance_fraction)[:_BRIGHTEST]:
         x, y = ghost.centroid_mm

@@ -210,11 +210,15 @@ def writing(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror}") from None
+        why = "it is a file, not a folder" if isinstance(error, FileExistsError) else error.strerror
+        raise InputError(f"{path}: cannot be written: {why}") from None
 
 
-def check_separate(read: str, written: Mapping[str, Path | None]) -> None:
-    """Refuse two options that name one file, and one that names the file which is read. Raises InputError."""
+def check_written(read: str, written: Mapping[str, Path | None]) -> None:
+    """Refuse files of options before the work. Raises InputError.
+
+    Two options may not name one file, none the file which is read, and all folders must exist.
+    """
     taken = {Path(read).resolve(): "the input"} if Path(read).is_file() else {}
     for option, path in written.items():
         if path is None:
@@ -222,6 +226,8 @@ def check_separate(read: str, written: Mapping[str, Path | None]) -> None:
         other = taken.setdefault(path.resolve(), option)
         if other != option:
             raise InputError(f"{option} {path}: is also the file of {other}; choose another path")
+        if not path.absolute().parent.is_dir():
+            raise InputError(f"{option} {path}: must be in a folder that exists")
 
 
 def check_image_path(path: Path, *endings: str) -> None:

@@ -24,12 +24,13 @@ _LIBRARIES = ("mitsuba", "drjit", "numpy", "zarr", "trimesh", "OpenEXR", "colour
 @app.command("list", rich_help_panel=_PANEL)
 def list_(
     kind: Annotated[
-        str,
+        str | None,
         typer.Argument(
             help="One of scenes, bodies, lenses, detectors, studies, faults, effects, reflectances and glasses.",
             metavar="KIND",
+            show_default=False,
         ),
-    ],
+    ] = None,
     plugins: PluginOption = None,
 ) -> None:
     """List packaged files, such as scenes and lenses, or faults, effects and reflectances with their keys."""
@@ -50,7 +51,7 @@ def list_(
         registered[kind]()
         return
     if kind not in folders:
-        raise InputError(f"list {kind}: must be one of {', '.join((*folders, *registered))}")
+        raise InputError(f"list {kind or 'KIND'}: must be one of {', '.join((*folders, *registered))}")
     paths = resources.packaged(folders[kind])
     if not paths:
         typer.echo(f"no packaged {kind}")

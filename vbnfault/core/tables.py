@@ -266,14 +266,15 @@ def sentence(details: Sequence[Any], schema: Mapping[str, Any], where: str = "")
         (detail, *_locate(detail["loc"][:-1] if detail["type"] in _UNKNOWN else detail["loc"], schema))
         for detail in details
     ]
-    clauses = []
-    for detail, keys, node in located:
-        if detail["type"] in _UNKNOWN:
-            known = [key for choice in _choices(node, schema) for key in choice.get("properties", {})]
-            hint = did_you_mean(str(detail["loc"][-1]), known)
-            clauses.append(f"{_dotted([*keys, detail['loc'][-1]], where)}: unknown key{hint}")
-    if len(clauses) > _MOST_NAMED:
-        clauses[_MOST_NAMED:] = [f"and {len(clauses) - _MOST_NAMED} more unknown keys"]
+    unknown = [entry for entry in located if entry[0]["type"] in _UNKNOWN]
+    alike: dict[str, list[str]] = {}  # keys by what is known in their place
+    for detail, keys, node in unknown[:_MOST_NAMED]:
+        known = [key for choice in _choices(node, schema) for key in choice.get("properties", {})]
+        hint = did_you_mean(str(detail["loc"][-1]), known)
+        alike.setdefault(hint, []).append(_dotted([*keys, detail["loc"][-1]], where))
+    clauses = [f"{', '.join(of)}: unknown key{'s' * (len(of) > 1)}{hint}" for hint, of in alike.items()]
+    if len(unknown) > _MOST_NAMED:
+        clauses.append(f"and {len(unknown) - _MOST_NAMED} more unknown keys")
     missing = [
         _dotted(keys, where)
         for detail, keys, _ in located

@@ -14,7 +14,7 @@ import numpy as np
 from ..body import Body, Fractured, Patch, PatchSpec, Site, Sites, cached_patch, choose_sites
 from ..body.refine import GROWTH_POWER
 from ..camera import Camera
-from ..core import activity, tables
+from ..core import activity, resources, tables
 from ..core.errors import InputError, in_file, shown, under_key
 from ..core.memory import release_unused, share_arenas
 from ..core.quantities import SOFT_KINDS, Sample
@@ -104,6 +104,9 @@ def configure_faults(scene: Scene, source: str = "scene") -> dict[str, Fault]:
         plugins_of(faults, scene.plugins)
     except InputError as error:
         raise InputError(f"{source}: {error}") from None
+    if scene.camera.lens:  # a name without a lens is refused before what does not fit to a lens
+        with in_file(source), under_key("camera.lens"):
+            resources.find("scenes/lenses", scene.camera.lens)
     for name, fault in faults.items():
         if fault.thin_lens_only and scene.camera.lens:
             raise InputError(

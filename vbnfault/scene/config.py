@@ -180,9 +180,10 @@ def _restored(plain: dict[str, Any]) -> Scene:
 def load_scene(name_or_path: str | Path, overrides: Mapping[str, Any] | None = None) -> Scene:
     """Load a scene by its path or packaged name. Raises InputError.
 
-    `overrides` maps dotted keys to values that replace those of the file. A relative path in the file (such as a
-    mesh or a texture) starts from the file's folder, or from the working folder where nothing lies there. A path in
-    `overrides` starts from the working folder.
+    `overrides` maps dotted keys, such as `camera.fov_deg`, to values that replace those of the file. A table
+    replaces the file's whole table of that name. A relative path in the file (such as a mesh or a texture) starts
+    from the file's folder, or from the working folder where nothing lies there. A path in `overrides` starts from
+    the working folder.
     """
     if not isinstance(overrides, Mapping | None):
         raise InputError(f"overrides = {shown(overrides)}: must be a table of dotted keys and their values")

@@ -90,7 +90,7 @@ def export_store(
     """
     known = formats()
     if format not in known:
-        raise InputError(f"--format {shown(format)}: there is no such format{did_you_mean(str(format), [*known])}")
+        raise InputError(f"format {shown(format)}: there is no such format{did_you_mean(str(format), [*known])}")
     if type(workers) is not int or not 1 <= workers <= MOST_THREADS:
         raise InputError(f"--workers {shown(workers)}: must be a whole number from 1 to {MOST_THREADS}")
     store, target = open_store(store), path_of(out, "out")
