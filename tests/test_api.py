@@ -224,6 +224,8 @@ def test_what_is_no_path_is_refused_in_a_sentence(tmp_path: Path, path: Any) -> 
         lambda: vbnfault.merge([path], tmp_path / "s.zarr"),
         lambda: vbnfault.merge(["s.zarr"], path),
     ]
+    if path is not None:  # which keeps nothing of a study
+        calls.append(lambda: vbnfault.study("flare_models", path))
     for call in calls:
         with pytest.raises(InputError, match=f"= {re.escape(repr(path))}: must be a path$"):
             call()

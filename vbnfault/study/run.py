@@ -26,6 +26,7 @@ from .. import __version__
 from ..core import environment, file_contents, tables, toml_files, whole_files
 from ..core.errors import InputError, VbnfaultError, shown
 from ..core.interrupts import Stopped, exit_code, finishing, interruptible
+from ..core.path_checks import path_of
 from ..dataset import BuildOptions
 from ..dataset.dask import check_scheduler, run_on_dask
 from ..dataset.errors import Interrupted
@@ -134,7 +135,7 @@ def study(
     Raises
     ------
     InputError
-        If the study file is wrong, or `out` holds another study.
+        If the study file is wrong, `out` is no path, or it holds another study.
     StudyFailed
         If evaluations failed; its attribute `indices` has the indices without them.
     Interrupted
@@ -144,7 +145,7 @@ def study(
     """
     options = BuildOptions(workers=workers, threads=threads, scheduler=scheduler, progress=progress)
     if out is not None:
-        return run_study(study, Path(out), options, overrides=overrides, evaluator=evaluator).indices
+        return run_study(study, path_of(out, "out"), options, overrides=overrides, evaluator=evaluator).indices
     with tempfile.TemporaryDirectory(prefix="vbnfault-study-") as folder:
         path = Path(folder) / "study"
         return run_study(study, path, options, overrides=overrides, evaluator=evaluator, report=False).indices
