@@ -28,6 +28,8 @@ from .stars import add_stars
 P = ParamSpec("P")
 T = TypeVar("T")
 
+_MOSTLY = 0.5  # fraction of an image that may be why a fault cannot be seen
+
 
 class StageRunner(Protocol):
     """Call a stage with its inputs and return its output, for example to measure how long it takes."""
@@ -107,8 +109,8 @@ def simulate_frame(spec: SampleSpec, run: StageRunner = run_stage, shared: Share
         if views == spec.scene.plan.max_views:
             raise VbnfaultError(
                 f"sample {spec.index}: {', '.join(unseen)} cannot be seen in the last of plan.max_views = {views} "
-                f"views that were rendered; change the bounds of the fault or of [geometry], raise max_views, or "
-                f"set plan.on_invisible = 'drop'"
+                f"views that were rendered{_why_unseen(view)}; change the bounds of the fault or of [geometry], "
+                f"raise max_views, or set plan.on_invisible = 'drop'"
             )
         views, first_try = views + 1, view.pose.tries
         del view  # release its memory before the next render
@@ -178,6 +180,18 @@ def _expose(
     return _RenderedView(
         spec=spec, pose=pose, rendering=rendering, starless=starless, exposure=exposure, injection=injection
     )
+
+
+def _why_unseen(view: _RenderedView) -> str:
+    """Return a clause that says so if most of a view's image is white or black, and with which faults."""
+    draws = view.injection.draws
+    levels = view.injection.development.image(draws).array[..., :3]
+    named = f" with {', '.join(draws)}" if draws else ""
+    for level, word in ((255, "white"), (0, "black")):
+        share = float((levels == level).all(axis=-1).mean())
+        if share > _MOSTLY:
+            return f", whose image is {word} in {100 * share:.0f} % of its pixels{named}"
+    return ""
 
 
 def _unseen(spec: SampleSpec, injection: Injection) -> list[str]:
