@@ -15,7 +15,8 @@ from conftest import ALL_FAULTS
 from test_faults_kit import make, make_context, noisy, noisy_electrons, with_mosaic
 
 from vbnfault.core.errors import InputError
-from vbnfault.core.quantities import RGBI
+from vbnfault.core.quantities import LUMINANCE, RGBI
+from vbnfault.detector.display import with_luminance
 from vbnfault.detector.mosaic import pattern
 from vbnfault.faults import (
     MOSAIC_STEPS,
@@ -258,6 +259,21 @@ def test_scale_by_intensity() -> None:
     assert scale_by_intensity(pixels, wanted).tolist() == expected
     unchanged = scale_by_intensity(pixels[[0, 3]], np.array([60, 100], np.float32))
     assert np.array_equal(unchanged, pixels[[0, 3]])
+
+
+def test_dark_pixels_scaled_by_intensity_keep_i_as_their_luminance() -> None:
+    """A level of 1 stands for 0.5 to 1.5. By the ratio of the rounded ones, luminance was up to half too bright."""
+    rgb = np.stack(np.meshgrid(*[np.arange(8, dtype=np.uint8)] * 3), axis=-1).reshape(1, -1, 3)
+    pixels = with_luminance(rgb)[0]
+    for wanted in (0.0, 5.0, 42.0):
+        out = scale_by_intensity(pixels, np.full(len(pixels), wanted, np.float32))
+        whole = (out[:, :3] < 255).all(axis=1)
+        assert whole.mean() > 0.9
+        # half a level of rounding in each channel, and half in I
+        off = out[whole, :3] @ LUMINANCE.astype(np.float64) - out[whole, 3]
+        assert np.abs(off).max() <= 1.0
+    lit = pixels[pixels[:, 3] > 0]
+    assert np.array_equal(scale_by_intensity(lit, lit[:, 3].astype(np.float32)), lit)
 
 
 @pytest.mark.parametrize(

@@ -83,12 +83,16 @@ def scale_by_intensity(
 ) -> NDArray[np.uint8]:
     """Return RGBI uint8[..., 4] with I set to `intensity` (0-255) and RGB scaled by the same ratio.
 
-    Where I was 0, R, G and B become the new I. Values that overflow are clipped in each channel. With `monochrome`,
-    R, G and B always become the new I: scaled by the ratio, they could be rounded to another number.
+    Where I is the luminance of R, G and B, the ratio is that of the luminances before they are rounded: 1 DN of I
+    may stand for 0.5 to 1.5. Where I was 0, R, G and B become the new I. Values that overflow are clipped in each
+    channel. With `monochrome`, R, G and B always become the new I: scaled by the ratio, they could be rounded to
+    another number.
     """
     before = rgbi[..., 3]
     dark = np.ones_like(before, dtype=bool) if monochrome else before == 0
-    ratio = intensity / np.maximum(before, np.float32(1))
+    exact = sum((rgbi[..., k] * np.float32(LUMINANCE[k]) for k in range(3)), np.float32(0))
+    exact = np.where(np.abs(exact - before) <= 0.5, exact, before)
+    ratio = (exact + (intensity - before)) / np.maximum(exact, np.float32(0.5))
     out = np.empty_like(rgbi)
     for channel in range(4):
         value = intensity.copy() if channel == 3 else rgbi[..., channel] * ratio
