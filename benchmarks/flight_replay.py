@@ -67,16 +67,17 @@ temperatures that are drawn put the level up to 1.7 DN off. On the 33 frames:
 
 | ground    | `rank` | variance at 2-4, 4-8, 8-16, 16-32, 32-64 px | body   | limb   | sky    |
 |-----------|--------|---------------------------------------------|--------|--------|--------|
-| `GROUND`  | 0.807  | 0.36, 0.51, 0.74, 0.93, 0.85 of the real    | 99.4 % | 94.9 % | 73.8 % |
+| `GROUND`  | 0.806  | 0.36, 0.51, 0.73, 0.92, 0.84 of the real    | 99.4 % | 94.9 % | 73.8 % |
 | `TEXTURE` | 0.739  | 0.92, 0.88, 0.93, 1.06, 1.00 of the real    | 74.6 % | 74.5 % | 70.8 % |
 
 The last three columns are the patches that the classifier tells, with `--splits 4` and for `TEXTURE` `--draws 4`;
-50 % would be none. With `--draws 8` the body of `TEXTURE` has 75.2 %, single draws have 72 to 79 %. With
-`patch.scarps = 0.3` it has 76.5 % in the same draws, and with 0.5, in the first four of them, 78.0 %, where
-`TEXTURE` has 74.6 %. The settings were chosen by the classifier on the same frames, so others may be told more
-often. What had given the images away most were mottled plains and a core of the point spread that was too wide:
-real ground is either smooth or rough, and boulders and shadows on it are sharp. Obliquely lit ground is still too
-rough in its smoothest tenth, and real scarps throw thin dark lines where ours throw spots.
+50 % would be none. With `--draws 8` the three places of `TEXTURE` have 75.2, 74.3 and 71.1 %, and single draws of
+the body 72 to 79 %. In the same eight draws the body has 75.3 % without scarps and 76.5 % with `patch.scarps =
+0.3`; with 0.5, it has 78.0 % in the first four of them, where `TEXTURE` has 74.6 %. The settings were chosen by the
+classifier on the same frames, so others may be told more often. What had given the images away most were mottled
+plains and a core of the point spread that was too wide: real ground is either smooth or rough, and boulders and
+shadows on it are sharp. Obliquely lit ground is still too rough in its smoothest tenth, and real scarps throw thin
+dark lines where ours throw spots.
 
 The sky of 31 frames is the sum of six parts, fitted by least squares to means over 8 px: the halo of the limb;
 light scattered farther, 0.5 % of that of the body (0.4 to 0.8 % in four fifths of the frames; the wings of the
