@@ -194,6 +194,10 @@ def test_damage_is_named_and_exactly_mended(
     assert "image" in said
     assert "depth_m" in said
     assert run(monkeypatch, "build", scene, "--out", hurt) == 0
+    # two lack their depth map, and the flipped bit lies in the image of a third
+    assert re.search(
+        r"8 samples, 8 of them finished before\n3 samples built in .*, 3 of them in place", capsys.readouterr().out
+    )
     assert run(monkeypatch, "verify", hurt) == 0
     assert store.digest(hurt) == store.digest(built)
     assert intact.stat().st_mtime_ns == stamp

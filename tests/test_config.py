@@ -106,6 +106,7 @@ TITLE = 'title = "t"\n'
             ["geometry.sun_facing.roll_deg = [5, 1]:", "reversed"],
         ),
         (TITLE + "[plan]\nclasses_per_sample = [4, 3]", ["plan.classes_per_sample = [4, 3]:", "reversed"]),
+        (TITLE + '[dataset]\nlayers = ["clean", "clean"]', ["dataset.layers = ", "clean is named twice"]),
         (
             TITLE + "[camera]\nexposure_min_s = 3\nexposure_max_s = 1",
             ["exposure_min_s", "exposure_max_s", "reversed"],

@@ -176,6 +176,12 @@ def test_mask_any_unites_the_classes_that_a_scene_chooses() -> None:
             members(mask_any=[unknown])
 
 
+def test_a_faulty_sample_cannot_have_more_classes_than_the_scene() -> None:
+    with pytest.raises(InputError, match=r"plan.classes_per_sample = \[7, 9\]: the scene has only 6 fault classes"):
+        of_scene(plan={"classes_per_sample": [7, 9]})
+    of_scene(plan={"classes_per_sample": [2, 9]})  # at most as many as there are
+
+
 def test_mask_effect_is_stored_by_default_and_soft_layers_need_their_fault() -> None:
     assert "mask_effect" in sampling.DatasetTable().layers
     with pytest.raises(InputError, match="'dust_opacity': no fault of the scene has it; the faults have: none"):

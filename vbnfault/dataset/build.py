@@ -286,7 +286,10 @@ class Summary:
             return [*self.outlook(), *self.description]
         lines = [f"{self._where}: {self.samples} samples, {self.finished} of them finished before"]
         if self.built:
-            lines.append(f"{self.built} samples built in {duration_text(self.seconds)}")
+            # every sample is whole now, so what was built beyond the unfinished ones was damaged
+            mended = max(self.finished + self.built - self.samples, 0)
+            again = f", {mended} of them in place of damaged ones" if mended else ""
+            lines.append(f"{self.built} samples built in {duration_text(self.seconds)}{again}")
         lines += self.counts.lines()
         if self.counts.missing:
             lines.append(self.counts.missing_text())

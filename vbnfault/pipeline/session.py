@@ -150,6 +150,11 @@ def _check_layers(scene: Scene, faults: Mapping[str, Fault], source: str) -> Non
         if name not in faults:
             known = ", ".join(faults) or "none"
             raise InputError(f"{source}: dataset.mask_any: {name!r}: the scene has no such fault; it has: {known}")
+    least, most = scene.plan.classes_per_sample
+    if scene.plan.mode == "per_sample" and faults and least > len(faults):
+        raise InputError(
+            f"{source}: plan.classes_per_sample = [{least}, {most}]: the scene has only {len(faults)} fault classes"
+        )
 
 
 class Session:

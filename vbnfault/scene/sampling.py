@@ -17,6 +17,14 @@ _LAYERS = (
 Layer = Annotated[str, Field(pattern=f"^({_LAYERS})$")]
 
 
+def _each_once(layers: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the layers. Raises ValueError where one is named twice."""
+    for k, layer in enumerate(layers):
+        if layer in layers[:k]:
+            raise ValueError(f"{layer} is named twice")
+    return layers
+
+
 class SplitTable(Table):
     """Set the fraction of the sites in each split."""
 
@@ -54,7 +62,9 @@ class DatasetTable(Table):
         "device of the detector, noise and, with camera.exposure_stops, exposure; must divide samples and "
         "shard_samples",
     )
-    layers: tuple[Layer, ...] = Field(DEFAULT_LAYERS, description="optional layers that are stored")
+    layers: Annotated[tuple[Layer, ...], AfterValidator(_each_once)] = Field(
+        DEFAULT_LAYERS, description="optional layers that are stored"
+    )
     radiance_dtype: Literal["float32", "float16"] = Field(
         "float32",
         description="data type of the layers radiance and scene_radiance; float16 takes half the bytes and rounds "
