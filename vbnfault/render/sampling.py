@@ -113,7 +113,7 @@ def _set_count(samples: int) -> int:
 
 
 # An adaptive render with an aperture and bounces needs two or three tables for each of up to nine sample counts.
-# A table has 128 KiB, or more for many samples.
+# A table has at most 128 KiB, or 128 bytes a sample beyond 1024 samples.
 @lru_cache(maxsize=32)
 def _disc_table(samples: int, dimension: int, limb: tuple[float, ...] | None = None) -> Any:
     """Return stratified points of the unit disc: `_set_count` sets of `samples`, each set in its own order."""
@@ -157,10 +157,8 @@ def disc_sets(samples: int, dimension: int) -> NDArray[np.float64]:
 
 def _ringed_sets(samples: int, dimension: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Return `disc_sets`, and the number of the ring of each point from the middle outwards, int64[set, sample]."""
-    rng, sets = (
-        np.random.Generator(np.random.Philox(np.random.SeedSequence((samples, dimension)))),
-        _set_count(samples),
-    )
+    rng = np.random.Generator(np.random.Philox(np.random.SeedSequence((samples, dimension))))
+    sets = _set_count(samples)
     if samples == 1:
         radius, turn = np.sqrt(rng.random((sets, 1))), 2 * np.pi * rng.random((sets, 1))
         points = radius[..., None] * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
