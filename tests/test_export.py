@@ -464,7 +464,7 @@ def test_bad_input_is_one_sentence(described_store: Path, tmp_path: Path) -> Non
             export_store(more.pop("store", described_store), out, name, progress=False, **more)
         assert tree(tmp_path) == before  # nothing is written, nothing lost
 
-    refused(r"format 'pgn': there is no such format \(did you mean png\?\)", name="pgn")
+    refused(r"^format 'pgn': there is no such format \(did you mean png\?\)", name="pgn")
     refused(r"--workers 0: must be a whole number from 1 to 64", workers=0)
     refused(r"--masks 'soft': must be one of footprint, effect", masks="soft")
     refused("--masks effect: png writes every mask of the store by its name; leave it out", masks="effect")

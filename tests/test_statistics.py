@@ -163,6 +163,6 @@ def test_the_commands(copy: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytes
     assert run(monkeypatch, "export", copy, "--format", "yolo", "--out", out, "--workers", 1) == 0
     assert capsys.readouterr().out == f"{out}: 6 samples as yolo\n"
     assert run(monkeypatch, "export", copy, "--format", "voc", "--out", out) == 2
-    assert "format 'voc': there is no such format" in capsys.readouterr().err
+    assert "vbnfault: format 'voc': there is no such format" in capsys.readouterr().err
     assert run(monkeypatch, "stats", copy.with_name("none")) == 2
     assert "no such store" in capsys.readouterr().err

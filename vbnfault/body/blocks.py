@@ -14,7 +14,7 @@ _THREADS = 2
 
 
 def in_blocks(step: Callable[..., tuple[NDArray[Any], ...]], *arrays: NDArray[Any]) -> tuple[NDArray[Any], ...]:
-    """Return what `step(*blocks)` gives for blocks of rows of the arrays, joined: a tuple of arrays.
+    """Call `step(*blocks)` for each block of rows of the arrays, and return the arrays that it gives, joined.
 
     All arrays have equally many rows. `step` must treat each row on its own, so that the bits do not depend on the
     blocks.

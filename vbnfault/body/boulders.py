@@ -116,7 +116,7 @@ def add_boulders(ground: GroundMesh, spec: PatchSpec, *, rng: np.random.Generato
 def _strewn(
     ground: GroundMesh, spec: PatchSpec, tree: Future[cKDTree], *, rng: np.random.Generator, budget: int
 ) -> Boulders:
-    """Return the boulders of `add_boulders`; `tree` finds the ground's points."""
+    """Do the work of `add_boulders`; another thread builds `tree`, which finds the nearest points of the ground."""
     points, faces = ground.points, ground.faces
     normals, _ = face_normals_areas(points, faces)
     centre = face_centres(points, faces)

@@ -60,7 +60,7 @@ def noise_key(seed: int, stream: int) -> int:
 
 
 def _by_blocks(kernel: Callable[[NDArray, UInt32], Float32], points: NDArray, seed: int) -> Float32:
-    """Apply a noise kernel to all points, float32[n, column]."""
+    """Return the values of a noise kernel at all points, float32[n, column]."""
     word = seed_word(seed)
     (out,) = in_blocks(lambda block: (kernel(block, word),), points)
     return out

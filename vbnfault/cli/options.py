@@ -215,7 +215,7 @@ def writing(path: Path) -> Iterator[None]:
 
 
 def check_written(read: str, written: Mapping[str, Path | None]) -> None:
-    """Refuse files of options before the work. Raises InputError.
+    """Check, before the work, the paths of the files that options ask to write. Raises InputError.
 
     Two options may not name one file, none the file which is read, and all folders must exist.
     """

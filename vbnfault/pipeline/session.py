@@ -104,6 +104,11 @@ def configure_faults(scene: Scene, source: str = "scene") -> dict[str, Fault]:
         plugins_of(faults, scene.plugins)
     except InputError as error:
         raise InputError(f"{source}: {error}") from None
+    least, most = scene.plan.classes_per_sample
+    if scene.plan.mode == "per_sample" and faults and least > len(faults):
+        raise InputError(
+            f"{source}: plan.classes_per_sample = [{least}, {most}]: the scene has only {len(faults)} fault classes"
+        )
     if scene.camera.lens:  # a name without a lens is refused before what does not fit to a lens
         with in_file(source), under_key("camera.lens"):
             resources.find("scenes/lenses", scene.camera.lens)
@@ -150,11 +155,6 @@ def _check_layers(scene: Scene, faults: Mapping[str, Fault], source: str) -> Non
         if name not in faults:
             known = ", ".join(faults) or "none"
             raise InputError(f"{source}: dataset.mask_any: {name!r}: the scene has no such fault; it has: {known}")
-    least, most = scene.plan.classes_per_sample
-    if scene.plan.mode == "per_sample" and faults and least > len(faults):
-        raise InputError(
-            f"{source}: plan.classes_per_sample = [{least}, {most}]: the scene has only {len(faults)} fault classes"
-        )
 
 
 class Session:

@@ -235,7 +235,9 @@ class Direct(Light):
             dr.eval(*sums)
             return slice(part.first, part.first + part.count), sums, samples
 
-        def take(span: slice, sums: list[NDArray[np.float32]], samples: NDArray[np.float16] | None) -> None:
+        def take(span: slice, queued_sums: list[Any], samples: Any) -> None:
+            """Wait for the kernels of a part, and add the sums of its terms to the bands of its pixels."""
+            sums = [total.numpy() for total in queued_sums]
             for k, (row, values) in enumerate(zip(weights, sums, strict=False)):
                 if self.banded:  # the only term of its band, which is quicker than a sum
                     np.multiply(values, row[k], out=out[k, span])
@@ -246,20 +248,16 @@ class Direct(Light):
                     out[band, span] += values * row[band]
             if signals is not None and samples is not None:
                 signals[0][span] = sums[-1]
-                signals[1][span] = samples.reshape(-1, spp)
-
-        def fetched(span: slice, sums: list[Any], samples: Any) -> None:
-            """Wait for the kernels of a part, and take what they give."""
-            take(span, [total.numpy() for total in sums], None if samples is None else samples.numpy())
+                signals[1][span] = samples.numpy().reshape(-1, spp)
 
         queued: tuple[slice, list[Any], Any] | None = None
         for part in pixels.parts(max(1, WAVEFRONT // (spp * len(weights)))):
             following = started(part)
             if queued is not None:  # the kernels of the next part run while numpy takes those of the last
-                fetched(*queued)
+                take(*queued)
             queued = following
         if queued is not None:
-            fetched(*queued)
+            take(*queued)
         return out, signals
 
     def mean_limb(self, signal: NDArray[np.float64]) -> tuple[float, ...] | None:

@@ -101,8 +101,8 @@ class Pixels:
             yield Pixels(min(most, self.count - start), self.first + start)
 
 
-# Pixels of few samples share more sets, because these together cover the disc. All sets of a table are taken from a
-# cache, which holds tables of this many points.
+# With few samples a pixel, many different sets are needed, since only together do they cover the disc evenly. With
+# many samples, each set does. A table of `_TABLE_POINTS` points stays in the processor's cache.
 _MOST_SETS, _FEWEST_SETS = 256, 16
 _TABLE_POINTS = 1 << 14
 
@@ -113,10 +113,10 @@ def _set_count(samples: int) -> int:
 
 
 # An adaptive render with an aperture and bounces needs two or three tables for each of up to nine sample counts.
-# A table has at most 128 KiB, or 128 bytes a sample beyond 1024 samples.
+# A table takes at most 128 KiB, or 128 bytes for each sample if these are more than 1024.
 @lru_cache(maxsize=32)
 def _disc_table(samples: int, dimension: int, limb: tuple[float, ...] | None = None) -> Any:
-    """Return stratified points of the unit disc: `_set_count` sets of `samples`, each set in its own order."""
+    """Return stratified points of the unit disc in sets of `samples`, each set in its own order, on the device."""
     points = disc_sets(samples, dimension) if limb is None else limb_sets(samples, dimension, limb)
     table = packets(mi.Float, points.astype(np.float32))
     dr.eval(table)

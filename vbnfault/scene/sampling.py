@@ -18,7 +18,7 @@ Layer = Annotated[str, Field(pattern=f"^({_LAYERS})$")]
 
 
 def _each_once(layers: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the layers. Raises ValueError where one is named twice."""
+    """Return the layers as they are. Raises ValueError if one is named twice."""
     for k, layer in enumerate(layers):
         if layer in layers[:k]:
             raise ValueError(f"{layer} is named twice")
