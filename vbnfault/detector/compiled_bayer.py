@@ -62,29 +62,30 @@ def image(mosaic: Raw, pattern: Pattern, saturated: Raw, display: Display) -> U8
     dr.sync_thread()
     whole: U8 = buffers.empty((2 * down, 2 * across, 4), np.uint8)
     for y, of_row in enumerate(rows):
-        whole[y::2] = np.array(of_row, copy=False).view(np.uint8).reshape(down, 2 * across, 4)
+        of_tiles = np.array(of_row, copy=False).reshape(down, across + _HALO)[:, :across]
+        whole[y::2].reshape(down, across, 8).view(np.uint64)[..., 0] = of_tiles
     return np.ascontiguousarray(whole[:height, :width])
 
 
 def _neighbourhoods(mosaic: Raw, saturated: Mask, tiles: tuple[int, int]) -> tuple[Lanes, Lanes]:
     """Return the 6 × 6 raw numbers in and around each tile by row and column, twice.
 
-    In the second table, saturated numbers are infinite, since their light has no upper bound.
+    In the second table, saturated numbers are infinite, since their light has no upper bound. Each row of tiles has
+    `_HALO` more lanes than tiles. So a neighbour of all lanes is the same array from another start, which a kernel
+    reads in a row: to gather the numbers takes half as long again.
     """
     be = backend()
     dr = be.dr
     down, across = tiles
-    tile = dr.arange(be.UInt32, down * across)
-    columns, words = (dr.opaque(be.UInt32, n) for n in (across, across + _HALO))
-    row = tile // columns
-    first = 2 * row * words + tile - row * columns
+    words = across + _HALO
     # the highest bit says whether a pixel is saturated; to fetch it on its own would take as long as the rest
     marked = mosaic | saturated.astype(np.uint16) << np.uint16(_MOST_BITS)
-    pixels = be.UInt32(_in_words(marked, tiles))
+    of_parity = _in_words(marked, tiles)
     values: Lanes = []
     lit: Lanes = []
     for dy in range(2 + 2 * _HALO):
-        in_row = [dr.gather(be.UInt32, pixels, first + dy * words + dx) for dx in range(1 + _HALO)]
+        starts = [dy // 2 * words + dx for dx in range(1 + _HALO)]
+        in_row = [be.UInt32(of_parity[dy % 2, start : start + down * words]) for start in starts]
         halves = [(word, bit) for word in in_row for bit in (0, 16)]
         values.append([be.Float(be.Int32((word >> bit) & _LARGEST)) for word, bit in halves])
         marks = [(word & (1 << _MOST_BITS + bit)) != 0 for word, bit in halves]
@@ -99,13 +100,22 @@ def _pair(low: Any, high: Any) -> Any:
 
 
 def _in_words(array: Raw, tiles: tuple[int, int]) -> NDArray[np.uint32]:
-    """Return pairs of neighbouring pixels as words, uint32[n], of whole tiles with a mirrored halo around them."""
+    """Return pairs of neighbouring pixels of the even and of the odd rows as words, uint32[2, n].
+
+    The rows are those of whole tiles with a mirrored halo around them, one after the other. At least `_HALO` words
+    that no tile uses follow. Both halves begin at a multiple of 64 bytes, so that frames of a width share a kernel.
+    """
     height, width = array.shape
     down, across = (2 * n for n in tiles)
     padded = cv2.copyMakeBorder(
         array, _HALO, _HALO + down - height, _HALO, _HALO + across - width, cv2.BORDER_REFLECT_101
-    )
-    return buffers.aligned(padded).reshape(-1).view(np.uint32)
+    ).view(np.uint32)
+    used = padded.size // 2
+    out = buffers.aligned(buffers.empty((2, -(-(used + _HALO) // 16) * 16), np.uint32))
+    for parity, words in enumerate(out):
+        words[:used].reshape(-1, padded.shape[1])[...] = padded[parity::2]
+        words[used:] = 0
+    return out
 
 
 class _Tile:
