@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core import buffers
 from ..core.errors import InputError
-from .blocks import blockwise
+from ..core.llvm import backend
 
 if TYPE_CHECKING:
     from .readout import ReadoutSpec
@@ -23,7 +24,7 @@ def convert(analogue: F32, spec: ReadoutSpec, transitions_dn: F32 | None = None)
 
     With `transitions_dn` (see `ReadoutIndividual`) a code begins at its transition.
     """
-    return blockwise(Converter(spec, transitions_dn), plane(analogue))
+    return raw_of(Converter(spec, transitions_dn).codes(on_device(plane(analogue))), analogue.shape)
 
 
 def transitions_dn(dnl_lsb: NDArray[np.floating]) -> F32:
@@ -40,31 +41,50 @@ def transitions_dn(dnl_lsb: NDArray[np.floating]) -> F32:
 
 
 class Converter:
-    """Convert levels to codes with tables that are made once."""
+    """Convert levels to codes in a kernel that drjit compiles, with tables that are made once."""
 
     def __init__(self, spec: ReadoutSpec, transitions: F32 | None) -> None:
-        self.top = spec.top_dn
-        self.table = spec.codes if spec.missing_codes or spec.stuck_bits else None
-        self.transitions = transitions
+        self._top = spec.top_dn
+        self._table = spec.codes if spec.missing_codes or spec.stuck_bits else None
+        self._transitions = transitions
         if transitions is not None:
-            check_shape("transitions_dn", transitions, (self.top,))
+            check_shape("transitions_dn", transitions, (self._top,))
             # levels with integer part k have at least low[k] transitions at or below them, and at most `more`
             # further ones
-            low = np.searchsorted(transitions, np.arange(self.top + 2), side="right")
-            self.low = low.astype(np.int32)
-            self.more = int(np.diff(low).max(initial=0))
-            self.padded = np.append(transitions, np.float32(np.inf))
+            low = np.searchsorted(transitions, np.arange(self._top + 2), side="right")
+            self._low = low.astype(np.uint32)
+            self._more = int(np.diff(low).max(initial=0))
+            self._padded = np.append(transitions, np.float32(np.inf))
 
-    def __call__(self, level: F32) -> Raw:
-        level = np.clip(level, 0, self.top)
-        if self.transitions is None:
-            code = np.rint(level).astype(np.uint16)
+    def codes(self, level: Any) -> Any:
+        """Return the codes of levels in DN; device arrays."""
+        be = backend()
+        dr, UInt32 = be.dr, be.UInt32
+        level = dr.clip(level, 0, dr.opaque(be.Float, self._top))
+        if self._transitions is None:
+            code = UInt32(be.Int32(dr.round(level)))
         else:
-            count = self.low.take(level.astype(np.int32))
-            for _ in range(self.more):
-                count += self.padded.take(count) <= level
-            code = count.astype(np.uint16)
-        return code if self.table is None else self.table.take(code)
+            code = dr.gather(UInt32, UInt32(self._low), UInt32(be.Int32(level)))
+            above = on_device(self._padded)
+            for _ in range(self._more):
+                code = code + dr.select(dr.gather(be.Float, above, code) <= level, UInt32(1), UInt32(0))
+        return code if self._table is None else dr.gather(UInt32, UInt32(self._table.astype(np.uint32)), code)
+
+
+def on_device(array: NDArray[Any]) -> Any:
+    """Return real numbers of any shape as a device array, Float, in their order."""
+    flat = buffers.aligned(np.asarray(array, dtype=np.float32)).reshape(-1)  # so that all arrays share one kernel
+    return backend().Float(flat)
+
+
+def raw_of(codes: Any, shape: tuple[int, ...]) -> Raw:
+    """Return codes of a device as raw numbers, uint16 of a shape."""
+    dr = backend().dr
+    dr.eval(codes)
+    dr.sync_thread()
+    out = buffers.empty(shape, np.uint16)
+    np.copyto(out, np.array(codes, copy=False).reshape(shape), casting="unsafe")
+    return out
 
 
 def with_stuck_bits(raw: Raw, stuck_bits: Sequence[tuple[int, int]]) -> Raw:

@@ -11,17 +11,17 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
 from ..core.errors import InputError
+from ..core.llvm import backend
 from ..core.tables import table_class
-from .blocks import blockwise
-from .converter import Converter, check_shape, plane, transitions_dn, with_stuck_bits
-from .nodes import halves, readout_steps
+from .converter import Converter, check_shape, on_device, plane, raw_of, transitions_dn, with_stuck_bits
+from .nodes import node_of, readout_steps
 from .noise import normal_field
 
 F32 = NDArray[np.float32]
@@ -235,19 +235,16 @@ def read_out(
     noise: ReadoutNoise | None = None,
     individual: ReadoutIndividual | None = None,
 ) -> Raw:
-    """Return raw DN, uint16[y, x], of collected electrons float32[y, x]; the chain runs in blocks of rows.
+    """Return raw DN, uint16[y, x], of collected electrons float32[y, x], in one compiled kernel.
 
     Without `noise` the result is noise-free. Without `individual` it has no fixed pattern and no differential
     non-linearity.
     """
     transitions = None if individual is None else individual.transitions_dn
     chain = _Chain(electrons.shape, spec, noise, individual)
-    code_of = Converter(spec, transitions)
-    return blockwise(
-        lambda block, *of_rows: code_of(chain.amplify(clip_full_well(block, spec.full_well_e), *of_rows)),
-        plane(electrons),
-        *chain.of_rows,
-    )
+    be = backend()
+    left = be.dr.minimum(on_device(plane(electrons)), be.dr.opaque(be.Float, spec.full_well_e))
+    return raw_of(Converter(spec, transitions).codes(chain.amplified(left)), electrons.shape)
 
 
 def analogue_dn(
@@ -261,9 +258,10 @@ def analogue_dn(
     `electrons` are those that the full well has left (`clip_full_well`); other arguments are as in `read_out`.
     """
     chain = _Chain(electrons.shape, spec, noise, individual)
-    return blockwise(
-        lambda block, *of_rows: chain.amplify(block.copy(), *of_rows), plane(electrons), *chain.of_rows
-    )
+    dr, level = backend().dr, chain.amplified(on_device(plane(electrons)))
+    dr.eval(level)
+    dr.sync_thread()
+    return np.array(level, copy=False).reshape(electrons.shape)
 
 
 def clip_full_well(electrons: F32, full_well_e: float) -> F32:
@@ -273,28 +271,20 @@ def clip_full_well(electrons: F32, full_well_e: float) -> F32:
 
 def banding_e(shape: tuple[int, int], spec: ReadoutSpec) -> F32:
     """Return the interference in electrons, float32[y, x]: A sin(2π f t + φ) at the time t of each pixel."""
-    return _product(*_waves(shape, spec))
-
-
-def _waves(shape: tuple[int, int], spec: ReadoutSpec) -> tuple[F32, F32]:
-    """Return the interference as two factors, float32[y, 2] and float32[2, x]."""
     # sin(a + b) of the line's and the pixel's phase is a sum of two products [y] × [x]: no sine per pixel is needed
     line_s, pixel_s = readout_time_s(shape, spec)
     turn = 2 * math.pi * spec.banding_frequency_hz
     line, pixel = turn * line_s + spec.banding_phase_rad, turn * pixel_s
-    wave = spec.banding_seen_e * np.stack([np.sin(line), np.cos(line)], axis=1)
-    return wave.astype(np.float32), np.stack([np.cos(pixel), np.sin(pixel)]).astype(np.float32)
-
-
-def _product(wave: F32, across: F32) -> F32:
-    # BLAS is avoided: its sums may depend on the size of the block
-    out = wave[:, :1] * across[0]
-    out += wave[:, 1:] * across[1]
+    wave = (spec.banding_seen_e * np.stack([np.sin(line), np.cos(line)])).astype(np.float32)
+    across = np.stack([np.cos(pixel), np.sin(pixel)]).astype(np.float32)
+    # BLAS is avoided: its sums may depend on the shape
+    out: F32 = wave[0][:, None] * across[0]
+    out += wave[1][:, None] * across[1]
     return out
 
 
 class _Chain:
-    """Prepare the analogue chain of one exposure for blocks of rows."""
+    """Follow the pixels of one exposure through the analogue chain, in a kernel that drjit compiles."""
 
     def __init__(
         self,
@@ -306,73 +296,67 @@ class _Chain:
         if len(shape) != 2:
             raise InputError(f"the image has shape {shape}, but must be [y, x]")
         height, width = shape
-        self.spec = spec
-        rows = np.zeros(height, dtype=np.float32)
-        self.column_e: F32 | None = None
+        self._shape, self._spec = (height, width), spec
+        rows, columns = (np.zeros(n, dtype=np.float32) for n in shape)
+        self._pixel_e: F32 | None = None
         if individual is not None:
             check_shape("row_e", individual.row_e, (height,))
             check_shape("column_e", individual.column_e, (width,))
             if individual.row_e is not None:
                 rows = rows + individual.row_e
-            self.column_e = individual.column_e
+            if individual.column_e is not None:
+                columns = individual.column_e
+            self._pixel_e = individual.pixel_e
             check_shape("pixel_e", individual.pixel_e, (height, width))
         if noise is not None:
             check_shape("read", noise.read, (height, width))
             check_shape("row", noise.row, (height,))
             rows = rows + noise.row * np.float32(spec.row_noise_e_rms)
-        wave: F32 | None = None
+        self._row_e, self._column_e = (line if line.any() else None for line in (rows, columns))
+        self._read = None if noise is None else noise.read
+
+    def amplified(self, electrons: Any) -> Any:
+        """Return the level at the converter, in DN, of electrons in the order of the pixels; device arrays."""
+        spec = self._spec
+        out = electrons
+        if self._pixel_e is not None:
+            out = out + on_device(self._pixel_e)
+        if self._column_e is not None:
+            out = out + self._everywhere(self._column_e)
+        if self._row_e is not None:
+            out = out + self._everywhere(self._row_e[:, None])
         if spec.banding_seen_e:
-            wave, self.across = _waves((height, width), spec)
-        down, right = halves((height, width), spec.nodes)
+            out = out + on_device(banding_e(self._shape, spec))
+        if self._read is not None:
+            out = out + on_device(self._read) * _opaque(spec.noise_e_rms)
         gains = np.array(spec.node_gains or (1.0,) * spec.nodes) * spec.system_gain_dn_per_e
         offsets = np.array(spec.node_offsets_dn or (0.0,) * spec.nodes) + spec.bias_dn
-        # gains and offsets of the upper and the lower half, float32[2, x]
-        table = np.array([[0, 1], [2, 3]]) if spec.nodes == 4 else np.array([[0, 1]] * 2)
-        by_column = np.minimum(table[:, right], spec.nodes - 1)
-        self.gains, self.offsets = (v[by_column].astype(np.float32) for v in (gains, offsets))
-        pixel_e = None if individual is None else individual.pixel_e
-        self.of_rows = (rows if rows.any() else None, down, wave, None if noise is None else noise.read, pixel_e)
+        if spec.nodes == 1:
+            return self._bent(out * _opaque(gains[0]) + _opaque(offsets[0]))
+        node = node_of(self._shape, spec.nodes)
+        return self._bent(out * on_device(gains[node]) + on_device(offsets[node]))
 
-    def amplify(
-        self,
-        electrons: F32,
-        row_e: F32 | None,
-        half: NDArray[np.intp],
-        wave: F32 | None,
-        read: F32 | None,
-        pixel_e: F32 | None,
-    ) -> F32:
-        """Return the level at the converter, in DN, of a block of rows, whose array `electrons` is overwritten."""
-        out = electrons
-        if pixel_e is not None:
-            out += pixel_e
-        if self.column_e is not None:
-            out += self.column_e
-        if row_e is not None:
-            out += row_e[:, None]
-        if wave is not None:
-            out += _product(wave, self.across)
-        if read is not None:
-            out += read * np.float32(self.spec.noise_e_rms)
-        # a block may lie in both halves
-        for lower in (0, 1):
-            rows = half == lower
-            if rows.all():
-                out *= self.gains[lower]
-                out += self.offsets[lower]
-            elif rows.any():
-                out[rows] = out[rows] * self.gains[lower] + self.offsets[lower]
-        return self._bend(out)
+    def _everywhere(self, values: F32) -> Any:
+        """Return values by row or by column as a device array in the order of the pixels.
 
-    def _bend(self, dn: F32) -> F32:
+        To fetch them in the kernel takes longer than to copy them: a processor's instruction for that is slow.
+        """
+        return on_device(np.broadcast_to(values, self._shape))
+
+    def _bent(self, dn: Any) -> Any:
         """Apply the integral non-linearity, which has no deviation at the bias and at the top code."""
-        spec = self.spec
+        spec = self._spec
         if not (spec.inl_quadratic_dn or spec.inl_cubic_dn):
             return dn
-        u = (dn - np.float32(spec.bias_dn)) * np.float32(1 / (spec.top_dn - spec.bias_dn))
+        u = (dn - _opaque(spec.bias_dn)) * _opaque(1 / (spec.top_dn - spec.bias_dn))
         # outside the range the polynomials diverge, so the curve continues as a straight line
-        np.clip(u, 0, 1, out=u)
+        u = backend().dr.clip(u, 0, 1)
         arc = u * (1 - u)
         s = 4 * spec.inl_quadratic_dn + _CUBIC_SCALE * spec.inl_cubic_dn
-        dn += arc * (np.float32(s) - np.float32(2 * _CUBIC_SCALE * spec.inl_cubic_dn) * u)
-        return dn
+        return dn + arc * (_opaque(s) - _opaque(2 * _CUBIC_SCALE * spec.inl_cubic_dn) * u)
+
+
+def _opaque(value: float) -> Any:
+    """Return a number as an argument of a kernel; as a literal it would give each sensor a kernel of its own."""
+    be = backend()
+    return be.dr.opaque(be.Float, float(value))
