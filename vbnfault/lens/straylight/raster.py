@@ -37,6 +37,7 @@ _EDGE_NODES = 2049
 _UNLIKE = 0.05  # ratio of neighbouring areas below which a fold is near
 _SMOOTH = 0.5  # change of irradiance over a pixel that still looks smooth
 _NEIGHBOURS = 4096  # lanes that follow each other, mostly cells side by side, whose pixels share the cache
+_SIZES_PER_OCTAVE = 16  # classes of cells by the number of their pixels; with more, neighbours are torn apart
 _NARROW_PX = 1.5  # cells narrower than this are drawn by points
 _POINTS = 64  # largest number of points along each side of a cell
 _WANDER = 1.0  # largest distance of a cell's points beyond its corners, in sizes of the cell
@@ -291,12 +292,12 @@ class Sums:
 def _shared_out(work: NDArray[np.uint32], chosen: NDArray[np.int64]) -> NDArray[np.uint32]:
     """Return lanes in an order that balances the work.
 
-    Lanes with equal work are neighbours, because neighbours in the vector unit wait for one another. Among those,
-    neighbouring cells follow each other. Groups of such lanes are scattered so that every thread gets some of the
-    large ones.
+    Lanes with nearly equal work are neighbours, because neighbours in the vector unit wait for one another. Among
+    those, neighbouring cells follow each other, because their pixels share the cache. Groups of such lanes are
+    scattered so that every thread gets some of the large ones.
     """
-    size = np.minimum(work[chosen], 65535).astype(np.uint16)
-    order = chosen[np.argsort(size, kind="stable")].astype(np.uint32)
+    size = np.log2(np.maximum(work[chosen], 1).astype(np.float32)) * _SIZES_PER_OCTAVE
+    order = chosen[np.argsort(np.ceil(size).astype(np.uint16), kind="stable")].astype(np.uint32)
     groups = len(order) // _NEIGHBOURS
     golden = np.argsort(np.arange(groups) * ((np.sqrt(5) - 1) / 2) % 1)
     rest = order[groups * _NEIGHBOURS :]
