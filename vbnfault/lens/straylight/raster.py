@@ -36,7 +36,8 @@ EDGE_LOW, EDGE_HIGH = -1.0, 5.0  # range of the profile of a soft edge, in width
 _EDGE_NODES = 2049
 _UNLIKE = 0.05  # ratio of neighbouring areas below which a fold is near
 _SMOOTH = 0.5  # change of irradiance over a pixel that still looks smooth
-_NEIGHBOURS = 4096  # lanes that follow each other, mostly cells side by side, whose pixels share the cache
+_NEIGHBOURS = 16384  # lanes that follow each other, mostly cells side by side, whose pixels share the cache
+_BANDS_APART = 64
 _SIZES_PER_OCTAVE = 16  # classes of cells by the number of their pixels; with more, neighbours are torn apart
 _NARROW_PX = 1.5  # cells narrower than this are drawn by points
 _POINTS = 64  # largest number of points along each side of a cell
@@ -135,17 +136,13 @@ class Sums:
 
     def draw(self, spots: Spots, placement: BundleDrawing, azimuth_rad: float) -> None:
         """Add bundles of rays on lattices, turned to the Sun's azimuth."""
-        UInt32 = backend().UInt32
         lattice = _Lattice(self.canvas, _Traced(spots), placement, azimuth_rad)
         number, folds = (v.numpy() for v in lattice.cells().pixels())
-        order = _shared_out(number, np.flatnonzero(number))
-        if len(order):
-            self._fill(lattice.cells(UInt32(order)))
-        folded = np.flatnonzero(folds).astype(np.uint32)
+        filled, folded = np.flatnonzero(number), np.flatnonzero(folds)
+        if len(filled):
+            self._fill(lattice.shared_out(filled, number[filled]))
         if len(folded):
-            number = lattice.cells(UInt32(folded)).points().numpy()
-            order = folded[_shared_out(number, np.arange(len(folded)))]
-            self._splat(lattice.cells(UInt32(order)))
+            self._splat(lattice.shared_out(folded, lattice.cells(folded).points().numpy()))
 
     def _fill(self, cells: _Cells) -> None:
         """Draw cells as pairs of triangles; add small cells to the pixels nearest to their middle."""
@@ -289,19 +286,23 @@ class Sums:
         ]
 
 
-def _shared_out(work: NDArray[np.uint32], chosen: NDArray[np.int64]) -> NDArray[np.uint32]:
-    """Return lanes in an order that balances the work.
+def _shared_out(work: NDArray[np.uint32], band: NDArray[np.uint16]) -> NDArray[np.intp]:
+    """Return the order of lanes with work, [lane] each, that balances it.
 
-    Lanes with nearly equal work are neighbours, because neighbours in the vector unit wait for one another. Among
-    those, neighbouring cells follow each other, because their pixels share the cache. Groups of such lanes are
-    scattered so that every thread gets some of the large ones.
+    Bands follow each other, because a plane of the sums fits the cache where those of all bands do not. Lanes with
+    nearly equal work are neighbours, because neighbours in the vector unit wait for one another. Among those,
+    neighbouring cells follow each other, because their pixels share the cache. Groups of such lanes are scattered
+    within a band so that every thread gets some of the large ones.
     """
-    size = np.log2(np.maximum(work[chosen], 1).astype(np.float32)) * _SIZES_PER_OCTAVE
-    order = chosen[np.argsort(np.ceil(size).astype(np.uint16), kind="stable")].astype(np.uint32)
-    groups = len(order) // _NEIGHBOURS
-    golden = np.argsort(np.arange(groups) * ((np.sqrt(5) - 1) / 2) % 1)
-    rest = order[groups * _NEIGHBOURS :]
-    return np.concatenate([order[: groups * _NEIGHBOURS].reshape(groups, _NEIGHBOURS)[golden].ravel(), rest])
+    sizes = np.ceil(np.log2(np.maximum(work, 1).astype(np.float32)) * _SIZES_PER_OCTAVE).astype(np.uint16)
+    lanes = np.argsort(band << 10 | sizes, kind="stable")  # of 16 bits, which numpy sorts fastest
+    parts = []
+    for lanes_of_band in np.split(lanes, np.cumsum(np.bincount(band))[:-1]):
+        groups = len(lanes_of_band) // _NEIGHBOURS
+        golden = np.argsort(np.arange(groups) * ((np.sqrt(5) - 1) / 2) % 1)
+        whole, rest = np.split(lanes_of_band, [groups * _NEIGHBOURS])
+        parts += [whole.reshape(groups, _NEIGHBOURS)[golden].ravel(), rest]
+    return np.concatenate(parts)
 
 
 class _Triangle:
@@ -432,10 +433,16 @@ class _Lattice:
         self.entrance_mm2 = traced.entrance_mm2[placement.source]
         self.light = self.entrance_mm2 * placement.strength * self.per_mm**2
         self.numbers = lattice_places(self.across - 1, self.across - 1)
+        # of each cell; as many groups keep the pixels of most cells together
+        self._bands = np.repeat((placement.band[:, 0] % _BANDS_APART).astype(np.uint16), (self.across - 1) ** 2)
 
-    def cells(self, index: Any = None) -> _Cells:
+    def cells(self, index: NDArray[np.intp] | None = None) -> _Cells:
         """Return all cells, or those at an index."""
-        return _Cells(self, index)
+        return _Cells(self, None if index is None else backend().UInt32(index.astype(np.uint32)))
+
+    def shared_out(self, index: NDArray[np.intp], work: NDArray[np.uint32]) -> _Cells:
+        """Return the cells at an index in an order that shares out their work, such as pixels to draw."""
+        return self.cells(index[_shared_out(work, self._bands[index])])
 
 
 class _Cells:
