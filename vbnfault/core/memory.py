@@ -17,7 +17,7 @@ from . import buffers
 
 # Resident memory in bytes that a process reaches before it releases any. To take memory back from the system costs
 # a tenth of a sample's time where every stage does it, so memory is released only where a step would pass this.
-_MOST = 1260 << 20
+_MOST = 1360 << 20
 _M_ARENA_MAX, _ARENAS = -8, 2  # option of `mallopt` in the GNU C library, and its value
 
 

@@ -35,7 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from ..core import spectra
+from ..core import buffers, spectra
 from ..lens import Prescription
 from ..lens.coating import mean_reflectance
 from ..lens.footprint import ImageFrame
@@ -127,7 +127,7 @@ class Contamination(LensFault):
         out = times(quantity.array, passes * (1 - lost))
         if lost:
             strewn = _strewn(quantity.array, quantity.white_e, params, context)
-            out += times(strewn, passes)
+            cv2.add(out, times(strewn, passes), dst=out)
         return quantity.with_array(out)
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
@@ -293,7 +293,8 @@ def _strewn(array: F32, white_e: F32, params: Params, context: FaultContext) -> 
     step = _cell_px(frame)
     height, width, channels = array.shape
     rows, columns = -(-height // step), -(-width // step)
-    whole = cv2.copyMakeBorder(array, 0, rows * step - height, 0, columns * step - width, cv2.BORDER_REPLICATE)
+    below, right = rows * step - height, columns * step - width
+    whole = cv2.copyMakeBorder(array, 0, below, 0, right, cv2.BORDER_REPLICATE) if below or right else array
     cells = cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA).reshape(rows, columns, channels)
     # the grid has twice the size of the frame, so no two cells of the frame meet across its periodic edge
     shape = (fft.next_fast_len(2 * rows, real=True), fft.next_fast_len(2 * columns, real=True))
@@ -314,7 +315,7 @@ def _strewn(array: F32, white_e: F32, params: Params, context: FaultContext) -> 
     inner = np.moveaxis(spread[:, top - 1 : top + rows + 1, left - 1 : left + columns + 1], 0, -1)
     inner = np.maximum(np.ascontiguousarray(inner), np.float32(0))
     if step == 1:
-        return np.ascontiguousarray(inner[1:-1, 1:-1])
-    finer = cv2.resize(inner, ((columns + 2) * step, (rows + 2) * step), interpolation=cv2.INTER_LINEAR)
-    finer = finer.reshape(*finer.shape[:2], channels)
-    return np.ascontiguousarray(finer[step : step + height, step : step + width])
+        return inner[1:-1, 1:-1]
+    finer = buffers.empty(((rows + 2) * step, (columns + 2) * step, channels))
+    cv2.resize(inner, finer.shape[1::-1], dst=finer, interpolation=cv2.INTER_LINEAR)
+    return finer[step : step + height, step : step + width]

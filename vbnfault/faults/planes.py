@@ -17,10 +17,11 @@ _ROWS_AT_ONCE = 64  # so that the factors of these rows stay in the cache
 
 def times(array: NDArray[np.float32], factor: NDArray[Any]) -> NDArray[np.float32]:
     """Return planes float32[y, x, channel] times a factor for each channel [channel] or for each pixel [y, x]."""
+    out = buffers.empty(array.shape)
     if factor.ndim == 1:
         # OpenCV needs a scalar of four numbers
-        return np.asarray(cv2.multiply(array, (*factor.tolist(), 0.0, 0.0, 0.0)[:4])).reshape(array.shape)
-    out = buffers.empty(array.shape)
+        cv2.multiply(array, (*factor.tolist(), 0.0, 0.0, 0.0)[:4], dst=out)
+        return out
     for start in range(0, len(array), _ROWS_AT_ONCE):
         rows = slice(start, start + _ROWS_AT_ONCE)
         cv2.multiply(array[rows], cv2.merge([factor[rows]] * array.shape[2]), dst=out[rows])
