@@ -37,8 +37,8 @@ _EDGE_NODES = 2049
 _UNLIKE = 0.05  # ratio of neighbouring areas below which a fold is near
 _SMOOTH = 0.5  # change of irradiance over a pixel that still looks smooth
 _NEIGHBOURS = 16384  # lanes that follow each other, mostly cells side by side, whose pixels share the cache
-_BANDS_APART = 64
-_ONE = np.float32(1).view(np.uint32)
+_BANDS_APART = 64  # largest number of bands that are drawn one after the other
+_ONE = np.float32(1).view(np.uint32)  # the bits of the number, as an integer
 _NARROW_PX = 1.5  # cells narrower than this are drawn by points
 _POINTS = 64  # largest number of points along each side of a cell
 _WANDER = 1.0  # largest distance of a cell's points beyond its corners, in sizes of the cell
@@ -434,7 +434,7 @@ class _Lattice:
         self.entrance_mm2 = traced.entrance_mm2[placement.source]
         self.light = self.entrance_mm2 * placement.strength * self.per_mm**2
         self.numbers = lattice_places(self.across - 1, self.across - 1)
-        # of each cell; as many groups keep the pixels of most cells together
+        # the band of each cell, modulo a number that `_shared_out` can sort by
         self._bands = np.repeat((placement.band[:, 0] % _BANDS_APART).astype(np.uint16), (self.across - 1) ** 2)
 
     def cells(self, index: NDArray[np.intp] | None = None) -> _Cells:
