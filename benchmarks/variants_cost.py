@@ -1,6 +1,6 @@
 """Measure what a labelled sample costs when several samples share a view, against one view a sample.
 
-    python benchmarks/variants_cost.py [SCENE] [--samples N] [--variants K] [--size PX] [--functions N]
+    python benchmarks/variants_cost.py [SCENE] [--samples N] [--variants K] [--size PX] [--threads N] [--functions N]
 
 Both datasets are built into stores in one process: the same scene, seed, terrain and number of samples, with
 `dataset.variants_per_view` of 1 and of K. Both plans command each fault class in equally many samples. The shards
@@ -10,7 +10,8 @@ on both. One site is used: in a large dataset its terrain serves hundreds of sam
 Printed are, for both builds, ms of wall and of CPU time per sample of each stage and of whole samples, with `store`
 for encoding and writing; the numbers of renders, of samples with faults, and of their classes; and the ratios. With
 --functions N, the N functions that take longest after the render of the build with K variants are printed, too; the
-profile slows that build, so its ratio is then not the one to quote.
+profile slows that build, so its ratio is then not the one to quote. A build with as many workers as cores gives each
+worker one render thread: --threads 1 measures what one of them does.
 """
 
 from __future__ import annotations
@@ -111,13 +112,15 @@ class Timed:
             seconds["store"] = seconds["sum"] - sum(seconds[name] for name in STAGES)
 
 
-def sessions(scene: str, samples: int, variants: int, settings: Mapping[str, Any]) -> list[pipeline.Session]:
+def sessions(
+    scene: str, samples: int, variants: int, settings: Mapping[str, Any], threads: int | None = None
+) -> list[pipeline.Session]:
     """Return the sessions with one and with `variants` samples of a view, on one terrain."""
     out = []
     for k in (1, variants):
         table = {"samples": samples, "sites": 1, "variants_per_view": k, "shard_samples": variants}
         values = {f"dataset.{key}": value for key, value in table.items()}
-        out.append(pipeline.Session(config.load_scene(scene, {**settings, **values})))
+        out.append(pipeline.Session(config.load_scene(scene, {**settings, **values}), threads=threads))
     alone, shared = out
     shared.body = alone.body
     shared.terrain = alone.terrain  # type: ignore[method-assign]
@@ -131,13 +134,14 @@ def measure(
     folder: Path,
     *,
     settings: Mapping[str, Any] | None = None,
+    threads: int | None = None,
     profiled: bool = False,
 ) -> tuple[Timed, Timed]:
     """Build both stores in `folder`, shard by shard in turn, and return their times.
 
-    `settings` are keys of the scene file with their values, as `build --set` takes them.
+    `settings` are keys of the scene file with their values, as `build --set` takes them, and `threads` is as there.
     """
-    both = sessions(scene, samples, variants, settings or {})
+    both = sessions(scene, samples, variants, settings or {}, threads)
     profile = cProfile.Profile() if profiled else None
     for session in both:  # kernels, textures, the model of the lens; other samples than the first, to keep no view
         session.simulate(samples - 1)
@@ -180,6 +184,7 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=32)
     parser.add_argument("--variants", type=int, default=8, metavar="K")
     parser.add_argument("--size", type=int, help="pixels along either side of the frame")
+    parser.add_argument("--threads", type=int, metavar="N", help="render threads, as of build; default: all cores")
     parser.add_argument("--functions", type=int, default=0, metavar="N")
     given = parser.parse_args()
     size = {} if given.size is None else {"camera.width_px": given.size, "camera.height_px": given.size}
@@ -190,6 +195,7 @@ def main() -> None:
             given.variants,
             Path(folder),
             settings=size,
+            threads=given.threads,
             profiled=bool(given.functions),
         )
         digests = [store.digest(build.store)[:16] for build in (alone, shared)]
