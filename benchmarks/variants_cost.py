@@ -1,6 +1,7 @@
 """Measure what a labelled sample costs when several samples share a view, against one view a sample.
 
-    python benchmarks/variants_cost.py [SCENE] [--samples N] [--variants K] [--size PX] [--threads N] [--functions N]
+    python benchmarks/variants_cost.py [SCENE] [--samples N] [--variants K] [--size PX] [--threads N]
+        [--functions N]
 
 Both datasets are built into stores in one process: the same scene, seed, terrain and number of samples, with
 `dataset.variants_per_view` of 1 and of K. Both plans command each fault class in equally many samples. The shards
@@ -10,8 +11,9 @@ on both. One site is used: in a large dataset its terrain serves hundreds of sam
 Printed are, for both builds, ms of wall and of CPU time per sample of each stage and of whole samples, with `store`
 for encoding and writing; the numbers of renders, of samples with faults, and of their classes; and the ratios. With
 --functions N, the N functions that take longest after the render of the build with K variants are printed, too; the
-profile slows that build, so its ratio is then not the one to quote. A build with as many workers as cores gives each
-worker one render thread: --threads 1 measures what one of them does.
+profile slows that build, so its ratio is then not the one to quote.
+
+A build with as many workers as cores gives each worker one render thread; --threads 1 measures such a worker.
 """
 
 from __future__ import annotations
