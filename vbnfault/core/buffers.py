@@ -115,6 +115,11 @@ def aligned(array: NDArray[T]) -> NDArray[T]:
     return out
 
 
+def flat(array: NDArray[T]) -> NDArray[T]:
+    """Return `aligned` of an array in one dimension, as drjit takes it."""
+    return aligned(array).reshape(-1)
+
+
 def clear() -> None:
     """Free the memory that is kept for coming arrays."""
     _kept.clear()

@@ -111,7 +111,7 @@ class Device:
         self.telegraph = self.individual.rts.at(self.temperature_K)
         self.chain = chain_of(sensor.effects)
         names = [effect.name for effect in self.chain]
-        # with no effect between them, the three run on one block of rows after the other, which is quicker
+        # with no effect between them, the three run in one kernel, which is quicker
         self._reads_out_at_once = names.index("converter") == names.index("full_well") + 2
 
     # --- light to raw DN ------------------------------------------------------------------------------------------

@@ -83,20 +83,20 @@ def image(curve: Curve, signal: F32, codes: NDArray[np.uint16] | None, base: tup
     dr, trace = be.dr, _Trace(curve, noisy=codes is not None)
     place = dr.arange(be.UInt32, signal.size)
     given = [
-        be.Float(_flat(signal)),
+        be.Float(buffers.flat(signal)),
         place,
-        be.UInt32(0) if codes is None else be.UInt32(_flat(codes).view(np.uint32)),
+        be.UInt32(0) if codes is None else be.UInt32(buffers.flat(codes).view(np.uint32)),
     ]
     if base is None:
         found = trace.level(*given)
     else:
-        of_base = be.UInt32(_flat(base[1]).view(np.uint32))
+        of_base = be.UInt32(buffers.flat(base[1]).view(np.uint32))
 
         def known(_: Any, place: Any, __: Any) -> Any:
             pixel = place // 3
             return dr.gather(be.UInt32, of_base, pixel) >> 8 * (place - 3 * pixel) & 0xFF
 
-        found = dr.if_stmt(tuple(given), given[0] != be.Float(_flat(base[0])), trace.level, known)
+        found = dr.if_stmt(tuple(given), given[0] != be.Float(buffers.flat(base[0])), trace.level, known)
     out = be.UInt8(found)
     dr.eval(out)
     dr.sync_thread()
@@ -162,7 +162,7 @@ class _Trace:
         self._scale = [be.dr.opaque(be.Float64, float(value)) for value in curve.scale]
         if noisy:
             self._normal = _tables()[0]
-            self._dark_counts = be.Float(_flat(curve.dark_counts_e))
+            self._dark_counts = be.Float(buffers.flat(curve.dark_counts_e))
 
     def level(self, signal: Any, place: Any, codes: Any) -> Any:
         """Return the 8 bit levels of signals; the low half of a word of codes is that of the shot noise."""
@@ -191,12 +191,12 @@ def poisson(mean: F32, normal: NormalField) -> F32:
     """Return `noise.poisson_quantile` of means and normal variates, float32[y, x]."""
     be = backend()
     dr = be.dr
-    codes = _flat(normal.codes)
+    codes = buffers.flat(normal.codes)
     if codes.size % 2:  # two codes share a word
-        codes = _flat(np.append(codes, np.uint16(0)))
+        codes = buffers.flat(np.append(codes, np.uint16(0)))
     place = dr.arange(be.UInt32, mean.size)
     word = dr.gather(be.UInt32, be.UInt32(codes.view(np.uint32)), place >> 1)
-    counts = _poisson(be.Float(_flat(mean)), word >> 16 * (place & 1) & 0xFFFF)
+    counts = _poisson(be.Float(buffers.flat(mean)), word >> 16 * (place & 1) & 0xFFFF)
     dr.eval(counts)
     dr.sync_thread()
     out: F32 = np.array(counts, copy=False)
@@ -240,13 +240,8 @@ def _summed(_: Any, mean: Any, code: Any, few: Any) -> Any:
     return be.Float(count)
 
 
-def _flat(array: NDArray[Any]) -> NDArray[Any]:
-    """Return an array in one dimension, aligned so that all arrays share one kernel."""
-    return buffers.aligned(array).reshape(-1)
-
-
 @lru_cache(maxsize=1)
 def _tables() -> tuple[Any, Any]:
     """Return the normal variates by code, and the values of their distribution function, on the device."""
     be, normal = backend(), variates_by_code()
-    return be.Float(_flat(normal)), be.Float64(_flat(ndtr(normal.astype(np.float64))))
+    return be.Float(buffers.flat(normal)), be.Float64(buffers.flat(ndtr(normal.astype(np.float64))))

@@ -71,8 +71,8 @@ def _neighbourhoods(mosaic: Raw, saturated: Mask, tiles: tuple[int, int]) -> tup
     """Return the 6 × 6 raw numbers in and around each tile by row and column, twice.
 
     In the second table, saturated numbers are infinite, since their light has no upper bound. Each row of tiles has
-    `_HALO` more lanes than tiles. So a neighbour of all lanes is the same array from another start, which a kernel
-    reads in a row: to gather the numbers takes half as long again.
+    `_HALO` more lanes than tiles. So the neighbours of all lanes on one side are the same array from another start,
+    which a kernel reads in a row: to gather the numbers takes half as long again.
     """
     be = backend()
     dr = be.dr

@@ -57,7 +57,7 @@ class Converter:
             self._padded = np.append(transitions, np.float32(np.inf))
 
     def codes(self, level: Any) -> Any:
-        """Return the codes of levels in DN; device arrays."""
+        """Return the codes, UInt32, of levels in DN, Float."""
         be = backend()
         dr, UInt32 = be.dr, be.UInt32
         level = dr.clip(level, 0, dr.opaque(be.Float, self._top))
@@ -73,8 +73,7 @@ class Converter:
 
 def on_device(array: NDArray[Any]) -> Any:
     """Return real numbers of any shape as a device array, Float, in their order."""
-    flat = buffers.aligned(np.asarray(array, dtype=np.float32)).reshape(-1)  # so that all arrays share one kernel
-    return backend().Float(flat)
+    return backend().Float(buffers.flat(np.asarray(array, dtype=np.float32)))
 
 
 def raw_of(codes: Any, shape: tuple[int, ...]) -> Raw:

@@ -242,8 +242,7 @@ def read_out(
     """
     transitions = None if individual is None else individual.transitions_dn
     chain = _Chain(electrons.shape, spec, noise, individual)
-    be = backend()
-    left = be.dr.minimum(on_device(plane(electrons)), be.dr.opaque(be.Float, spec.full_well_e))
+    left = backend().dr.minimum(on_device(plane(electrons)), _opaque(spec.full_well_e))
     return raw_of(Converter(spec, transitions).codes(chain.amplified(left)), electrons.shape)
 
 
@@ -316,7 +315,7 @@ class _Chain:
         self._read = None if noise is None else noise.read
 
     def amplified(self, electrons: Any) -> Any:
-        """Return the level at the converter, in DN, of electrons in the order of the pixels; device arrays."""
+        """Return the level at the converter in DN, Float, of electrons, Float, in the order of the pixels."""
         spec = self._spec
         out = electrons
         if self._pixel_e is not None:
@@ -339,7 +338,7 @@ class _Chain:
     def _everywhere(self, values: F32) -> Any:
         """Return values by row or by column as a device array in the order of the pixels.
 
-        To fetch them in the kernel takes longer than to copy them: a processor's instruction for that is slow.
+        A kernel that gathers them takes longer than the copy: the gather instruction of processors may be slow.
         """
         return on_device(np.broadcast_to(values, self._shape))
 

@@ -236,7 +236,7 @@ class Direct(Light):
             return slice(part.first, part.first + part.count), sums, samples
 
         def take(span: slice, queued_sums: list[Any], samples: Any) -> None:
-            """Wait for the kernels of a part, and add the sums of its terms to the bands of its pixels."""
+            """Wait for the kernels of a part of the pixels, and add the sums of its terms to their bands."""
             sums = [total.numpy() for total in queued_sums]
             for k, (row, values) in enumerate(zip(weights, sums, strict=False)):
                 if self.banded:  # the only term of its band, which is quicker than a sum

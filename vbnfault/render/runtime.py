@@ -35,4 +35,4 @@ def packets(kind: Any, values: NDArray[Any]) -> Any:
     aligned, drjit fetches single numbers, by another kernel: the one in its cache on disk would serve only some of
     the processes.
     """
-    return kind(buffers.aligned(values.ravel()))
+    return kind(buffers.flat(values))

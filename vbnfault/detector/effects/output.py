@@ -69,7 +69,7 @@ class RawStep(FaultStep):
 
 
 def full_well_to_codes(signal: F32, exposure: Exposure) -> Raw:
-    """Return what `FullWell`, `Analogue` and `Conversion` give one after the other, in one pass over blocks."""
+    """Return what `FullWell`, `Analogue` and `Conversion` give one after the other, in one kernel."""
     noise = None if exposure.noise is None else exposure.noise.readout
     return read_out(signal, exposure.sensor.readout, noise, _with_offsets(exposure))
 

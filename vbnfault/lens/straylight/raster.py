@@ -287,7 +287,7 @@ class Sums:
 
 
 def _shared_out(work: NDArray[np.uint32], band: NDArray[np.uint16]) -> NDArray[np.intp]:
-    """Return the order of lanes with work, [lane] each, that balances it.
+    """Return an order of lanes that balances their work, intp[lane]; `work` and `band` hold a value for each lane.
 
     Bands follow each other, because a plane of the sums fits the cache where those of all bands do not. Lanes with
     nearly equal work are neighbours, because neighbours in the vector unit wait for one another. Among those,
