@@ -5,8 +5,9 @@
 
 Both datasets are built into stores in one process: the same scene, seed, terrain and number of samples, with
 `dataset.variants_per_view` of 1 and of K. Both plans command each fault class in equally many samples. The shards
-of the two builds take turns, after one sample of each that is not counted, so that load and heat of the machine act
-on both. One site is used: in a large dataset its terrain serves hundreds of samples, so its load is not counted.
+of the two builds take turns, so that load and heat of the machine act on both. Before, samples with each fault class
+are simulated and not counted, because kernels and the models of the lens serve a whole dataset. So does the terrain
+of a site: one is used, and its load is not counted.
 
 Printed are, for both builds, ms of wall and of CPU time per sample of each stage and of whole samples, with `store`
 for encoding and writing; the numbers of renders, of samples with faults, and of their classes; and the ratios. With
@@ -129,6 +130,23 @@ def sessions(
     return out
 
 
+def warm_up(session: pipeline.Session, threads: int | None) -> None:
+    """Compile kernels and make textures and the models of the lens, which all sessions of a process share.
+
+    A second session of the same scene and terrain simulates samples until each fault class has been commanded. It is
+    released afterwards, so that none of its views stays in memory.
+    """
+    other = pipeline.Session(session.scene, threads=threads)
+    other.body = session.body
+    other.terrain = session.terrain  # type: ignore[method-assign]
+    missing = set(other.faults)
+    for index in range(len(other.plan) - 1, -1, -1):
+        here = missing & set(other.plan.commanded(index))
+        if here or index == len(other.plan) - 1:
+            other.simulate(index)
+            missing -= here
+
+
 def measure(
     scene: str,
     samples: int,
@@ -145,8 +163,7 @@ def measure(
     """
     both = sessions(scene, samples, variants, settings or {}, threads)
     profile = cProfile.Profile() if profiled else None
-    for session in both:  # kernels, textures, the model of the lens; other samples than the first, to keep no view
-        session.simulate(samples - 1)
+    warm_up(both[-1], threads)
     alone, shared = (
         Timed(session, folder / f"{k}.zarr", profile if k > 1 else None)
         for session, k in zip(both, (1, variants), strict=True)

@@ -10,7 +10,7 @@ one of the 65,536 quantiles of the variates.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -188,15 +188,23 @@ class _Trace:
 
 
 def poisson(mean: F32, normal: NormalField) -> F32:
-    """Return `noise.poisson_quantile` of means and normal variates, float32[y, x]."""
+    """Return `noise.poisson_quantile` of means and normal variates, float32[y, x].
+
+    The variates are looked up by numpy, once for all exposures with this noise: on some processors, to fetch them
+    in the kernel takes longer than all of its arithmetic.
+    """
     be = backend()
     dr = be.dr
     codes = buffers.flat(normal.codes)
     if codes.size % 2:  # two codes share a word
         codes = buffers.flat(np.append(codes, np.uint16(0)))
-    place = dr.arange(be.UInt32, mean.size)
-    word = dr.gather(be.UInt32, be.UInt32(codes.view(np.uint32)), place >> 1)
-    counts = _poisson(be.Float(buffers.flat(mean)), word >> 16 * (place & 1) & 0xFFFF)
+    words = be.UInt32(codes.view(np.uint32))
+
+    def code_at(place: Any, lanes: Any) -> Any:
+        return dr.gather(be.UInt32, words, place >> 1, lanes) >> 16 * (place & 1) & 0xFFFF
+
+    flat, z = be.Float(buffers.flat(mean)), be.Float(buffers.flat(normal.looked_up))
+    counts = _quantile(flat, z, dr.arange(be.UInt32, mean.size), code_at)
     dr.eval(counts)
     dr.sync_thread()
     out: F32 = np.array(counts, copy=False)
@@ -205,10 +213,18 @@ def poisson(mean: F32, normal: NormalField) -> F32:
 
 
 def _poisson(mean: Any, code: Any, active: Any = True) -> Any:
-    """Return `noise.poisson_quantile` of the means of active lanes, as Float."""
+    """Return `noise.poisson_quantile` of the means of active lanes and of codes of normal variates, as Float."""
+    be = backend()
+    return _quantile(mean, be.dr.gather(be.Float, _tables()[0], code, active), code, lambda code, _: code, active)
+
+
+def _quantile(mean: Any, z: Any, place: Any, code_at: Callable[[Any, Any], Any], active: Any = True) -> Any:
+    """Return `noise.poisson_quantile` of the means and normal variates of active lanes, as Float.
+
+    `code_at` returns the codes of the variates at places, for the lanes whose distribution is summed.
+    """
     be = backend()
     dr = be.dr
-    z = dr.gather(be.Float, _tables()[0], code, active)
     count = (z * z * be.Float(1 / 6) + be.Float(1 / 3) + dr.sqrt(mean) * z) + mean
     count = dr.if_stmt(
         (count, mean, z),
@@ -218,10 +234,15 @@ def _poisson(mean: Any, code: Any, active: Any = True) -> Any:
     )
     few = active & (mean < EXACT_POISSON_BELOW_E)
     count = dr.maximum(dr.floor(count), 0)
-    return dr.if_stmt((count, mean, code, few), few, _summed, lambda count, *_: count)
+    return dr.if_stmt(
+        (count, mean, place, few),
+        few,
+        lambda _, mean, place, few: _summed(mean, code_at(place, few), few),
+        lambda count, *_: count,
+    )
 
 
-def _summed(_: Any, mean: Any, code: Any, few: Any) -> Any:
+def _summed(mean: Any, code: Any, few: Any) -> Any:
     """Return the Poisson counts of means of few electrons, as Float, by summing the distribution in float64."""
     be = backend()
     dr = be.dr

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -81,6 +81,13 @@ class NormalField:
             np.take(table, codes[part], mode="clip", out=out[part])
         out[self.tail] = self.tail_values
         return out.reshape(self.codes.shape)
+
+    @cached_property
+    def looked_up(self) -> F32:
+        """Return `values`, which are kept and must not be changed."""
+        out = self.values()
+        out.flags.writeable = False
+        return out
 
 
 def draw_normals(shape: tuple[int, ...], rng: np.random.Generator) -> NormalField:

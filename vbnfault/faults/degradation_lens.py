@@ -43,7 +43,7 @@ from ..lens.straylight.scatter import Harvey
 from .context import FaultContext, Params
 from .contract import LensFault
 from .fields import Interval, Severity, bounds, choice, number
-from .planes import times
+from .planes import add_to, times
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -126,8 +126,7 @@ class Contamination(LensFault):
         lost = params["haze"] + sum(s["share"] for s in params["scratches"])
         out = times(quantity.array, passes * (1 - lost))
         if lost:
-            strewn = _strewn(quantity.array, quantity.white_e, params, context)
-            cv2.add(out, times(strewn, passes), dst=out)
+            add_to(out, _strewn(quantity.array, quantity.white_e, passes, params, context))
         return quantity.with_array(out)
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
@@ -287,8 +286,8 @@ def kernel(params: Params, frame: ImageFrame, shape: tuple[int, int]) -> F32:
     return out.astype(np.float32)
 
 
-def _strewn(array: F32, white_e: F32, params: Params, context: FaultContext) -> F32:
-    """Return the scattered light, float32[y, x, channel]."""
+def _strewn(array: F32, white_e: F32, passes: F64, params: Params, context: FaultContext) -> F32:
+    """Return the scattered light that passes, float32[y, x, channel]; `passes` are fractions float64[channel]."""
     frame = context.frame
     step = _cell_px(frame)
     height, width, channels = array.shape
@@ -313,7 +312,7 @@ def _strewn(array: F32, white_e: F32, params: Params, context: FaultContext) -> 
     waves = context.once(f"contamination.kernel {shape}", params, lambda: fft.rfft2(kernel(params, frame, shape)))
     spread = fft.irfft2(fft.rfft2(planes) * waves, s=shape)
     inner = np.moveaxis(spread[:, top - 1 : top + rows + 1, left - 1 : left + columns + 1], 0, -1)
-    inner = np.maximum(np.ascontiguousarray(inner), np.float32(0))
+    inner = np.maximum(np.ascontiguousarray(inner), np.float32(0)) * passes.astype(np.float32)
     if step == 1:
         return inner[1:-1, 1:-1]
     finer = buffers.empty(((rows + 2) * step, (columns + 2) * step, channels))

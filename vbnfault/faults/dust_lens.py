@@ -49,7 +49,7 @@ from ..lens.straylight.scatter import DUST_INDEX
 from .context import FaultContext, Params
 from .contract import LensFault
 from .fields import Interval, Severity, bounds, number
-from .planes import plus, times
+from .planes import add_to, times
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -147,7 +147,7 @@ class DefocusedDust(LensFault):
         """Return the expected electrons of some rows times the transmission of all grains, plus their glow."""
         out = times(quantity.array, _shadows_once(params, context).transmission[rows])
         light = _glow_once(params, context)
-        return quantity.with_array(out if light is None else plus(out, light[rows]))
+        return quantity.with_array(out if light is None else add_to(out, light[rows]))
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
         """Return the pixels where the loss reaches `mask_loss`, or the glow that fraction of white, bool[y, x].

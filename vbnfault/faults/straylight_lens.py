@@ -44,7 +44,7 @@ from ..lens.straylight.total import ClearLight, SunlightInLens, scene_veil_fract
 from .context import FaultContext, Params
 from .contract import LensFault
 from .fields import Interval, Severity, bounds, choice, flag, number
-from .planes import intensity_dn, plus, plus_plane, reaches, sums, times
+from .planes import add_to, intensity_dn, plus, plus_plane, reaches, sums, times
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -206,8 +206,8 @@ class _LensStraylight(LensFault):
             veil = sums(quantity.array) * light.scene_lost
             added = plus_plane(added, veil_per_px(context.shape, context.camera.focal_length_px), veil)
         if quantity.past_rims is None:
-            return quantity.with_array(plus(scene, added))
-        past = plus(times(quantity.past_rims, light.direct_left), added)
+            return quantity.with_array(add_to(scene, added))
+        past = add_to(times(quantity.past_rims, light.direct_left), added)
         return replace(quantity, array=scene, past_rims=past)
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
