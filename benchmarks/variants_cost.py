@@ -5,9 +5,9 @@
 
 Both datasets are built into stores in one process: the same scene, seed, terrain and number of samples, with
 `dataset.variants_per_view` of 1 and of K. Both plans command each fault class in equally many samples. The shards
-of the two builds take turns, so that load and heat of the machine act on both. Before, samples with each fault class
-are simulated and not counted, because kernels and the models of the lens serve a whole dataset. So does the terrain
-of a site: one is used, and its load is not counted.
+of the two builds take turns, so that load and heat of the machine act on both. Before, samples with each fault
+class are simulated and not counted, because kernels and the models of the lens serve a whole dataset. So does the
+terrain of a site: one is used, and its load is not counted.
 
 Printed are, for both builds, ms of wall and of CPU time per sample of each stage and of whole samples, with `store`
 for encoding and writing; the numbers of renders, of samples with faults, and of their classes; and the ratios. With
@@ -133,8 +133,8 @@ def sessions(
 def warm_up(session: pipeline.Session, threads: int | None) -> None:
     """Compile kernels and make textures and the models of the lens, which all sessions of a process share.
 
-    A second session of the same scene and terrain simulates samples until each fault class has been commanded. It is
-    released afterwards, so that none of its views stays in memory.
+    A second session of the same scene and terrain simulates samples until each fault class has been commanded. It
+    is released afterwards, so that none of its views stays in memory.
     """
     other = pipeline.Session(session.scene, threads=threads)
     other.body = session.body

@@ -181,7 +181,7 @@ class Electrons(Quantity):
         band = self.rim_rows
         if band is None:
             return self
-        array, past = self.array.copy(), np.zeros_like(self.array)
+        array, past = buffers.copy(self.array), buffers.zeros(self.array.shape)
         array[band.rows], past[band.rows] = band.before, band.past
         return replace(self, array=array, past_rims=past, rim_rows=None)
 

@@ -20,6 +20,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core import buffers
 from ..core.errors import VbnfaultError
 from ..core.quantities import DEAD, HOT, RGBI, RTS, RTS_HIGH, STUCK, TRAP
 from . import compiled_bayer
@@ -186,11 +187,14 @@ class Device:
         noise can take away (interference whole, the rest four standard deviations).
         """
         readout = self.sensor.readout
-        full = np.full(self.shape, readout.full_well_e, dtype=np.float32)
+        full = buffers.empty(self.shape)
+        full.fill(readout.full_well_e)
         temporal_e = math.hypot(readout.noise_e_rms, readout.row_noise_e_rms)
         margin_dn = (4 * temporal_e + 2 * readout.banding_seen_e) * readout.system_gain_dn_per_e
-        level = read_out(full, readout, None, self.readout_individual) - np.float32(margin_dn)
-        return np.ceil(np.maximum(level, 0)).astype(np.uint16)
+        level = buffers.empty(self.shape)
+        np.subtract(read_out(full, readout, None, self.readout_individual), np.float32(margin_dn), out=level)
+        np.maximum(level, 0, out=level)
+        return np.ceil(level, out=level).astype(np.uint16)
 
     @cached_property
     def bad(self) -> NDArray[np.bool_]:

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..camera import Camera
+from ..core import buffers
 from ..core.errors import under_key
 from ..core.quantities import RGBI, Charge, Electrons, Offset, Quantity, RawMosaic, RimRows, soft_kind
 from ..core.registry import DeclarationError
@@ -273,7 +274,7 @@ def act(fault: Fault, light: Electrons, params: Params, context: FaultContext) -
             return _act_beside_rows(fault, light, params, context, reach)
         light = light.in_planes
     if fault.adds_past_rims:
-        past = np.zeros_like(light.array) if light.past_rims is None else light.past_rims
+        past = buffers.zeros(light.array.shape) if light.past_rims is None else light.past_rims
         return fault.apply(replace(light, past_rims=past), params, context)
     if light.past_rims is None:
         return fault.apply(light, params, context)
@@ -281,7 +282,8 @@ def act(fault: Fault, light: Electrons, params: Params, context: FaultContext) -
     if fault.at_rims:
         return replace(rest, past_rims=light.past_rims * np.float32(fault.passed_to_sun(params, context)))
     whole = fault.apply(light.merged, params, context)
-    return replace(rest, past_rims=np.maximum(whole.array - rest.array, 0))
+    past = np.subtract(whole.array, rest.array, out=buffers.empty(rest.array.shape))
+    return replace(rest, past_rims=np.maximum(past, 0, out=past))
 
 
 def _act_beside_rows(
@@ -307,7 +309,7 @@ def _act_beside_rows(
         past = band.past * np.float32(fault.passed_to_sun(params, context))
     else:
         past = np.maximum(whole.array[rows] - rest, 0)
-    array = whole.array.copy() if np.shares_memory(whole.array, light.array) else whole.array
+    array = buffers.copy(whole.array) if np.shares_memory(whole.array, light.array) else whole.array
     array.flags.writeable = True
     array[rows] = rest + past
     return replace(whole, array=array, rim_rows=RimRows(rows=rows, before=rest, past=past))

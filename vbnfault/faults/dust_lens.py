@@ -49,7 +49,7 @@ from ..lens.straylight.scatter import DUST_INDEX
 from .context import FaultContext, Params
 from .contract import LensFault
 from .fields import Interval, Severity, bounds, number
-from .planes import add_to, times
+from .planes import add_to, reaches, times
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -159,7 +159,7 @@ class DefocusedDust(LensFault):
         if light is None:
             return np.asarray(dark)
         white = np.asarray(context.camera.detector.white_e, dtype=np.float32)
-        return np.asarray(dark | (light >= np.float32(params["mask_loss"]) * white).any(axis=2))
+        return np.asarray(dark | reaches(light, np.float32(params["mask_loss"]) * white))
 
     def soft(self, params: Params, context: FaultContext) -> F32:
         """Return the fraction of the light that the grains remove, float32[y, x]. Their glow does not count."""

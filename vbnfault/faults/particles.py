@@ -63,7 +63,7 @@ from ..lens.streaks import Streaks, drawn, inside, pupil_support
 from .context import FaultContext, Params
 from .contract import Fault
 from .fields import Interval, bounds, flag, number
-from .planes import add_to, times
+from .planes import add_to, reaches, times
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -173,7 +173,7 @@ class _Particles(Fault):
             return np.zeros(context.shape, dtype=bool)
         level = np.float32(params["mask_level_dn"] / 255)
         white = np.asarray(context.camera.detector.white_e, dtype=np.float32)
-        return np.asarray((light.added >= level * white).any(axis=2) | (light.passes <= 1 - level))
+        return np.asarray(reaches(light.added, level * white) | (light.passes <= 1 - level))
 
     @property
     def effect_level_dn(self) -> float:

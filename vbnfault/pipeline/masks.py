@@ -102,8 +102,11 @@ def spreads(fault: Fault, context: FaultContext) -> bool:
 
 def union(masks: Mask, faults: Iterable[str], members: Iterable[str]) -> Mask:
     """Return where any of the classes `members` has its mask, bool[y, x]."""
-    chosen = set(members)
-    return np.asarray(masks[[name in chosen for name in faults]].any(axis=0))
+    chosen, out = set(members), np.zeros(masks.shape[1:], dtype=bool)
+    for name, mask in zip(faults, masks, strict=True):
+        if name in chosen:
+            out |= mask
+    return out
 
 
 def outline(mask: Mask) -> Mask:
