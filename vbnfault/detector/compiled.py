@@ -213,15 +213,19 @@ def poisson(mean: F32, normal: NormalField) -> F32:
 
 
 def _poisson(mean: Any, code: Any, active: Any = True) -> Any:
-    """Return `noise.poisson_quantile` of the means of active lanes and of codes of normal variates, as Float."""
+    """Return `noise.poisson_quantile` of means and of the normal variates with these codes, as Float.
+
+    Lanes that are not active have any value.
+    """
     be = backend()
     return _quantile(mean, be.dr.gather(be.Float, _tables()[0], code, active), code, lambda code, _: code, active)
 
 
 def _quantile(mean: Any, z: Any, place: Any, code_at: Callable[[Any, Any], Any], active: Any = True) -> Any:
-    """Return `noise.poisson_quantile` of the means and normal variates of active lanes, as Float.
+    """Return `noise.poisson_quantile` of means and of normal variates `z`, as Float.
 
-    `code_at` returns the codes of the variates at places, for the lanes whose distribution is summed.
+    Lanes that are not active have any value. Where the mean is small, the distribution is summed up to the code of
+    the variate, which `code_at(place, lanes)` returns for these lanes.
     """
     be = backend()
     dr = be.dr

@@ -84,7 +84,7 @@ class NormalField:
 
     @cached_property
     def looked_up(self) -> F32:
-        """Return `values`, which are kept and must not be changed."""
+        """Return the variates as `values` does, but compute them once; the array is read-only."""
         out = self.values()
         out.flags.writeable = False
         return out

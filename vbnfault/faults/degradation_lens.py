@@ -287,7 +287,10 @@ def kernel(params: Params, frame: ImageFrame, shape: tuple[int, int]) -> F32:
 
 
 def _strewn(array: F32, white_e: F32, passes: F64, params: Params, context: FaultContext) -> F32:
-    """Return the scattered light that passes, float32[y, x, channel]; `passes` are fractions float64[channel]."""
+    """Return the scattered light that reaches the sensor, float32[y, x, channel].
+
+    `passes` is the fraction of it that worn coatings and browned glass let through, float64[channel].
+    """
     frame = context.frame
     step = _cell_px(frame)
     height, width, channels = array.shape
