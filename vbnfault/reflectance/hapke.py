@@ -68,17 +68,18 @@ class Hapke:
             key = p["roughness_deg"], k
             if key not in shared:
                 mu0, mu, shadowing = _rough(m, light, view, np.radians(p["roughness_deg"]))
-                x0, x = m.maximum(mu0 / k, _TINY), m.maximum(mu / k, _TINY)
                 seeliger = m.select(lit, shadowing * (mu0 / (mu0 + mu)) * (k / (4 * np.pi)), 0)
-                shared[key] = seeliger, x0, x, m.log((1 + x0) / x0), m.log((1 + x) / x)
-            seeliger, x0, x, log0, log1 = shared[key]
+                shared[key] = seeliger, *(_chandrasekhar_parts(m, m.maximum(c / k, _TINY)) for c in (mu0, mu))
+            seeliger, *parts = shared[key]
             w = p["single_scattering_albedo"]
-            single = _henyey_greenstein(m, p["asymmetry"], cos_phase)
-            if p["shadow_hiding_amplitude"]:
+            # Single scattering is `above` / `below` and multiple scattering 1 / `inverse` - 1. They share one
+            # quotient, because a division takes as long as several products.
+            above, below = _henyey_greenstein(m, p["asymmetry"], cos_phase)
+            if p["shadow_hiding_amplitude"]:  # 1 + B0 h / (h + tan(α/2))
                 h = p["shadow_hiding_width"]
-                single = single * (1 + p["shadow_hiding_amplitude"] * h / (h + half))
-            multiple = _chandrasekhar(w, x0, log0) * _chandrasekhar(w, x, log1) - 1
-            value = w * seeliger * (single + multiple)
+                above, below = above * (half + h * (1 + p["shadow_hiding_amplitude"])), below * (half + h)
+            inverse = _inverse_chandrasekhar(w, *parts[0]) * _inverse_chandrasekhar(w, *parts[1])
+            value = w * seeliger * ((above * inverse + below * (1 - inverse)) / (below * inverse))
             if p["coherent_amplitude"]:
                 value = value * (1 + p["coherent_amplitude"] * _coherent(m, half / p["coherent_width"]))
             out.append(value)
@@ -88,17 +89,23 @@ class Hapke:
 # --- parts of the models ------------------------------------------------------------------------------------
 
 
-def _henyey_greenstein(m: Any, g: float, cos_phase: Any) -> Any:
-    """Return P(α) = (1 - g²) / (1 + 2 g cos α + g²)^(3/2)."""
+def _henyey_greenstein(m: Any, g: float, cos_phase: Any) -> tuple[float, Any]:
+    """Return numerator and denominator of P(α) = (1 - g²) / (1 + 2 g cos α + g²)^(3/2)."""
     base = 1 + g * g + 2 * g * cos_phase
-    return (1 - g * g) / (base * m.sqrt(base))
+    return 1 - g * g, base * m.sqrt(base)
 
 
-def _chandrasekhar(w: float, x: Any, log: Any) -> Any:
-    """Return H(x) (Hapke 2002, eq. 13); `log` is ln((1 + x) / x)."""
+def _chandrasekhar_parts(m: Any, x: Any) -> tuple[Any, Any]:
+    """Return what 1 / H(x) takes from x: x/2 · ln((1 + x) / x), and x - x² ln((1 + x) / x)."""
+    scaled = x * m.log((1 + x) / x)
+    return 0.5 * scaled, x - x * scaled
+
+
+def _inverse_chandrasekhar(w: float, first: Any, second: Any) -> Any:
+    """Return 1 / H(x) = 1 - w x [r0 + (1/2 - r0 x) ln((1 + x) / x)] (Hapke 2002, eq. 13) from its parts."""
     gamma = np.sqrt(1 - w)
     r0 = float((1 - gamma) / (1 + gamma))
-    return 1 / (1 - w * x * (r0 + (0.5 - r0 * x) * log))
+    return 1 - w * first - w * r0 * second
 
 
 def _coherent(m: Any, z: Any) -> Any:
