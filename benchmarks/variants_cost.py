@@ -2,6 +2,7 @@
 
     python benchmarks/variants_cost.py [SCENE] [--samples N] [--variants K] [--size PX] [--threads N]
         [--functions N]
+    python benchmarks/variants_cost.py [SCENE] --workers N [--samples N] [--variants K] [--size PX]
 
 Both datasets are built into stores in one process: the same scene, seed, terrain and number of samples, with
 `dataset.variants_per_view` of 1 and of K. Both plans command each fault class in equally many samples. The shards
@@ -14,7 +15,10 @@ for encoding and writing; the numbers of renders, of samples with faults, and of
 --functions N, the N functions that take longest after the render of the build with K variants are printed, too; the
 profile slows that build, so its ratio is then not the one to quote.
 
-A build with as many workers as cores gives each worker one render thread; --threads 1 measures such a worker.
+A build with as many workers as cores gives each worker one render thread; --threads 1 measures such a worker. With
+--workers N, whole builds in N processes are timed instead. The time of a sample is then the difference between a
+build and one of three times as many samples, over the difference of their samples: starting the processes does not
+count. Builds with K = 1 have half as many samples.
 """
 
 from __future__ import annotations
@@ -33,6 +37,7 @@ from typing import Any, ParamSpec, TypeVar
 
 import profile_sample
 
+import vbnfault
 from vbnfault import dataset, pipeline, store
 from vbnfault.core.quantities import Sample
 from vbnfault.dataset.tasks import Task, work
@@ -176,6 +181,24 @@ def measure(
     return alone, shared
 
 
+def seconds_with_workers(
+    scene: str, samples: int, variants: int, workers: int, settings: Mapping[str, Any]
+) -> float:
+    """Return the s a sample that builds in `workers` processes take when `variants` samples share a view.
+
+    A first build fills the caches on disk with kernels and terrain, and is not counted.
+    """
+    took = []
+    for number in (variants * workers, samples, 3 * samples):
+        values = {"samples": number, "sites": 1, "variants_per_view": variants, "shard_samples": variants}
+        given = config.load_scene(scene, {**settings, **{f"dataset.{key}": value for key, value in values.items()}})
+        with tempfile.TemporaryDirectory() as folder:
+            start = time.perf_counter()
+            vbnfault.build(given, Path(folder) / "built.zarr", workers=workers)
+            took.append(time.perf_counter() - start)
+    return (took[2] - took[1]) / (2 * samples)
+
+
 def table(alone: Timed, shared: Timed) -> str:
     """Return the stages of both builds in ms a sample, and the ratios."""
     samples = len(alone.session.plan)
@@ -204,9 +227,20 @@ def main() -> None:
     parser.add_argument("--variants", type=int, default=8, metavar="K")
     parser.add_argument("--size", type=int, help="pixels along either side of the frame")
     parser.add_argument("--threads", type=int, metavar="N", help="render threads, as of build; default: all cores")
+    parser.add_argument("--workers", type=int, metavar="N", help="time whole builds in N processes")
     parser.add_argument("--functions", type=int, default=0, metavar="N")
     given = parser.parse_args()
     size = {} if given.size is None else {"camera.width_px": given.size, "camera.height_px": given.size}
+    if given.workers is not None:
+        many, one = (
+            seconds_with_workers(given.scene, number, k, given.workers, size)
+            for k, number in ((given.variants, given.samples), (1, max(1, given.samples // 2)))
+        )
+        print(
+            f"{given.workers} processes: K=1 {one:.3f} s a sample, "
+            f"K={given.variants} {many:.3f} s, ratio {many / one:.3f}"
+        )
+        return
     with tempfile.TemporaryDirectory() as folder:
         alone, shared = measure(
             given.scene,

@@ -7,6 +7,9 @@ from pathlib import Path
 
 import pytest
 
+import vbnfault
+from vbnfault.scene.config import Scene
+
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
 
@@ -35,6 +38,21 @@ def test_benchmarks_print_every_stage_and_ratio(tmp_path: Path) -> None:
         "at most 0.25",
     ):
         assert line in printed
+
+
+def test_the_cost_with_workers_is_that_of_the_samples_between_two_builds(monkeypatch: pytest.MonkeyPatch) -> None:
+    import variants_cost
+
+    now, built = [0.0], []
+
+    def build(scene: Scene, _path: Path, *, workers: int) -> None:
+        built.append((scene.dataset.samples, scene.dataset.variants_per_view, workers))
+        now[0] += 10 + 3 * scene.dataset.samples  # the start of the processes, and the samples
+
+    monkeypatch.setattr(vbnfault, "build", build)
+    monkeypatch.setattr(variants_cost.time, "perf_counter", lambda: now[0])
+    assert variants_cost.seconds_with_workers("paper67p", 8, 4, 2, {}) == 3
+    assert built == [(8, 4, 2), (8, 4, 2), (24, 4, 2)]
 
 
 def test_the_cost_of_variants_is_measured_on_equal_faults(tmp_path: Path) -> None:

@@ -36,7 +36,7 @@ MODELS = ("traced", "paraxial")
 # Twice as many rays are traced across a ghost whose uneven fraction is larger, and across one that aberrations
 # spread (`_Detail.spread_out`).
 _UNEVEN = 0.3
-_RAYS_AT_ONCE = 1 << 16  # of the wavelengths that are always traced, to bound memory
+_RAYS_AT_ONCE = 1 << 18  # of the wavelengths that are always traced; a ray takes about 100 bytes
 _ACROSS_FOCUSED = 25  # rays across a ghost for each sample of the Sun's disc
 _SUBDIVISIONS = 8  # of the interval between two nodes, where colours separate
 _APART_PX = 2.0  # pixels of a ghost's level: colours farther apart than this need more wavelengths
@@ -384,11 +384,13 @@ class FlareModel:
         sampled = detail.sampled[rays.route]
         finely = (arrivals.uneven > _UNEVEN) | detail.spread_out[rays.route]
         across = np.where(finely, 2 * self._across - 1, self._across)
+        over_disc = len(disc_samples(_DISC_RINGS)) * _ACROSS_FOCUSED**2
+        number = self.canvas.bands * np.where(sampled, over_disc, across**2)
         for of_disc in (False, True):
             group = np.flatnonzero(sampled == of_disc)
             # one half of the lattices mirrors the other only if it does for all of them, in whatever part
             halved = not (rays.direction[group, 1].any() or rays.box_mm[group, 1].any())
-            for part in _parts(group, across[group], self.canvas.bands):
+            for part in _parts(group, across[group], number[group]):
                 each, bundles, drawn = self._coloured(rays.take(part), arrivals.take(part), detail)
                 strength, side = np.full(len(bundles), cosine), across[part][each]
                 if of_disc:
@@ -539,8 +541,10 @@ class FlareModel:
         )
 
 
-def _parts(ghosts: NDArray[np.int64], across: NDArray[np.int64], bands: int) -> list[NDArray[np.int64]]:
-    """Return ghosts in parts that take about `_RAYS_AT_ONCE` rays each, given the rays across each ghost.
+def _parts(
+    ghosts: NDArray[np.int64], across: NDArray[np.int64], rays: NDArray[np.int64]
+) -> list[NDArray[np.int64]]:
+    """Return ghosts in parts of about `_RAYS_AT_ONCE` rays, given each ghost's rays along a side and in all.
 
     Each part has lattices of all sizes: those of one size are drawn by another kernel, which rounds differently. So
     the sum of the parts is that of all ghosts at once, bit for bit.
@@ -548,7 +552,7 @@ def _parts(ghosts: NDArray[np.int64], across: NDArray[np.int64], bands: int) -> 
     if not len(ghosts):
         return []
     _, number = np.unique(across, return_counts=True)
-    count = min(-(-bands * int((across**2).sum()) // _RAYS_AT_ONCE), int(number.min()))
+    count = min(-(-int(rays.sum()) // _RAYS_AT_ONCE), int(number.min()))
     by_size = ghosts[np.argsort(across, kind="stable")]
     return [by_size[k::count] for k in range(count)]
 
