@@ -270,13 +270,13 @@ class SceneInLens:
         scattered = np.zeros((len(weights), *self.sensor.shape), dtype=np.float32)
         for grid, irradiance in sources:
             places, kernel = self._places(grid), self._kernel(grid)
-            terms = []
+            lit, terms = self._lit(kernel.slope), []
             for of_source, of_offset in zip(kernel.of_source, kernel.of_offset, strict=True):
                 light = np.zeros((len(weights), irradiance.shape[1]), dtype=np.float32)
-                for band, own in enumerate(irradiance):
-                    gain = weights[:, band, None] * of_source[band] * self._lit(kernel.slope)
-                    for channel, one in zip(light, gain, strict=True):
-                        channel += own * places.at_angle(one)
+                for gain, own, of_band in zip(of_source * lit, irradiance, weights.T, strict=True):
+                    scattering = own * places.at_angle(gain)
+                    for channel, weight in zip(light, of_band, strict=True):
+                        channel += scattering * np.float32(weight)
                 terms.append((light, places.directions.spectrum(kernel.offset, of_offset)))
             if terms and irradiance.any():
                 scattered += places.directions.convolved(terms)
@@ -419,7 +419,10 @@ class _Places:
     def at_angle(self, values: F64) -> F32:
         """Return values at the grid of field angles for every source, float32[source]."""
         table = values.astype(np.float32)
-        return table[self.angle] + self.rest * np.diff(table)[self.angle]
+        # the indices lie in the table, so that clipping changes none and is quicker than the check
+        found, steps = (np.take(of, self.angle, mode="clip") for of in (table, np.diff(table)))
+        steps *= self.rest
+        return np.add(found, steps, out=found)
 
 
 @lru_cache(maxsize=8)
