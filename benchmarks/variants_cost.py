@@ -23,6 +23,10 @@ count. Builds with K = 1 have half as many samples.
 
 from __future__ import annotations
 
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line sets it, before numpy is imported
+
 import argparse
 import cProfile
 import pstats

@@ -122,6 +122,19 @@ def test_xarray_shows_labelled_axes(built: Path) -> None:
         assert "sun_elevation_deg" in planned
 
 
+def test_products_of_matrices_use_one_thread_unless_the_user_says_otherwise() -> None:
+    """The variable is set before numpy is imported, or OpenBLAS would not read it."""
+    code = (
+        "import os, sys, vbnfault.cli; app = sys.modules['vbnfault.cli.app']\n"
+        "app._exit_code = lambda: print('numpy' in sys.modules, os.environ['OPENBLAS_NUM_THREADS']) or 0\n"
+        "app.main()"
+    )
+    others = {k: v for k, v in os.environ.items() if k != "OPENBLAS_NUM_THREADS"}
+    for given, used in (({}, "1"), ({"OPENBLAS_NUM_THREADS": "3"}, "3")):
+        done = subprocess.run([sys.executable, "-c", code], env=others | given, capture_output=True, text=True)
+        assert done.stdout.split() == ["False", used], done.stderr
+
+
 def test_the_digest_depends_on_no_workers_or_threads(
     built: Path, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -31,6 +31,9 @@ def main() -> None:
     """Run the command that the arguments name, and exit with its code."""
     if len(os.environ.get("COLUMNS", "")) > 4:  # no terminal is that wide; tables would fill the memory with blanks
         del os.environ["COLUMNS"]
+    # numpy's products of matrices are small. A thread of OpenBLAS that waits for the next one keeps a core busy and
+    # takes it from render threads. The library reads this when numpy is imported; to change it later is not safe.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     warnings.showwarning = lambda message, *_, **__: typer.echo(f"warning: {message}", err=True)
     with streams.steady(), interrupts.interruptible():
         try:

@@ -13,7 +13,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import ParamSpec, Protocol, TypeVar
 
-from ..core import blas
 from ..core.errors import VbnfaultError
 from ..core.quantities import Radiance
 from ..core.shared_results import SharedResults
@@ -85,7 +84,6 @@ class SharedViews:
         return pose, rendering
 
 
-@blas.one_thread()
 def simulate_frame(spec: SampleSpec, run: StageRunner = run_stage, shared: SharedViews | None = None) -> Frame:
     """Run all stages of one sample and return its frame.
 
@@ -120,7 +118,6 @@ def simulate_frame(spec: SampleSpec, run: StageRunner = run_stage, shared: Share
     return _frame(view, views, run)
 
 
-@blas.one_thread()
 def simulate_stored_view(
     spec: SampleSpec, pose: Pose, rendering: Rendering, views: int, run: StageRunner = run_stage
 ) -> Frame:
