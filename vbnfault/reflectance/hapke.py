@@ -72,8 +72,8 @@ class Hapke:
                 shared[key] = seeliger, *(_chandrasekhar_parts(m, m.maximum(c / k, _TINY)) for c in (mu0, mu))
             seeliger, *parts = shared[key]
             w = p["single_scattering_albedo"]
-            # Single scattering is `above` / `below` and multiple scattering 1 / `inverse` - 1. They share one
-            # quotient, because a division takes as long as several products.
+            # The function of single scattering is `above` / `below`, and that of multiple scattering is
+            # 1 / `inverse` - 1. Their sum is computed as one quotient, because divisions are slow.
             above, below = _henyey_greenstein(m, p["asymmetry"], cos_phase)
             if p["shadow_hiding_amplitude"]:  # 1 + B0 h / (h + tan(α/2))
                 h = p["shadow_hiding_width"]
@@ -96,13 +96,16 @@ def _henyey_greenstein(m: Any, g: float, cos_phase: Any) -> tuple[float, Any]:
 
 
 def _chandrasekhar_parts(m: Any, x: Any) -> tuple[Any, Any]:
-    """Return what 1 / H(x) takes from x: x/2 · ln((1 + x) / x), and x - x² ln((1 + x) / x)."""
+    """Return x/2 · L and x - x² L with L = ln((1 + x) / x); 1 / H(x) is linear in these two functions of x."""
     scaled = x * m.log((1 + x) / x)
     return 0.5 * scaled, x - x * scaled
 
 
 def _inverse_chandrasekhar(w: float, first: Any, second: Any) -> Any:
-    """Return 1 / H(x) = 1 - w x [r0 + (1/2 - r0 x) ln((1 + x) / x)] (Hapke 2002, eq. 13) from its parts."""
+    """Return 1 / H(x) = 1 - w x [r0 + (1/2 - r0 x) ln((1 + x) / x)] (Hapke 2002, eq. 13).
+
+    `first` and `second` are the results of `_chandrasekhar_parts`.
+    """
     gamma = np.sqrt(1 - w)
     r0 = float((1 - gamma) / (1 + gamma))
     return 1 - w * first - w * r0 * second

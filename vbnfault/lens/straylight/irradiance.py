@@ -36,7 +36,7 @@ MODELS = ("traced", "paraxial")
 # Twice as many rays are traced across a ghost whose uneven fraction is larger, and across one that aberrations
 # spread (`_Detail.spread_out`).
 _UNEVEN = 0.3
-_RAYS_AT_ONCE = 1 << 18  # of the wavelengths that are always traced; a ray takes about 100 bytes
+_RAYS_AT_ONCE = 1 << 18  # of the wavelengths that are always traced, to bound memory
 _ACROSS_FOCUSED = 25  # rays across a ghost for each sample of the Sun's disc
 _SUBDIVISIONS = 8  # of the interval between two nodes, where colours separate
 _APART_PX = 2.0  # pixels of a ghost's level: colours farther apart than this need more wavelengths
@@ -544,7 +544,9 @@ class FlareModel:
 def _parts(
     ghosts: NDArray[np.int64], across: NDArray[np.int64], rays: NDArray[np.int64]
 ) -> list[NDArray[np.int64]]:
-    """Return ghosts in parts of about `_RAYS_AT_ONCE` rays, given each ghost's rays along a side and in all.
+    """Return ghosts in parts of about `_RAYS_AT_ONCE` rays.
+
+    `across` and `rays` are the numbers of each ghost's rays, along a side of its lattice and in total.
 
     Each part has lattices of all sizes: those of one size are drawn by another kernel, which rounds differently. So
     the sum of the parts is that of all ghosts at once, bit for bit.
