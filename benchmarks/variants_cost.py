@@ -17,9 +17,9 @@ profile slows that build, so its ratio is then not the one to quote.
 
 A build with as many workers as cores gives each worker one render thread; --threads 1 measures such a worker. With
 --workers N, whole builds in N processes are timed instead. The time of a sample is then the difference between the
-times of two builds, one of which has three times as many samples, divided by the difference of these numbers, so that
-the start of the processes does not count. Builds with K = 1 have half as many samples. --threads and --functions have
-no effect on such builds.
+times of two builds, one of which has three times as many samples, divided by the difference of these numbers, so
+that the start of the processes does not count. Builds with K = 1 have half as many samples. --threads and
+--functions have no effect on such builds.
 """
 
 from __future__ import annotations
