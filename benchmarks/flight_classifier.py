@@ -24,6 +24,9 @@ by bootstrap over frames. 50 % means that nothing gives the images away. With `-
 drawn N times, and the mean over the draws is printed with the least and the greatest: one draw of 12 patches a
 frame may be off by 2 %.
 
+Each place has a classifier of its own, which is the harder test. At the end, one classifier is trained on patches
+of all places, and tested on patches of all places.
+
 **Controls.** `real against real`: frames are labelled at random, so nothing can be learned that holds in other
 frames: about 50 %. `blurred`: rendered patches against the same after a Gaussian blur of 0.7 px: about 100 %.
 
@@ -63,6 +66,7 @@ _PENALTIES = (1e-2, 1e-1, 1.0)
 _FOLDS = 4
 _BOOTSTRAPS = 2000
 _SPOT = 3  # levels of 255 over the median: six times the noise of a sky
+_MEAN = "all features, mean of draws"
 _SHOWN = 10  # patches of each class in a figure
 
 
@@ -369,12 +373,39 @@ def _relabelled(values: F64, frame: NDArray[np.int64], splits: int, seed: int) -
     return right.mean(axis=0), frame
 
 
-def drawn(pairs: Sequence[tuple[str, U8, U8]], place: str, given: argparse.Namespace, seed: int) -> float:
-    """Return the accuracy with all features, of patches and halves that follow from `seed`."""
-    patches = patches_of(pairs, place, given.size, given.patches, seed)
-    values = np.hstack(list(features(patches.images).values()))
-    trained = halves(patches.frame, given.splits, seed)
-    return accuracy(score_frames(values, patches.label, patches.frame, trained)[1], patches.frame)[0]
+def told(
+    pairs: Sequence[tuple[str, U8, U8]], places: Sequence[str], given: argparse.Namespace, seed: int
+) -> tuple[float, float, float]:
+    """Return the accuracy with all features of one classifier for patches of some places, and its interval.
+
+    Patches and halves follow from `seed`.
+    """
+    drawn = [patches_of(pairs, place, given.size, given.patches, seed) for place in places]
+    values = np.vstack([np.hstack(list(features(patches.images).values())) for patches in drawn])
+    label, frame = (np.concatenate([getattr(patches, name) for patches in drawn]) for name in ("label", "frame"))
+    return accuracy(score_frames(values, label, frame, halves(frame, given.splits, seed))[1], frame)
+
+
+def over_draws(
+    pairs: Sequence[tuple[str, U8, U8]],
+    places: Sequence[str],
+    given: argparse.Namespace,
+    first: tuple[float, float, float],
+) -> tuple[float, float, float]:
+    """Print and return the mean accuracy of all draws with the least and the greatest.
+
+    `first` is the accuracy of the first draw.
+    """
+    draws = [first[0], *(told(pairs, places, given, given.seed + k)[0] for k in range(1, given.draws))]
+    mean, low, high = float(np.mean(draws)), min(draws), max(draws)
+    print(row(f"mean of {given.draws:2d} draws", (mean, low, high)), flush=True)
+    return mean, low, high
+
+
+def row(name: str, figures: tuple[float, float, float]) -> str:
+    """Return a line with an accuracy and its interval in percent."""
+    mean, low, high = (100 * value for value in figures)
+    return f"  {name:<18} {mean:5.1f} %  ({low:.1f} to {high:.1f})"
 
 
 def confident(patches: Patches, score: F64) -> U8:
@@ -418,17 +449,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
         result[place], score = examine(patches, place, given.splits, given.seed)
         cv2.imwrite(str(given.out / f"confident_{place}.png"), confident(patches, score))
         print(f"{place}: {len(patches.label)} patches of {given.size} px in {len(np.unique(patches.frame))} frames")
-        for name, (mean, low, high) in result[place].items():
-            print(f"  {name:<18} {100 * mean:5.1f} %  ({100 * low:.1f} to {100 * high:.1f})", flush=True)
+        for name, figures in result[place].items():
+            print(row(name, figures), flush=True)
         if given.draws > 1:
-            draws = [result[place]["all features"][0]]
-            draws += [drawn(pairs, place, given, given.seed + k) for k in range(1, given.draws)]
-            mean, low, high = float(np.mean(draws)), min(draws), max(draws)
-            result[place]["all features, mean of draws"] = mean, low, high
-            print(f"  mean of {given.draws:2d} draws   {100 * mean:5.1f} %  ({100 * low:.1f} to {100 * high:.1f})")
-    if result:
-        mean = float(np.mean([figures["all features"][0] for figures in result.values()]))
-        print(f"mean of the places: {100 * mean:.1f} %")
+            result[place][_MEAN] = over_draws(pairs, (place,), given, result[place]["all features"])
+    if len(result) > 1:
+        found = list(result)
+        result["all"] = {"all features": told(pairs, found, given, given.seed)}
+        print("one classifier for all places")
+        print(row("all features", result["all"]["all features"]))
+        if given.draws > 1:
+            result["all"][_MEAN] = over_draws(pairs, found, given, result["all"]["all features"])
     (given.out / "classifier.json").write_text(json.dumps(result, indent=1))
 
 

@@ -132,11 +132,13 @@ BINNING = 2  # the frames have half the native size
 # Weights of native pixels in each axis of the halving. Noise of neighbours in the sky of the frames correlates by
 # 0.07, which asks for 0.035 at the ends; limb and ground are sharper and ask for less.
 _HALVING = (0.0325, 0.4675, 0.4675, 0.0325)
-_STRETCH = 255 / 4095**0.5  # of a root of DN
+_WHITE_DN = 4095  # of 12 bits
+_STRETCH = 255 / _WHITE_DN**0.5  # of a root of DN
 # Variance of the sky by its level s, both after stretch and halving: of the rounding, of photons, and dark / s²
 _SKY_VARIANCE = (0.08, 0.16, 8.0)
 _NOISY = 1.45  # times this variance: 28 frames have 0.88 to 1.17, three in a row 1.7 to 2.0
 HIGH_GAIN = 1.4  # over the low one: what noise of 1.9 times the variance asks for; 1.7 in visnav
+_WHITE, _LOWER_PERCENTILES = 250, (95.0, 90.0, 80.0, 70.0, 60.0, 50.0, 40.0, 30.0, 20.0, 10.0)
 _MOST_BLACK_DN = 4.0  # more is light: of 32 frames the black differs by 1.7 DN at most
 AFRHO_CM = 50.0  # chosen beside halo and wings of the point spread for the sky of 31 frames
 # What leaves spots and tracks in the sky. Protons: flux, energies, depth and `ending_fraction` fitted to the peaks,
@@ -201,9 +203,13 @@ def aligned_pose(pose: FlownPose, similarity: NDArray[np.float64], fov_deg: floa
 
 
 def developed(raw_dn: NDArray[Any], bias_dn: float) -> NDArray[np.uint8]:
-    """Return a raw image as the frames show it: stretched by a root in 8 bits, then halved, uint8[y, x]."""
+    """Return a raw image as the frames show it: stretched by a root in 8 bits, then halved, uint8[y, x].
+
+    A pixel at the largest digital number is white, as in an overexposed frame.
+    """
     over_black = np.clip(np.asarray(raw_dn, dtype=np.float32) - np.float32(bias_dn), 0, None)
     shown = np.minimum(np.float32(_STRETCH) * np.sqrt(over_black), 255)
+    shown[np.asarray(raw_dn) >= _WHITE_DN] = 255
     for axis in (0, 1):
         size = shown.shape[axis]
         shown = np.pad(shown, [(1, 1) if k == axis else (0, 0) for k in (0, 1)], mode="symmetric")
@@ -304,10 +310,24 @@ def exposed_as(scene: vbnfault.Scene, real: Look, detectors: Sequence[str]) -> v
 
     Its sensor is the first of `detectors`, or the second, of a higher gain, where the frame's noise asks for it.
     """
-    level = min((real.bright / 255) ** 2, 1.0)
-    detector = detectors[noise_excess(real) > _NOISY]
-    camera = scene.camera.model_copy(update={"metering_level": level, "detector": detector})
+    percentile, brightness = metered_on(real)
+    metering = {"metering_level": min((brightness / 255) ** 2, 1.0), "metering_percentile": percentile}
+    camera = scene.camera.model_copy(update={**metering, "detector": detectors[noise_excess(real) > _NOISY]})
     return scene.model_copy(update={"camera": camera})
+
+
+def metered_on(real: Look) -> tuple[float, float]:
+    """Return a percentile of the lit pixels of a real frame, and its brightness.
+
+    It is the 99th, which is `bright`; in an overexposed frame, the highest one that is below white.
+    """
+    if real.bright < _WHITE:
+        return 99.0, real.bright
+    for percentile in _LOWER_PERCENTILES:
+        brightness = float(np.percentile(real.image[real.lit], percentile))
+        if brightness < _WHITE:
+            break
+    return percentile, brightness
 
 
 def replay(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import sys
 from pathlib import Path
@@ -105,13 +106,23 @@ def test_draws_are_those_of_the_seeds_that_follow(tmp_path: Path) -> None:
         for which, image in (("real", real), ("rendered", rendered)):
             cv2.imwrite(str(tmp_path / f"{name}_{which}.png"), image)
 
-    def figures(*more: str) -> dict[str, list[float]]:
+    def figures(*more: str) -> dict[str, dict[str, list[float]]]:
         few = ["--size", "16", "--patches", "3", "--splits", "2", *more]
         flight_classifier.main(["--pairs", str(tmp_path), "--out", str(tmp_path / "out"), *few])
-        return dict(json.loads((tmp_path / "out/classifier.json").read_text())["body"])
+        return dict(json.loads((tmp_path / "out/classifier.json").read_text()))
 
     both, first, second = figures("--draws", "2", "--seed", "5"), figures("--seed", "5"), figures("--seed", "6")
-    drawn = [one["all features"][0] for one in (first, second)]
-    assert both["all features, mean of draws"] == pytest.approx([np.mean(drawn), min(drawn), max(drawn)])
-    assert drawn[0] != drawn[1]
-    assert "all features, mean of draws" not in first
+    for place in ("body", "all"):
+        drawn = [one[place]["all features"][0] for one in (first, second)]
+        mean = both[place]["all features, mean of draws"]
+        assert mean == pytest.approx([np.mean(drawn), min(drawn), max(drawn)])
+        assert drawn[0] != drawn[1]
+        assert "all features, mean of draws" not in first[place]
+
+
+def test_one_classifier_for_all_places_has_to_know_what_gives_each_of_them_away() -> None:
+    given = argparse.Namespace(size=SIZE, patches=8, splits=2)
+    mean, low, high = flight_classifier.told(pairs(blur_px=1.5), flight_classifier.PLACES, given, 1)
+    assert low <= mean <= high
+    assert mean > 0.9  # each blurred place is told apart, see above
+    assert flight_classifier.told(pairs(blur_px=0.0), flight_classifier.PLACES, given, 1)[0] < 0.65

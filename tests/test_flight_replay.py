@@ -111,6 +111,24 @@ def test_raw_images_are_stretched_by_a_root_and_halved() -> None:
     # 3.985 √2 = 5.64 and 3.985 √3 = 6.90 have the mean 6.27; rounded first, 6 and 7 would give 7
     raw[0::2], raw[1::2] = 102, 103
     assert flight_replay.developed(raw, 100.0)[2:-2].tolist() == [[6] * 6] * 2
+    # the largest number is white, though 255 √(3595 / 4095) = 238.93
+    raw[:] = 4095
+    assert (flight_replay.developed(raw, 500.0) == 255).all()
+    assert (flight_replay.developed(raw - 1, 500.0) == 239).all()
+
+
+def test_an_overexposed_frame_is_metered_on_what_is_not_yet_white() -> None:
+    body = disc(80, 80)
+    real = flight_frames.look(body)
+    assert flight_replay.metered_on(real) == (99.0, real.bright)
+    brighter = 1.6 * body  # its mean is 240
+    real = flight_frames.look(np.minimum(brighter, 255))
+    percentile, brightness = flight_replay.metered_on(real)
+    assert 30 <= percentile <= 70
+    assert brightness == pytest.approx(np.percentile(brighter[real.lit], percentile))
+    assert brightness < 250 <= np.percentile(brighter[real.lit], percentile + 10)
+    camera = flight_replay.exposed_as(vbnfault.load_scene("navcam67p"), real, ("low", "high")).camera
+    assert (camera.metering_percentile, camera.metering_level) == (percentile, (brightness / 255) ** 2)
 
 
 def test_a_larger_body_has_a_smaller_overlap_and_a_limb_farther_out() -> None:
