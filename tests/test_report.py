@@ -34,7 +34,7 @@ def page(described_store: Path, tmp_path_factory: pytest.TempPathFactory) -> str
 
 def test_the_page_needs_no_other_file_and_holds_every_section(page: str) -> None:
     assert not re.search(r'(?:src|href)="(?!data:|#)', page)
-    assert not re.search(r"url\((?!data:)|@import|https?://", page)
+    assert not re.search(r"url\((?!data:|#)|@import|https?://", page)
     names = re.findall(r'<section id="(\w+)">', page)
     assert names == ["gallery", "balance", "together", "sun", "view", "parameters", "exposure", "areas", "about"]
     assert page.count('class="card"') == 6
@@ -261,6 +261,16 @@ def test_text_cannot_end_a_script_or_an_element() -> None:
 # --- in a browser -------------------------------------------------------------------------------------------
 
 
+def first_image(page: Any) -> np.ndarray:
+    """Return the first image of the gallery as the browser shows it, float64[y, x, 3]."""
+    place = (
+        "(() => { const { x, y, width, height } = document.querySelector('.card .image').getBoundingClientRect(); "
+    )
+    x, y, width, height = (round(v) for v in page.evaluate(place + "return [x, y, width, height]; })()"))
+    shown = cv2.imdecode(np.frombuffer(page.screenshot(), np.uint8), cv2.IMREAD_COLOR)
+    return shown[y + 2 : y + height - 2, x + 2 : x + width - 2].astype(float)
+
+
 @pytest.mark.skipif(found() is None, reason=WHY_NOT)
 def test_the_page_in_a_browser(described_store: Path, tmp_path: Path) -> None:
     url = write_report(described_store, tmp_path / "r.html").as_uri()
@@ -280,6 +290,18 @@ def test_the_page_in_a_browser(described_store: Path, tmp_path: Path) -> None:
         assert page.evaluate(clean) == "hidden"
         page.press("c")
         assert page.evaluate(clean) == "visible"
+
+        page.press("c")
+        page.evaluate("document.head.append(document.createElement('style'))")
+        page.evaluate("document.head.lastElementChild.textContent = '.frame .mask {display: none}'")
+        plain = first_image(page)
+        page.press("b")
+        brighter = first_image(page)
+        page.press("b")
+        assert plain.mean() < 200
+        assert (np.abs(brighter - np.sqrt(255 * plain)) <= 1).mean() > 0.99  # of two roundings
+        np.testing.assert_array_equal(first_image(page), plain)
+        page.evaluate("document.head.lastElementChild.remove()")
 
         page.click(".open", 2)
         page.wait("document.querySelector('dialog h3').textContent === 'Sample 2'")

@@ -165,6 +165,19 @@ def test_small_images_show_the_masks_where_asked(served: Served) -> None:
     assert plain != masked
 
 
+def test_brighter_images_are_the_square_root_and_their_masks_keep_their_colours(served: Served) -> None:
+    def image(query: str) -> np.ndarray:
+        data = np.frombuffer(served.ask(f"/api/small/3?side=160&{query}")[1], np.uint8)
+        return cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1].astype(float)
+
+    stored = served.store.read("image", 3, 4)[0][..., :3].astype(float)
+    plain, brighter = image("masks=0"), image("masks=0&brighter=1")
+    # what JPEG changes in the pictures of noise here, which the root enlarges where they are dark
+    lost = np.abs(plain - stored).mean()
+    assert np.abs(brighter - np.sqrt(255 * stored)).mean() < 2 * lost
+    assert np.abs(plain - np.sqrt(255 * stored)).mean() > 4 * lost
+
+
 # --- the listing --------------------------------------------------------------------------------------------
 
 
@@ -384,7 +397,12 @@ def test_the_grid_shows_filters_and_goes(page: Page, served: Served) -> None:
     page.press("ArrowLeft")
     assert page.evaluate("document.activeElement.dataset.index") == "3"
     page.press("m")
-    page.wait("[...document.querySelectorAll('.tile img')].every((i) => i.src.endsWith('masks=1'))")
+    page.wait("[...document.querySelectorAll('.tile img')].every((i) => i.src.includes('masks=1'))")
+    page.press("b")
+    page.wait("[...document.querySelectorAll('.tile img')].every((i) => i.src.endsWith('brighter=1'))")
+    assert page.evaluate("document.querySelector('header .brighter').getAttribute('aria-pressed')") == "true"
+    page.click("header .brighter")
+    page.wait("[...document.querySelectorAll('.tile img')].every((i) => i.src.endsWith('brighter=0'))")
     page.press("?")
     assert page.evaluate("document.getElementById('help').open")
     page.press("Escape")
@@ -437,6 +455,22 @@ def test_one_sample_by_mouse_and_by_keys(page: Page, served: Served) -> None:
     without = page.evaluate(_SUM)
     assert without != before
     page.press("1")
+    assert page.evaluate(_SUM) == before
+
+    page.press("b")
+    root = page.evaluate(
+        "(() => { const c = window.vbnfault.view.root; "
+        "return [...c.getContext('2d').getImageData(0, 0, c.width, c.height).data]; })()"
+    )
+    rgb = image[..., :3].reshape(-1, 3).astype(float)
+    np.testing.assert_array_equal(np.reshape(root, (-1, 4))[:, :3], np.round(np.sqrt(255 * rgb)))
+    assert page.evaluate(_SUM) != before
+    assert page.evaluate("[...window.vbnfault.view.pixels.data]") == image.ravel().tolist()
+    page.press("d")  # a depth is no image of the camera
+    page.wait("window.vbnfault.view.layer === 'depth_m' && window.vbnfault.view.root === null")
+    page.press("i")
+    page.wait("window.vbnfault.view.layer === 'image' && window.vbnfault.view.root !== null")
+    page.click("#panel .brighter")
     assert page.evaluate(_SUM) == before
 
     for key, name in (("c", "clean"), ("d", "depth_m"), ("n", "normal"), ("s", "semantic"), ("x", "difference")):

@@ -166,7 +166,7 @@ def _tools(store: Store, scalars: Scalars, shown: Sequence[int], count: int) -> 
     return (
         f'<div class="tools" role="toolbar" aria-label="Gallery"><div class="toggles">{"".join(buttons)}'
         '<button type="button" class="toggle flip" aria-pressed="false" style="--c:var(--ink)"><i></i>clean twin'
-        "<kbd>c</kbd></button></div>"
+        f"<kbd>c</kbd></button>{_BRIGHTER}</div>"
         f'<div class="filters"><label>split <select id="g-split">{every}{splits}</select></label>'
         f'<label>class <select id="g-class">{every}{classes}<option value="none">no fault</option></select></label>'
         f'<output id="g-count">{count} shown</output></div></div>'
@@ -285,12 +285,23 @@ def _words(fault: str) -> str:
     return escaped(fault.replace("_", " "))
 
 
-_DIALOG = """
+# the square root of the values, as a browser computes it
+_BRIGHTER_FILTER = (
+    '<svg class="filter" width="0" height="0" aria-hidden="true"><filter id="root" '
+    'color-interpolation-filters="sRGB"><feComponentTransfer>'
+    + "".join(f'<feFunc{channel} type="gamma" exponent="0.5"/>' for channel in "RGB")
+    + "</feComponentTransfer></filter></svg>"
+)
+_BRIGHTER = (
+    '<button type="button" class="toggle brighter" aria-pressed="false" style="--c:currentColor" '
+    'title="show the square root of the values"><i></i>brighter<kbd>b</kbd></button>'
+)
+_DIALOG = f"""{_BRIGHTER_FILTER}
 <dialog id="sample" aria-label="Sample"><div class="stage"><div class="holder"></div><div class="bar">
 <button type="button" data-step="-1" aria-label="Previous sample">previous <kbd>←</kbd></button>
 <button type="button" data-step="1" aria-label="Next sample">next <kbd>→</kbd></button>
 <button type="button" class="toggle flip" aria-pressed="false" style="--c:#fff">
-<i></i>clean twin<kbd>c</kbd></button><span class="masks"></span><span class="spacer"></span>
+<i></i>clean twin<kbd>c</kbd></button>{_BRIGHTER}<span class="masks"></span><span class="spacer"></span>
 <button type="button" data-close>close <kbd>Esc</kbd></button></div></div>
 <aside></aside></dialog>
 """

@@ -1,15 +1,18 @@
 "use strict";
-// The gallery: a toggle for each mask, the flip to the clean twin, two filters, and the sample at full size.
+// The gallery: a toggle for each mask, the flip to the clean twin, brighter images, two filters, and the sample at
+// full size.
 const gallery = document.querySelector(".gallery");
 const dialog = document.getElementById("sample");
-const state = { clean: false, open: null, hidden: new Set() };
+const state = { clean: false, brighter: false, open: null, hidden: new Set() };
 
 function show() {
   for (const button of document.querySelectorAll(".toggle[data-fault]"))
     button.setAttribute("aria-pressed", String(!state.hidden.has(button.dataset.fault)));
   for (const mask of document.querySelectorAll(".mask")) mask.hidden = state.hidden.has(mask.dataset.fault);
   for (const flip of document.querySelectorAll(".flip")) flip.setAttribute("aria-pressed", String(state.clean));
+  for (const button of document.querySelectorAll(".brighter")) button.setAttribute("aria-pressed", String(state.brighter));
   document.body.classList.toggle("show-clean", state.clean);
+  document.body.classList.toggle("show-brighter", state.brighter);
 }
 
 function toggle(fault) {
@@ -64,6 +67,8 @@ if (gallery) {
   });
   for (const flip of document.querySelectorAll(".flip"))
     flip.addEventListener("click", () => { state.clean = !state.clean; show(); });
+  for (const button of document.querySelectorAll(".brighter"))
+    button.addEventListener("click", () => { state.brighter = !state.brighter; show(); });
   for (const id of ["g-split", "g-class"]) document.getElementById(id).addEventListener("change", choose);
   gallery.addEventListener("click", (event) => {
     const button = event.target.closest(".open");
@@ -77,6 +82,7 @@ if (gallery) {
   document.addEventListener("keydown", (event) => {
     if (event.ctrlKey || event.metaKey || event.altKey || event.target.closest("select, input")) return;
     if (event.key === "c") { state.clean = !state.clean; show(); }
+    else if (event.key === "b") { state.brighter = !state.brighter; show(); }
     else if (/^[1-9]$/.test(event.key)) {
       const button = document.querySelectorAll(".tools .toggle[data-fault]")[event.key - 1];
       if (button) toggle(button.dataset.fault);

@@ -51,6 +51,7 @@ _RANGE = re.compile(r"bytes=(?:(\d+)-(\d*)|-(\d+))")
 _LAST = 2**62  # no file has so many bytes
 _SIDES_PX = (160, 240, 320)  # of the small images
 _JPEG_QUALITY = 82
+_ROOTS = np.sqrt(255 * np.arange(256)).round().astype(np.uint8)  # black and white stay as they are
 _MOST_SMALL = 3000  # small images that are kept, of some 10 kB each
 _KEPT_S = 60
 
@@ -224,23 +225,29 @@ class Viewer:
         return pixels.astype(pixels.dtype.newbyteorder("<"), copy=False).tobytes()
 
     def small(self, rest: str, query: dict[str, str]) -> bytes:
-        """Return a small image of a sample as JPEG, of 160, 240 or 320 px, with its masks if `masks` is 1."""
+        """Return a small image of a sample as JPEG, of 160, 240 or 320 px.
+
+        It has its masks if `masks` is 1, and the square root of the values if `brighter` is 1.
+        """
         sides = {str(side): side for side in _SIDES_PX}
         if (side := sides.get(query.get("side", "240"))) is None:
             raise _Missing
-        return self._small(_index(rest, self.store.samples), side, query.get("masks") == "1")
+        masks, brighter = (query.get(name) == "1" for name in ("masks", "brighter"))
+        return self._small(_index(rest, self.store.samples), side, masks, brighter)
 
     @cached_property
-    def _small(self) -> Callable[[int, int, bool], bytes]:
+    def _small(self) -> Callable[[int, int, bool, bool], bytes]:
         """Return what makes small images, and keeps the latest."""
         return lru_cache(_MOST_SMALL)(self._make_small)
 
-    def _make_small(self, index: int, side_px: int, masks: bool) -> bytes:
+    def _make_small(self, index: int, side_px: int, masks: bool, brighter: bool) -> bytes:
         """Return a small image of a sample as JPEG."""
         spec = self.store.spec
         scale = min(1.0, side_px / max(spec.height, spec.width))
         size = (max(1, round(spec.width * scale)), max(1, round(spec.height * scale)))
         rgb = resized(self.pixels("image", index)[..., :3], size)
+        if brighter:
+            rgb = _ROOTS[rgb]
         if masks and spec.faults:
             small = np.stack([resized_mask(mask, size) for mask in self.pixels("mask", index)])
             localised = [fault in (spec.localised_faults or spec.faults) for fault in spec.faults]

@@ -71,7 +71,18 @@ function canvasOf(width, height) {
   return canvas;
 }
 
-// Return a canvas of a layer, and {low, high, units} or {names} for its legend.
+const ROOTS = Uint8ClampedArray.from({ length: 256 }, (_, value) => Math.sqrt(255 * value));
+
+// Return a canvas with the square root of the values of an image, black and white as they are.
+export function rooted(canvas) {
+  const { width, height } = canvas, out = canvasOf(width, height);
+  const image = canvas.getContext("2d").getImageData(0, 0, width, height);
+  for (let k = 0; k < image.data.length; k++) if (k % 4 < 3) image.data[k] = ROOTS[image.data[k]];
+  out.getContext("2d").putImageData(image, 0, 0);
+  return out;
+}
+
+// Return a canvas of a layer, {low, high, units} or {names} for its legend, and whether it is an image of the camera.
 export function paint(layer, { data, shape }) {
   const [height, width] = layer.dims[0] === "band" || layer.dims[0] === "fault" ? shape.slice(1, 3) : shape;
   const canvas = canvasOf(width, height);
@@ -79,8 +90,9 @@ export function paint(layer, { data, shape }) {
   const image = context.createImageData(width, height);
   const out = image.data;
   const count = width * height;
+  const photograph = layer.dtype === "uint8" && shape.length === 3;
   let legend = {};
-  if (layer.dtype === "uint8" && shape.length === 3) {
+  if (photograph) {
     const channels = shape[2];
     for (let k = 0, a = 0, b = 0; k < count; k++, a += 4, b += channels) {
       out[a] = data[b]; out[a + 1] = data[b + 1]; out[a + 2] = data[b + 2]; out[a + 3] = 255;
@@ -127,7 +139,7 @@ export function paint(layer, { data, shape }) {
     legend = { low, high, units: layer.units, table };
   }
   context.putImageData(image, 0, 0);
-  return { canvas, legend };
+  return { canvas, legend, photograph };
 }
 
 // Return the 1st and the 99th percentile of the finite values, from some of them.

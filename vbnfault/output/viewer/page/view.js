@@ -1,5 +1,5 @@
 // The page of `vbnfault view`: a grid of small images that scrolls any number of samples, and one sample at full size.
-import { difference, paint, paintMasks, ramp, read, sources } from "/layers.js";
+import { difference, paint, paintMasks, ramp, read, rooted, sources } from "/layers.js";
 
 const $ = (id) => document.getElementById(id);
 const NOT_KNOWN = 255, GAP = 10, CAPTION = 26, MOST_PX = 2e7; // browsers cannot scroll elements of more than 3.3e7 px
@@ -138,7 +138,7 @@ function status() {
 
 const scroller = $("scroller"), grid = $("grid");
 const tiles = new Map(); // position → tile
-let side = 240, columns = 1, rowHeight = 1, rows = 0, stretch = 1, current = 0, gridMasks = false, loading = 0;
+let side = 240, columns = 1, rowHeight = 1, rows = 0, stretch = 1, current = 0, gridMasks = false, brighter = false, loading = 0;
 
 function layout() {
   const wide = scroller.clientWidth - GAP;
@@ -239,7 +239,7 @@ function images() {
       if (!performance.getEntriesByName("first-image").length) performance.mark("first-image");
     });
     image.addEventListener("error", () => holder.replaceChildren(make("span", { className: "why", textContent: "cannot be read" })));
-    image.src = `/api/small/${index}?side=${side}&masks=${gridMasks ? 1 : 0}`;
+    image.src = `/api/small/${index}?side=${side}&masks=${gridMasks ? 1 : 0}&brighter=${brighter ? 1 : 0}`;
     holder.replaceChildren(image);
   }
 }
@@ -275,6 +275,15 @@ function toggleGridMasks() {
   layout();
 }
 $("grid-masks").addEventListener("click", toggleGridMasks);
+// Dark ground is hardly seen on a screen. The values of the data, which the probe shows, stay as they are.
+function toggleBrighter() {
+  brighter = !brighter;
+  for (const button of document.querySelectorAll(".brighter")) button.setAttribute("aria-pressed", String(brighter));
+  tiles.fresh = true;
+  layout();
+  redraw();
+}
+for (const button of document.querySelectorAll(".brighter")) button.addEventListener("click", toggleBrighter);
 $("grid-masks").hidden = !about.faults.length;
 for (const button of document.querySelectorAll("[data-size]"))
   button.addEventListener("click", () => {
@@ -308,7 +317,7 @@ $("go").addEventListener("submit", (event) => {
 // --- one sample ---------------------------------------------------------------------------------------------
 
 const canvas = $("canvas"), context = canvas.getContext("2d", { alpha: false });
-const view = { index: -1, layer: "image", hidden: new Set(), effect: false, zoom: 0, x: 0, y: 0, base: null, masks: [], pixels: null, turn: 0 };
+const view = { index: -1, layer: "image", hidden: new Set(), effect: false, zoom: 0, x: 0, y: 0, base: null, root: null, masks: [], pixels: null, turn: 0 };
 for (const [k, fault] of about.faults.entries()) if (!fault.localised) view.hidden.add(k);
 
 const choices = () => {
@@ -340,7 +349,7 @@ async function show(index, layer = view.layer) {
     $("probe").textContent = "";
     details(index, turn);
     if (listing && !listing.finished[index]) {
-      Object.assign(view, { base: null, pixels: null });
+      Object.assign(view, { base: null, root: null, pixels: null });
       complain("This sample is not finished yet.");
       return redraw();
     }
@@ -352,6 +361,7 @@ async function show(index, layer = view.layer) {
     if (turn !== view.turn) return;
     const painted = layer === "difference" ? difference(pixels[0], pixels[1], pixels[0].shape) : paint(layerOf.get(layer), pixels);
     view.base = painted.canvas;
+    view.root = painted.photograph ? () => rooted(painted.canvas) : null;
     view.pixels = layer === "difference" ? null : { ...pixels, layer: layerOf.get(layer) };
     legend(painted.legend);
     complain("");
@@ -361,7 +371,7 @@ async function show(index, layer = view.layer) {
     performance.mark("sample");
     ahead(position);
   } catch (error) {
-    if (turn === view.turn) { Object.assign(view, { base: null, pixels: null }); complain(error.message); redraw(); }
+    if (turn === view.turn) { Object.assign(view, { base: null, root: null, pixels: null }); complain(error.message); redraw(); }
   }
 }
 
@@ -402,7 +412,8 @@ function redraw() {
   context.setTransform(zoom, 0, 0, zoom, left, top);
   context.imageSmoothingEnabled = zoom < 2;
   context.imageSmoothingQuality = "high";
-  context.drawImage(view.base, 0, 0, about.width, about.height);
+  if (brighter && typeof view.root === "function") view.root = view.root(); // made once, when it is first asked for
+  context.drawImage((brighter && view.root) || view.base, 0, 0, about.width, about.height);
   view.masks.forEach((mask, k) => { if (mask && !view.hidden.has(k)) context.drawImage(mask.canvas, 0, 0); });
 }
 
@@ -602,6 +613,7 @@ function inSample(key, shift) {
   else if (key === "ArrowRight") step(1);
   else if (key === "c") pick(view.layer === "clean" ? "image" : "clean");
   else if (key === "m") toggleAll();
+  else if (key === "b") toggleBrighter();
   else if (key === "e") otherKind();
   else if (/^[1-9]$/.test(key) && key <= about.faults.length) toggle(key - 1);
   else if (key === "+" || key === "=") zoomTo((view.zoom || fitted()) * 1.25);
@@ -619,6 +631,7 @@ function inGrid(key) {
   const moves = { ArrowLeft: -1, ArrowRight: 1, ArrowUp: -columns, ArrowDown: columns, PageUp: -page, PageDown: page, Home: -current, End: count() - 1 - current };
   if (key in moves) reveal(current + moves[key], true);
   else if (key === "m") toggleGridMasks();
+  else if (key === "b") toggleBrighter();
   else if (key === "0") clear();
   else if (key === "g" || key === "/") { $("number").focus(); $("number").select(); }
   else if (key === "f") $("filters").querySelector(".filter")?.focus();
