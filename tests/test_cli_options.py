@@ -26,6 +26,12 @@ def options() -> Iterator[tuple[str, Any]]:
                 yield name, option
 
 
+def limits(option: Any) -> tuple[float, float] | None:
+    """The least and the largest number that an option takes, as its help says them; None if it takes no number."""
+    found = re.fullmatch(r"(?:INTEGER|NUMBER) \((\S+) to (\S+)\)", option.metavar or "")
+    return (float(found[1]), float(found[2])) if found else None
+
+
 @cache
 def help_of(command: str) -> str:
     """The help of a command as one line of words, without the frame around its tables."""
@@ -59,16 +65,22 @@ def test_help_shows_every_word_of_a_commands_text() -> None:
 def test_a_number_without_a_default_says_what_holds_instead() -> None:
     counts = {"append"}  # nothing is appended without it
     for command, option in options():
-        if option.default is None and not option.required and option.min is not None:
+        if option.default is None and not option.required and limits(option):
             assert isinstance(option.show_default, str) or option.name in counts, (command, option.name)
 
 
 def test_the_flares_options_have_the_limits_of_the_library() -> None:
     flare = [option for name, option in options() if name == "flare"]
-    limits = {option.name: (option.min, option.max) for option in flare if option.min is not None}
+    found = {option.name: limits(option) for option in flare if limits(option)}
     for name, low, high in RANGES:
-        assert limits.pop(name) == (low, high), name
-    assert set(limits) == {"wavelength_nm", "focal_length_mm", "reflections"}
+        assert found.pop(name) == (low, high), name
+    assert set(found) == {"wavelength_nm", "focal_length_mm", "reflections"}
+
+
+def test_a_number_that_is_none_is_refused_in_a_sentence_with_the_limits() -> None:
+    result = CliRunner().invoke(cli.app, ["describe", "quickstart", "--samples", "1e3"], env={"COLUMNS": "200"})
+    assert result.exit_code == 2
+    assert "Invalid value for '--samples': '1e3' must be a whole number from 1 to 10000000" in result.output
 
 
 def test_a_path_to_write_is_no_url() -> None:

@@ -19,12 +19,12 @@ from typing import Any, get_args, get_type_hints
 
 import numpy as np
 import pytest
+import typer
 from conftest import deny
 
 from vbnfault import cli
 from vbnfault.body import load_shape
 from vbnfault.body.shape import signed_volume
-from vbnfault.cli.options import finite
 from vbnfault.core import html_page, images, path_checks, resources, spice, user_files
 from vbnfault.core.errors import InputError, VbnfaultError, shown
 from vbnfault.core.whole_files import write_whole
@@ -527,12 +527,19 @@ def numeric_options() -> list[tuple[str, str, Any, set[type]]]:
     return found
 
 
-def test_every_number_of_the_command_line_has_both_limits() -> None:
+def test_every_number_of_the_command_line_has_both_limits_and_is_refused_beyond_them() -> None:
     for name, parameter, option, kinds in numeric_options():
-        assert option.min is not None, (name, parameter)
-        assert option.max is not None, (name, parameter)
-        # click finds nan within any limits
-        assert int in kinds or option.callback is finite, (name, parameter)
+        noun, kind = ("INTEGER", int) if int in kinds else ("NUMBER", float)
+        limits = re.fullmatch(rf"{noun} \((\S+) to (\S+)\)", option.metavar or "")
+        assert limits, (name, parameter)
+        for good in limits.groups():
+            assert option.parser(good) == kind(good), (name, parameter)
+        low, high = map(kind, limits.groups())
+        none = ["1.5", "1e3"] if kind is int else []
+        for bad in (str(low - 1), str(2 * high + 1), "nan", "inf", "some", "", "1_0", "٣", *none):
+            words = f"{bad!r} must be a {'whole ' * (kind is int)}number from {limits[1]} to {limits[2]}"
+            with pytest.raises(typer.BadParameter, match=re.escape(words) + "$"):
+                option.parser(bad)
 
 
 @pytest.mark.parametrize("value", ["nan", "inf", "-inf", "1e400", "361"])

@@ -43,11 +43,26 @@ PluginOption = Annotated[
 LensArgument = Annotated[str, typer.Argument(help="Path of a prescription, or name of a packaged lens.")]
 
 
-def finite(value: float | None) -> float | None:
-    """Return an option's number. Refuses `nan`, which click accepts within any minimum and maximum."""
-    if value is not None and not math.isfinite(value):
-        raise typer.BadParameter(f"{value} is not a finite number")
-    return value
+def _limited(
+    kind: type[int] | type[float], low: float, high: float, text: str, names: tuple[str, ...], unset: str | None
+) -> Any:
+    """Return an option that takes a number of a kind from `low` to `high`."""
+    limits = f"{low} to {high}" if kind is int else f"{low:g} to {high:g}"
+
+    def parsed(given: str | float) -> float:
+        """Return the number of a text, or a default. Refuses any other text in one sentence."""
+        text = str(given)
+        try:
+            value = kind(text) if text.isascii() and "_" not in text else math.nan
+        except ValueError:
+            value = math.nan
+        if not low <= value <= high:
+            noun = "whole number" if kind is int else "number"
+            raise typer.BadParameter(f"{shown(given)} must be a {noun} from {limits}")
+        return value
+
+    metavar = f"{'INTEGER' if kind is int else 'NUMBER'} ({limits})"
+    return typer.Option(*names, parser=parsed, metavar=metavar, help=text, show_default=unset or True)
 
 
 def number(low: float, high: float, text: str, *names: str, unset: str | None = None) -> Any:
@@ -55,7 +70,7 @@ def number(low: float, high: float, text: str, *names: str, unset: str | None = 
 
     `unset` says in the help what holds without the option, where its default is None.
     """
-    return typer.Option(*names, callback=finite, min=low, max=high, help=text, show_default=unset or True)
+    return _limited(float, low, high, text, names, unset)
 
 
 def on_this_machine(param: typer.CallbackParam, value: Path | None) -> Path | None:
@@ -87,7 +102,7 @@ def shard_range(text: str) -> range:
 
 def whole(low: int, high: int, text: str, *, unset: str | None = None) -> Any:
     """Return an option that takes a whole number from `low` to `high`; for `unset` see `number`."""
-    return typer.Option(min=low, max=high, help=text, show_default=unset or True)
+    return _limited(int, low, high, text, (), unset)
 
 
 FocalLengthOption = Annotated[

@@ -18,6 +18,7 @@ from .options import (
     number,
     overrides,
     replaced,
+    whole,
     writing,
 )
 
@@ -30,15 +31,10 @@ def study(
         str, typer.Argument(help="Path of a study file, or name of a packaged study.", metavar="STUDY")
     ],
     out: Annotated[Path, local_path("Folder for the results, to make or to continue.")],
-    workers: Annotated[int, typer.Option(min=1, max=MOST_PROCESSES, help="Number of processes.")] = 1,
+    workers: Annotated[int, whole(1, MOST_PROCESSES, "Number of processes.")] = 1,
     threads: Annotated[
         int | None,
-        typer.Option(
-            min=1,
-            max=MOST_PROCESSES,
-            help="Number of render threads of each process.",
-            show_default="all cores, divided equally",
-        ),
+        whole(1, MOST_PROCESSES, "Number of render threads of each process.", unset="all cores, divided equally"),
     ] = None,
     scheduler: Annotated[
         str | None,
@@ -89,7 +85,7 @@ class _SeverityOptions:
             show_default="the scene's",
         ),
     ] = None
-    views: Annotated[int, typer.Option(min=1, max=100_000, help="Number of views behind each lens.")] = 64
+    views: Annotated[int, whole(1, 100_000, "Number of views behind each lens.")] = 64
     settings: Annotated[
         list[str] | None,
         replaced("scene", "camera.width_px=256"),
@@ -104,7 +100,7 @@ def severity(
     tested: _SeverityOptions,
     metric: Annotated[str, typer.Option(help="Metric of navigation that is the error.")] = "matches_lost",
     quantile: Annotated[float, number(0, 1, "Quantile of the error over the views.")] = 0.5,
-    workers: Annotated[int, typer.Option(min=1, max=MOST_PROCESSES, help="Number of processes.")] = 1,
+    workers: Annotated[int, whole(1, MOST_PROCESSES, "Number of processes.")] = 1,
 ) -> None:
     """Compute levels of severity: for each fault model five values that cost navigation the same. A scene reads
     them by `severity.file`, and `severity = 3` in the table of a fault. Models that the file has
