@@ -107,6 +107,8 @@ def main() -> None:
     parser.add_argument("--folder", help="where the store is made, and removed afterwards")
     parser.add_argument("--json", help="also write the numbers to this file")
     options = parser.parse_args()
+    if options.folder:
+        Path(options.folder).mkdir(parents=True, exist_ok=True)
     folder = Path(tempfile.mkdtemp(dir=options.folder, prefix="large-store-"))
     try:
         (seconds, _), opened = timed(lambda: make(folder / "large.zarr", options.samples))

@@ -23,7 +23,7 @@ from ..store import open_store
 from ..train import Columns, Order, SampleReader, Targets, select
 from ..train.order import checked_epoch
 from ..train.selection import Where
-from .slots import Slots
+from .slots import Slots, contiguous
 
 Batch = dict[str, Any]
 Transform = Callable[[Batch], Batch]
@@ -362,7 +362,7 @@ def new_tensors(targets: Targets, count: int, *, shared: bool | None = None) -> 
         kind = torch.from_numpy(np.empty(0, dtype)).dtype
         if shared and new_shared is not None:
             size = int(np.prod(shape)) * dtype.itemsize
-            out[name] = torch.empty(0, dtype=kind).set_(new_shared(max(1, size)), 0, shape)
+            out[name] = torch.empty(0, dtype=kind).set_(new_shared(max(1, size)), 0, shape, contiguous(shape))
         else:
             out[name] = torch.empty(shape, dtype=kind)
     return out

@@ -40,6 +40,11 @@ class _View(NamedTuple):
     dtype: torch.dtype
 
 
+def contiguous(shape: tuple[int, ...]) -> tuple[int, ...]:
+    """Return the strides, in elements, of a contiguous tensor of a shape."""
+    return tuple(torch.empty(shape, device="meta").stride())
+
+
 class Packed(NamedTuple):
     """Hold a batch as it travels: tensors in the slot as views of it, small ones as arrays, others as they are."""
 
@@ -100,7 +105,7 @@ class Slots:
         shape = (workers, each, _aligned(max(1, size)))
         if shared:
             storage = torch.UntypedStorage._new_shared(int(np.prod(shape)))
-            self._memory = torch.empty(0, dtype=torch.uint8).set_(storage, 0, shape)
+            self._memory = torch.empty(0, dtype=torch.uint8).set_(storage, 0, shape, contiguous(shape))
         else:
             self._memory = torch.empty(shape, dtype=torch.uint8)
         self._taken = torch.zeros(workers, each, dtype=torch.uint8).share_memory_()
