@@ -12,12 +12,15 @@ import numpy as np
 import pytest
 from browser import WHY_NOT, found, opened
 from synthetic import FAULTS, fake_sample, filled, flip, make_spec
+from typer.testing import CliRunner
 
+import vbnfault
+from vbnfault import cli
 from vbnfault import store as st
 from vbnfault.core.errors import InputError
 from vbnfault.core.html_page import Page, Section, embedded_json
 from vbnfault.core.images import indexed_png
-from vbnfault.output.report import Limits, write_report
+from vbnfault.output.report import MOST_READ, MOST_SHOWN, write_report
 from vbnfault.output.report.charts import Histogram, boxes, number, ticks
 from vbnfault.output.report.gallery import parameter_table, pick
 from vbnfault.output.report.measure import Drawn, key_bounds, key_unit, read_drawn, read_pixels, read_scalars
@@ -144,9 +147,23 @@ def test_damaged_samples_are_counted_and_left_out(whole: st.Store, tmp_path: Pat
 
 
 def test_a_large_store_is_sampled_and_the_page_says_so(described_store: Path, tmp_path: Path) -> None:
-    text = write_report(described_store, tmp_path / "r.html", Limits(gallery=3, pixels=2)).read_text()
+    text = write_report(described_store, tmp_path / "r.html", samples=3, pixels=2).read_text()
     assert "3 of 6 finished samples" in text
     assert "of 2 samples, evenly spaced" in text
+
+
+def test_numbers_of_samples_have_the_limits_of_the_command_and_are_refused_beyond_them(
+    described_store: Path, tmp_path: Path
+) -> None:
+    text = CliRunner().invoke(cli.app, ["report", "--help"], env={"COLUMNS": "300"}).output
+    for name, most in (("samples", MOST_SHOWN), ("pixels", MOST_READ)):
+        assert re.search(rf"--{name} +INTEGER \(1 to {most}\)", text)
+        for wrong in (0, most + 1, 2.5, "3", True, None):
+            with pytest.raises(InputError, match=rf"^{name} = {wrong!r}: must be a whole number from 1 to {most}$"):
+                vbnfault.report(described_store, tmp_path / "r.html", **{name: wrong})
+    assert not list(tmp_path.iterdir())
+    vbnfault.report(described_store, tmp_path / "r.html", samples=np.int64(1))
+    assert (tmp_path / "r.html").read_text(encoding="utf-8").count('class="card"') == 1
 
 
 def test_the_gallery_has_every_class_of_every_split_where_there_is_room(tmp_path: Path) -> None:

@@ -68,9 +68,9 @@ def report(
     pixels: Annotated[int, whole(1, 1_000_000, "Largest number of samples whose pixels are read.")] = 400,
 ) -> None:
     """Write a report of a store as one page: a gallery, and what was planned, drawn and realised, by split."""
-    from ..output.report import Limits, write_report
+    from ..output.report import write_report
 
-    typer.echo(str(write_report(store, out, Limits(gallery=samples, pixels=pixels))))
+    typer.echo(str(write_report(store, out, samples=samples, pixels=pixels)))
 
 
 @app.command(rich_help_panel=_PANEL)

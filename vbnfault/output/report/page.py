@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.errors import InputError, VbnfaultError
+from ...core import tables
+from ...core.errors import InputError, VbnfaultError, shown
 from ...core.html_page import Page, Section, escaped, grouped_digits, html_table
 from ...core.path_checks import path_of
 from ...dataset.statistics import Statistics, statistics
@@ -51,16 +51,16 @@ _PLACE = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
-class Limits:
-    """Hold how many samples the gallery shows, and of how many the pixels are read."""
-
-    gallery: int = 36
-    pixels: int = 400
+# The largest numbers of samples in the gallery, and of samples whose pixels are read.
+MOST_SHOWN, MOST_READ = 200, 1_000_000
 
 
 def write_report(
-    store: str | os.PathLike[str] | Store, out: str | os.PathLike[str], limits: Limits | None = None
+    store: str | os.PathLike[str] | Store,
+    out: str | os.PathLike[str],
+    *,
+    samples: int = 36,
+    pixels: int = 400,
 ) -> Path:
     """Write the report of a store as one page that needs no other file, of at most 20 MB, and return its path.
 
@@ -73,22 +73,27 @@ def write_report(
         A store or its path; it may be unfinished.
     out
         The page to write; its name must end in .html.
-    limits
-        How many samples the gallery shows, and of how many the pixels are read.
+    samples
+        Largest number of samples in the gallery, 1 to 200.
+    pixels
+        Largest number of samples whose pixels are read, 1 to 1,000,000.
 
     Raises
     ------
     InputError
         If there is no store or no finished sample, or the page cannot be written there.
     """
-    store, path, limits = open_store(store), path_of(out, "out"), limits or Limits()
+    for name, value, most in (("samples", samples, MOST_SHOWN), ("pixels", pixels, MOST_READ)):
+        if not 1 <= (tables.whole(value) or 0) <= most:
+            raise InputError(f"{name} = {shown(value)}: must be a whole number from 1 to {most}")
+    store, path = open_store(store), path_of(out, "out")
     if path.suffix.lower() not in (".html", ".htm") or os.path.isdir(path):
         raise InputError(f"{path}: the report is a page, so its name must end in .html")
     scalars = read_scalars(store)
     if not len(scalars.samples):
         damaged = f"; the {scalars.unreadable} finished ones cannot be read" if scalars.unreadable else ""
         raise InputError(f"{store.path}: no sample is finished yet, so there is nothing to show{damaged}")
-    page = _page(store, scalars, limits)
+    page = _page(store, scalars, int(samples), int(pixels))
     try:
         page.write(path)
     except OSError as error:
@@ -96,15 +101,15 @@ def write_report(
     return path
 
 
-def _page(store: Store, scalars: Scalars, limits: Limits) -> Page:
-    """Return the page."""
-    pixels = read_pixels(store, scalars, limits.pixels)
+def _page(store: Store, scalars: Scalars, shown_samples: int, read_samples: int) -> Page:
+    """Return the page; `shown_samples` in its gallery, and the pixels of `read_samples`, at most."""
+    pixels = read_pixels(store, scalars, read_samples)
     drawn, read = read_drawn(store, scalars)
     try:
         numbers = statistics(store)
     except VbnfaultError:  # damaged scalars: the report shows what can be read, and says what cannot
         numbers = None
-    sections = [_gallery(store, scalars, limits.gallery)]
+    sections = [_gallery(store, scalars, shown_samples)]
     if store.spec.faults:
         sections += [_balance(store, scalars, numbers), _together(store, scalars)]
     sections += [_sun(scalars), _view(store, scalars)]
