@@ -60,7 +60,7 @@ def test_planned_and_realised_numbers_are_those_of_the_store(page: str, describe
 def test_what_is_measured_is_what_the_layers_hold(described_store: Path) -> None:
     data = st.open_store(described_store)
     scalars = read_scalars(data)
-    pixels = read_pixels(data, scalars, 4)
+    pixels = read_pixels(data, scalars, 4, {})
     assert pixels.positions.tolist() == [0, 2, 3, 5]
     for k, i in enumerate(pixels.positions):
         image, mask = data.read("image", i, i + 1)[0], data.read("mask", i, i + 1)[0]

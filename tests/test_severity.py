@@ -485,6 +485,13 @@ def test_tables_are_merged_if_they_were_made_alike(tmp_path: Path) -> None:
         severity.merged(path, more.model_copy(update={"width_px": 512}))
 
 
+def test_a_misspelt_lens_is_named(tmp_path: Path) -> None:
+    words = ["severity", "quickstart", "--out", str(tmp_path / "l.toml"), "--lens", "foo"]
+    result = CliRunner().invoke(app, words)
+    assert isinstance(result.exception, InputError)
+    assert str(result.exception).startswith("foo: neither a file nor a packaged name; lenses: ")
+
+
 def test_the_command_makes_a_table_that_a_scene_reads(tmp_path: Path) -> None:
     sizes = ("camera.width_px=128", "camera.height_px=128", "dataset.sites=1", "patch.max_triangles=60000")
     options = [word for size in sizes for word in ("--set", size)]

@@ -337,7 +337,7 @@ def test_a_file_replaced_between_its_index_and_a_chunk_is_read_again(
 
     monkeypatch.setattr(LocalStore, "get", get_and_replace)
     if times == 3:
-        with pytest.raises(VbnfaultError, match="depth_m of samples 3-3 cannot be read"):
+        with pytest.raises(VbnfaultError, match="depth_m of sample 3 cannot be read"):
             opened.read_sample(3)
     else:
         got = opened.read_sample(3).layers

@@ -35,6 +35,15 @@ def test_a_dry_run_says_how_much_a_study_evaluates_and_writes_nothing(
     assert "straylight_total_e (electrons), " in lines[3]
 
 
+def test_a_file_in_place_of_the_folder_is_one_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "out").touch()
+    code, said, errors = run(monkeypatch, capsys, "study", "flare_lens", "--out", str(tmp_path / "out"))
+    assert (code, said) == (2, "")
+    assert errors.splitlines()[-1] == f"vbnfault: {tmp_path}/out: is a file, not a folder; choose another --out"
+
+
 @pytest.mark.parametrize(
     ("setting", "sentence"),
     [

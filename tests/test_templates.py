@@ -167,8 +167,10 @@ def test_a_file_is_not_replaced_unless_asked(tmp_path: Path) -> None:
     assert path.read_text(encoding="utf-8") == "mine"
     write_template("lens", "glass", tmp_path, overwrite=True)
     assert load_lens(path).name == "glass"
-    with pytest.raises(InputError, match="cannot be written"):
+    with pytest.raises(InputError, match=r"glass\.toml: is a file, not a folder; choose another --out"):
         write_template("lens", "glass", path)
+    with pytest.raises(InputError, match="cannot be written: Not a directory"):
+        write_template("lens", "glass", path / "within")
 
 
 @pytest.mark.parametrize(

@@ -198,6 +198,15 @@ def test_options_that_belong_elsewhere_are_refused(finished_store: Path) -> None
         Loader(batches(finished_store), num_workers=-1)
 
 
+def test_what_is_no_dataset_is_refused(finished_store: Path) -> None:
+    wrong: Any = 3
+    for of in (BatchDataset, ShardSampler):
+        with pytest.raises(InputError, match="data = 3: must be a SampleDataset"):
+            of(wrong, batch_size=2)
+    with pytest.raises(InputError, match=r"batches = .*: must be a BatchDataset"):
+        Loader(data(finished_store))
+
+
 # --- transforms -----------------------------------------------------------------------------------------
 
 

@@ -7,6 +7,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -238,12 +239,13 @@ def test_regions_are_numbered_by_their_first_pixel() -> None:
     [
         (["mask_any", "depht"], {}, r"targets: 'depht' is no target.* \(did you mean depth\?\)"),
         (["parameters"], {}, "targets: 'parameters' is no target"),
+        (3, {}, "targets = 3: must be a list of names"),
         (["masks"], {"masks": "both"}, "masks = 'both': must be one of footprint, effect"),
         (["masks"], {"classes": ["fog"]}, "classes: 'fog' is no fault class"),
         (["masks"], {"classes": ["straylight", "straylight"]}, "a class is named twice"),
     ],
 )
-def test_a_wrong_target_is_refused_in_one_sentence(store: st.Store, names: list, options: dict, says: str) -> None:
+def test_a_wrong_target_is_refused_in_one_sentence(store: st.Store, names: Any, options: dict, says: str) -> None:
     with pytest.raises(InputError, match=says):
         Targets(store, names, **options)
 

@@ -187,6 +187,10 @@ def test_a_wrong_value_is_named_with_its_row_and_range(tmp_path: Path, alter: An
             r"columns are missing: sun_distance_au; unknown ",
         ),
         (lambda t: t.replace("name,", "name,name,"), r"column 'name' stands twice; must stand once"),
+        (
+            lambda t: t.split("\n", 1)[1],
+            r"its first line is one of numbers; must name the columns: name, julian_date, ",
+        ),
         (lambda t: t + "more,1\n", r"row 6 has 2 values; must have 13, as the first line has"),
         (lambda t: "\n", r"columns are missing: name, julian_date, "),
         (lambda t: t + '"open', r"is no CSV file: "),
@@ -506,7 +510,8 @@ def test_a_camera_in_the_ground_is_named_with_its_row(tmp_path: Path, sphere: st
     path = scene_file(tmp_path, sphere, [row("inside", (RADIUS_M - 50, 0, 0)), row("deep", (20.0, 0, 0))])
     session = vbnfault.Session(config.load_scene(path))
     for k, name in enumerate(("inside", "deep")):
-        sentence = rf"sample {k}: at Julian date .* {name} is within .* the ground, or below it; .* the poses were"
+        camera = f"the camera of row '{name}' is within .* the ground, or below it"
+        sentence = rf"sample {k}: at Julian date .* {camera}; .* the poses were"
         with pytest.raises(vbnfault.VbnfaultError, match=sentence):
             session.simulate(k)
     body = session.body

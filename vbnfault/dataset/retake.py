@@ -227,7 +227,7 @@ def _samples(opened: Store, out: store.Location, options: build.BuildOptions) ->
     """Return the samples of the store that are taken: the finished ones, or those that the new store began with."""
     done = [i for number in opened.begun() for i, finished in opened.done(number).items() if finished]
     if not done:
-        raise InputError(f"{opened.path}: no sample is finished yet; the command that built it resumes")
+        raise InputError(f"{opened.path}: {opened.why_none_is_finished()}; the command that built it resumes")
     samples = np.array(sorted(done), dtype=np.int64)
     if store.is_store(out) and not options.overwrite and RETAKE in (begun := store.open_store(out).attributes):
         ranges = begun[RETAKE]["samples"]

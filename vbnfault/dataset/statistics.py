@@ -280,8 +280,8 @@ def statistics(path: str | os.PathLike[str] | Store) -> Statistics:
         samples_of = {of: split == of for of in dict.fromkeys(split.tolist())}
         for of, chosen in samples_of.items():
             sites.setdefault(of, set()).update(columns["site"][chosen].tolist())
-        for text in columns["parameters"].tolist():
-            for fault, drawn in json.loads(text or "{}").items():
+        for sample, text in zip(samples, columns["parameters"].tolist(), strict=True):
+            for fault, drawn in _drawn(store, sample, text).items():
                 _add_parameters(parameters.setdefault(fault, {}), drawn)
         for values in parameters.values():
             for parameter in values.values():
@@ -291,6 +291,8 @@ def statistics(path: str | os.PathLike[str] | Store) -> Statistics:
             ranges[name].setdefault("all", Range()).add(numbers)
             for of, chosen in samples_of.items():
                 ranges[name].setdefault(of, Range()).add(numbers[chosen])
+    if not counts.samples.total() and store.lacks_done():
+        raise VbnfaultError(f"{store.path}: {store.why_none_is_finished()}; the build command restores it")
     return Statistics(
         samples=store.samples,
         finished=counts.samples.total(),
@@ -304,6 +306,20 @@ def statistics(path: str | os.PathLike[str] | Store) -> Statistics:
         parameters={fault: values for fault, values in parameters.items() if values},
         bounds=_bounds(store),
     )
+
+
+def _drawn(store: Store, sample: int, text: str) -> dict[str, Any]:
+    """Return the drawn parameters of a sample by fault. Raises VbnfaultError if the text is no table in JSON."""
+    try:
+        table = json.loads(text or "{}")
+    except (ValueError, RecursionError):
+        table = None
+    if not isinstance(table, dict):
+        raise VbnfaultError(
+            f"{store.path}: sample {sample}: its parameters are damaged, they are no table in JSON; "
+            "the build command repairs them"
+        )
+    return table
 
 
 def _bounds(store: Store) -> dict[str, dict[str, tuple[float, float]]]:

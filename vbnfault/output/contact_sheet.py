@@ -80,7 +80,7 @@ def preview(
         raise InputError(f"max_samples = {max_samples}: must be at least 1")
     done = [i for number in range(store.shards) for i, whole in store.done(number).items() if whole]
     if not done:
-        raise InputError(f"{store.path}: no sample is finished yet, so there is nothing to show")
+        raise InputError(f"{store.path}: {store.why_none_is_finished()}, so there is nothing to show")
     chosen = [done[k] for k in np.unique(np.linspace(0, len(done) - 1, max_samples).round().astype(int))]
     short = abbreviations(store.spec.faults)
     tiles = [_tile(store, i, short, masks) for i in chosen]

@@ -77,6 +77,8 @@ def write_template(kind: str, name: str, folder: Path, *, overwrite: bool = Fals
     path = folder / f"{name}{ending}"
     if path.exists() and not overwrite:
         raise InputError(f"{path}: exists already; --overwrite replaces it, or choose another name")
+    if folder.is_file():
+        raise InputError(f"{folder}: is a file, not a folder; choose another --out")
     try:
         folder.mkdir(parents=True, exist_ok=True)
         write_whole(path, text.replace(f"My{kind.capitalize()}", class_name))

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core import frames
-from ..core.errors import VbnfaultError
+from ..core.errors import VbnfaultError, shown
 from ..render.description import Sunlight
 from ..scene import names, plan
 from ..scene.trajectory import FlownPose
@@ -219,8 +219,9 @@ def _on_the_trajectory(spec: SampleSpec, flown: FlownPose) -> Pose:
     if not clear or encloses(spec.terrain.body, flown.camera_position_T_m):
         change = "poses" if scene.trajectory else "dates"
         made_for = "poses" if scene.trajectory else "kernels"
+        camera = f"the camera of row {shown(flown.name)}" if scene.trajectory else flown.name
         raise VbnfaultError(
-            f"sample {spec.index}: at Julian date {flown.julian_date:.6f} {flown.name} is within "
+            f"sample {spec.index}: at Julian date {flown.julian_date:.6f} {camera} is within "
             f"geometry.clearance_m = {clearance:g} m of the ground, or below it; choose other {change}, a smaller "
             f"clearance, or the body.shape that the {made_for} were made for"
         )

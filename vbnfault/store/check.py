@@ -515,9 +515,14 @@ def digest(path: str | os.PathLike[str] | Url | Store, *, progress: Callable[[in
     """Return the sha256 (hex) of the data in a store: root attributes, schema, and decoded arrays of its samples.
 
     The digest does not depend on the creation time, the sharding or the compression. The store is read once, shard
-    by shard; `progress` is called with the number of samples just read. Raises VbnfaultError for damaged chunks.
+    by shard; `progress` is called with the number of samples just read. Raises VbnfaultError for damaged chunks and
+    for an array that cannot be opened.
     """
     store = open_store(path)
+    problems, hopeless = metadata_problems(store)
+    if hopeless:
+        more = f", and there are {len(problems) - 1} problems more" if len(problems) > 1 else ""
+        raise VbnfaultError(f"{store.path}: {problems[0]}{more}; the build command mends it")
     digests = SampleDigests(store.samples)
     for number in store.begun():
         check = examine_shard(store, number)

@@ -126,7 +126,7 @@ class Store:
             if failure is not None:
                 raise failure from error
             raise VbnfaultError(
-                f"{self.path}: {name} of samples {start}-{stop - 1} cannot be read ({error}); "
+                f"{self.path}: {name} of {_samples(start, stop)} cannot be read ({error}); "
                 f"the build command repairs it"
             ) from error
         self._expect_written(name, start, values)
@@ -268,6 +268,20 @@ class Store:
     def finished(self) -> int:
         """Return how many samples are marked as finished in `done`."""
         return sum(count for _, count in self._counts())
+
+    def why_none_is_finished(self) -> str:
+        """Return a clause that says why no sample is finished: none is yet, or nothing marks those that are."""
+        if self.lacks_done():
+            return "the array done, which marks the finished samples, is missing"
+        return "no sample is finished yet"
+
+    def lacks_done(self) -> bool:
+        """Return whether the array that marks the finished samples is missing or damaged."""
+        try:
+            self.files.read(f"done/{DOCUMENT}")
+        except OSError:
+            return True
+        return False
 
     def whole_shards(self) -> set[int]:
         """Return the shards whose samples are all marked as finished in `done`."""
@@ -469,3 +483,8 @@ def _joined(ranges: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
         else:
             joined.append((start, length))
     return joined
+
+
+def _samples(start: int, stop: int) -> str:
+    """Return the words for the samples from `start` to `stop` - 1."""
+    return f"sample {start}" if stop == start + 1 else f"samples {start}-{stop - 1}"

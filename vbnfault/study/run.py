@@ -363,6 +363,8 @@ def _prepare_folder(path: Path, spec: StudySpec, identity: Mapping[str, Any]) ->
                     f"{path}: holds something else than a study of vbnfault, so it is left alone; choose another "
                     "--out"
                 )
+        if path.is_file():
+            raise InputError(f"{path}: is a file, not a folder; choose another --out")
         (path / "rows").mkdir(parents=True, exist_ok=True)
         if record.exists():
             try:

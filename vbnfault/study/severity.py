@@ -31,6 +31,7 @@ from ..dataset.processes import Pool
 from ..dataset.progress import Progress
 from ..dataset.work import run_here
 from ..faults import LEVELS, ModelLevels, SeverityTable, dataset_order, read_table, registry
+from ..lens import load_lens
 from ..scene import config
 from ..scene.instrument import CameraTable
 from ..world import assemble
@@ -445,6 +446,8 @@ def _groups(models: Sequence[ModelUnderTest], views: ViewOptions, detectors: Map
     groups: list[ViewGroup] = []
     first = 0
     for lens, name in enumerate(views.lenses or (scene.camera.lens,)):
+        if name:
+            load_lens(name)  # a misspelt lens is named before what does not fit to a lens
         fitting = [model for model in models if not (name and model.type.thin_lens_only)]
         kinds = dict.fromkeys((detectors[model.name], model.type.needs_sun) for model in fitting)
         for detector, facing_sun in kinds:

@@ -340,6 +340,8 @@ def _order(
     data: SampleDataset, *, ranks: tuple[int, int] | None = None, **order: Unpack[_OptionsOfOneRank]
 ) -> Order:
     """Return the order of a dataset's samples; the parameters are those of `BatchDataset`."""
+    if not isinstance(data, SampleDataset):
+        raise InputError(f"data = {shown(data)}: must be a SampleDataset")
     if ranks is None:
         parallel = torch.distributed
         known = parallel.is_available() and parallel.is_initialized()

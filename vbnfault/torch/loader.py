@@ -58,6 +58,8 @@ class Loader:
     def __init__(
         self, batches: BatchDataset, *, num_workers: int = 0, pin_memory: bool = False, **options: Any
     ) -> None:
+        if not isinstance(batches, BatchDataset):
+            raise InputError(f"batches = {shown(batches)}: must be a BatchDataset")
         for name in _SETS_ITSELF:
             if name in options:
                 raise InputError(f"{name}: a Loader takes it from its BatchDataset; give it there")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -68,6 +68,8 @@ class Targets:
         masks: str = "footprint",
     ) -> None:
         self.spec = store.spec
+        if not isinstance(names, str | Iterable):
+            raise InputError(f"targets = {shown(names)}: must be a list of names")
         self.names = tuple(dict.fromkeys(["image", *((names,) if isinstance(names, str) else names)]))
         self.classes = store.spec.faults if classes is None else known_classes(store, classes, "classes")
         if masks not in MASK_RULES:
@@ -90,7 +92,7 @@ class Targets:
         if target is None:
             from ..core.tables import did_you_mean  # not above: its import takes longer than all others here
 
-            known = [*TARGETS, *store.spec.pixel_layers]
+            known = list(dict.fromkeys([*TARGETS, *store.spec.pixel_layers]))
             raise InputError(
                 f"targets: {shown(name)} is no target, and no layer or number of the store"
                 f"{did_you_mean(str(name), known)}"

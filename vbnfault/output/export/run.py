@@ -133,9 +133,9 @@ def _check_finished(store: Store) -> None:
     """Refuse a store that lacks samples."""
     finished = store.finished()
     if finished < store.samples:
+        state = f"{finished} of {store.samples} samples are finished" if finished else store.why_none_is_finished()
         raise InputError(
-            f"{store.path}: {finished} of {store.samples} samples are finished; run the build command again, and "
-            "export the store when it is complete"
+            f"{store.path}: {state}; run the build command again, and export the store when it is complete"
         )
 
 

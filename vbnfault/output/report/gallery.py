@@ -63,10 +63,10 @@ def pick(scalars: Scalars, most: int) -> list[int]:
     return sorted(chosen)
 
 
-def gallery(store: Store, scalars: Scalars, most: int) -> tuple[str, int]:
-    """Return the gallery as markup, and the number of its samples."""
+def gallery(store: Store, scalars: Scalars, most: int, unread: dict[int, str]) -> tuple[str, int]:
+    """Return the gallery as markup, and the number of its samples; `unread` is that of `readable`."""
     names = [name for name in ("image", "clean", "mask") if name in store.spec.pixel_layers]
-    picked = [_picked(k, sample) for k, sample in readable(store, scalars, pick(scalars, most), names)]
+    picked = [_picked(k, sample) for k, sample in readable(store, scalars, pick(scalars, most), names, unread)]
     if not picked:
         return "<p>No sample could be read.</p>", 0
     files: list[_Files] = []

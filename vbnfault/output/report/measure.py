@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -276,14 +275,17 @@ class PixelResults:
     unreadable: int
 
 
-def read_pixels(store: Store, scalars: Scalars, most: int) -> PixelResults:
-    """Return what the pixels of up to `most` finished samples, evenly spaced, say."""
+def read_pixels(store: Store, scalars: Scalars, most: int, unread: dict[int, str]) -> PixelResults:
+    """Return what the pixels of up to `most` finished samples, evenly spaced, say.
+
+    `unread` is that of `readable`.
+    """
     images = [name for name in ("image", "clean") if name in store.spec.pixel_layers]
     masks = [name for name in ("mask", "mask_effect") if name in store.spec.pixel_layers and store.spec.faults]
     rows: dict[str, list[Any]] = {name: [] for name in (*images, *masks)}
     positions = []
     chosen = spread(len(scalars.samples), most).tolist()
-    for position, sample in readable(store, scalars, chosen, {*images, *masks}):
+    for position, sample in readable(store, scalars, chosen, {*images, *masks}, unread):
         layers = sample.layers
         positions.append(position)
         for image in images:
@@ -301,20 +303,16 @@ def read_pixels(store: Store, scalars: Scalars, most: int) -> PixelResults:
 
 
 def readable(
-    store: Store, scalars: Scalars, positions: Sequence[int], layers: Collection[str]
+    store: Store, scalars: Scalars, positions: Sequence[int], layers: Collection[str], unread: dict[int, str]
 ) -> Iterator[tuple[int, Sample]]:
-    """Yield position and sample, with some layers, of those that can be read; then warn of the others at once."""
-    problems = []
+    """Yield position and sample, with some layers, of those that can be read; to `unread` add why others cannot."""
     for position in positions:
         try:
             sample = store.read_sample(int(scalars.samples[position]), layers)
         except VbnfaultError as error:
-            problems.append(f"{error}")
+            unread[position] = str(error)
             continue
         yield position, sample
-    if problems:
-        more = f"; the same is true of {len(problems) - 1} samples more" if len(problems) > 1 else ""
-        warnings.warn(f"{problems[-1]}{more}; the report leaves out what it cannot read", stacklevel=2)
 
 
 def _of_image(image: NDArray[Any]) -> tuple[float, float]:

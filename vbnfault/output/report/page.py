@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
@@ -87,12 +88,16 @@ def write_report(
         if not 1 <= (tables.whole(value) or 0) <= most:
             raise InputError(f"{name} = {shown(value)}: must be a whole number from 1 to {most}")
     store, path = open_store(store), path_of(out, "out")
-    if path.suffix.lower() not in (".html", ".htm") or os.path.isdir(path):
+    if path.suffix.lower() not in (".html", ".htm"):
         raise InputError(f"{path}: the report is a page, so its name must end in .html")
+    if os.path.isdir(path):
+        raise InputError(f"{path}: is a folder; must be the name of the page to write")
     scalars = read_scalars(store)
     if not len(scalars.samples):
-        damaged = f"; the {scalars.unreadable} finished ones cannot be read" if scalars.unreadable else ""
-        raise InputError(f"{store.path}: no sample is finished yet, so there is nothing to show{damaged}")
+        why = store.why_none_is_finished()
+        if scalars.unreadable:
+            why = f"the scalars of all {scalars.unreadable} finished samples cannot be read"
+        raise InputError(f"{store.path}: {why}, so there is nothing to show")
     page = _page(store, scalars, int(samples), int(pixels))
     try:
         page.write(path)
@@ -103,13 +108,18 @@ def write_report(
 
 def _page(store: Store, scalars: Scalars, shown_samples: int, read_samples: int) -> Page:
     """Return the page; `shown_samples` in its gallery, and the pixels of `read_samples`, at most."""
-    pixels = read_pixels(store, scalars, read_samples)
+    unread: dict[int, str] = {}
+    pixels = read_pixels(store, scalars, read_samples, unread)
     drawn, read = read_drawn(store, scalars)
     try:
         numbers = statistics(store)
     except VbnfaultError:  # damaged scalars: the report shows what can be read, and says what cannot
         numbers = None
-    sections = [_gallery(store, scalars, shown_samples)]
+    sections = [_gallery(store, scalars, shown_samples, unread)]
+    if unread:
+        more = f"; the same is true of {len(unread) - 1} samples more" if len(unread) > 1 else ""
+        left_out = "leaves out what it cannot read" if pixels.positions.size else "shows no images"
+        warnings.warn(f"{list(unread.values())[-1]}{more}; the report {left_out}", stacklevel=3)
     if store.spec.faults:
         sections += [_balance(store, scalars, numbers), _together(store, scalars)]
     sections += [_sun(scalars), _view(store, scalars)]
@@ -160,9 +170,9 @@ def _how(text: str) -> str:
 # --- sections -----------------------------------------------------------------------------------------------
 
 
-def _gallery(store: Store, scalars: Scalars, most: int) -> Section:
-    """Return the gallery."""
-    markup, count = gallery(store, scalars, most)
+def _gallery(store: Store, scalars: Scalars, most: int, unread: dict[int, str]) -> Section:
+    """Return the gallery; `unread` is that of `readable`."""
+    markup, count = gallery(store, scalars, most, unread)
     every = "All finished samples"
     total = len(scalars.samples)
     if count < total:

@@ -67,7 +67,13 @@ class Yolo(Format):
         lines = [f"{key}: images/{name if name in used else fallback}" for key, name in paths.items()]
         lines += ["names:", *(f"  {k}: {name}" for k, name in enumerate(finished.store.spec.faults))]
         finished.folder.put([("data.yaml", ("\n".join(lines) + "\n").encode())])
-        return Closing()
+        lacking = [name for name in paths if name not in used]
+        return Closing(
+            warnings=[
+                f"the store has no samples in the split {name}; in data.yaml, {name} names those of {fallback}"
+                for name in lacking
+            ]
+        )
 
 
 def _outline_line(category: int, region: Region, spec: StoreSpec) -> str:
