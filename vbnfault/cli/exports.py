@@ -40,7 +40,8 @@ def stats(
     store: StoreArgument,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
 ) -> None:
-    """Print planned and realised statistics: classes by split, co-occurrence, exposure, ranges of parameters."""
+    """Print planned and realised statistics: classes by split, co-occurrence, exposure, ranges of parameters. No
+    checksums are compared; `vbnfault verify` does so."""
     from ..dataset.statistics import statistics
 
     numbers = statistics(store)
