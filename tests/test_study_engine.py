@@ -415,8 +415,12 @@ def test_a_folder_of_another_study_is_refused(spec: StudySpec, reference: Path) 
 
 def test_a_folder_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    for out in (tmp_path / "file" / "s", tmp_path / "file"):
-        with pytest.raises(VbnfaultError, match=r"file.*(cannot be|can be) (created|written)"):
+    cases = (
+        (tmp_path / "file" / "s", r"file.*(cannot be|can be) (created|written)"),
+        (tmp_path / "file", "is a file"),
+    )
+    for out, sentence in cases:
+        with pytest.raises(VbnfaultError, match=sentence):
             run.run_study(kit.spec(), out, QUIET, report=False, evaluator=kit.Function)
 
 
