@@ -75,11 +75,10 @@ The last three columns are the patches that the classifier tells, with `--splits
 50 % would be none. Single draws of the body have 72 to 78 %. One classifier for all places tells 72.0 %. Before
 overexposed frames were metered below white, the body of `TEXTURE` had 75.2 %. Without scarps it had 75.3 %, and
 76.5 % with `patch.scarps = 0.3`; with 0.5, it had 78.0 % in the first four of the eight draws, where `TEXTURE` had
-74.6 %. The settings were chosen by the
-classifier on the same frames, so others may be told more often. What had given the images away most were mottled
-plains and a core of the point spread that was too wide: real ground is either smooth or rough, and boulders and
-shadows on it are sharp. Obliquely lit ground is still too rough in its smoothest tenth, and real scarps throw thin
-dark lines where ours throw spots.
+74.6 %. The settings were chosen by the classifier on the same frames, so others may be told more often. What had
+given the images away most were mottled plains and a core of the point spread that was too wide: real ground is
+either smooth or rough, and boulders and shadows on it are sharp. Obliquely lit ground is still too rough in its
+smoothest tenth, and real scarps throw thin dark lines where ours throw spots.
 
 The sky of 31 frames is the sum of six parts, fitted by least squares to means over 8 px: the halo of the limb;
 light scattered farther, 0.5 % of that of the body (0.4 to 0.8 % in four fifths of the frames; the wings of the
@@ -140,6 +139,7 @@ _STRETCH = 255 / _WHITE_DN**0.5  # of a root of DN
 _SKY_VARIANCE = (0.08, 0.16, 8.0)
 _NOISY = 1.45  # times this variance: 28 frames have 0.88 to 1.17, three in a row 1.7 to 2.0
 HIGH_GAIN = 1.4  # over the low one: what noise of 1.9 times the variance asks for; 1.7 in visnav
+# A frame whose `bright` reaches this level is overexposed. It is metered on one of these percentiles.
 _WHITE, _LOWER_PERCENTILES = 250, (95.0, 90.0, 80.0, 70.0, 60.0, 50.0, 40.0, 30.0, 20.0, 10.0)
 _MOST_BLACK_DN = 4.0  # more is light: of 32 frames the black differs by 1.7 DN at most
 AFRHO_CM = 50.0  # chosen beside halo and wings of the point spread for the sky of 31 frames

@@ -37,7 +37,8 @@ def page(described_store: Path, tmp_path_factory: pytest.TempPathFactory) -> str
 
 def test_the_page_needs_no_other_file_and_holds_every_section(page: str) -> None:
     assert not re.search(r'(?:src|href)="(?!data:|#)', page)
-    assert not re.search(r"url\((?!data:|#)|@import|https?://", page)
+    assert not re.search(r"url\((?!data:|#root\))|@import|https?://", page)
+    assert page.count('<filter id="root"') == 1
     names = re.findall(r'<section id="(\w+)">', page)
     assert names == ["gallery", "balance", "together", "sun", "view", "parameters", "exposure", "areas", "about"]
     assert page.count('class="card"') == 6

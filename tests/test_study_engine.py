@@ -417,7 +417,7 @@ def test_a_folder_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     cases = (
         (tmp_path / "file" / "s", r"file.*(cannot be|can be) (created|written)"),
-        (tmp_path / "file", "is a file"),
+        (tmp_path / "file", "file: is a file, not a folder; choose another --out"),
     )
     for out, sentence in cases:
         with pytest.raises(VbnfaultError, match=sentence):

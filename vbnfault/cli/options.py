@@ -46,11 +46,11 @@ LensArgument = Annotated[str, typer.Argument(help="Path of a prescription, or na
 def _limited(
     kind: type[int] | type[float], low: float, high: float, text: str, names: tuple[str, ...], unset: str | None
 ) -> Any:
-    """Return an option that takes a number of a kind from `low` to `high`."""
+    """Return an option that takes a whole number (`kind` is int) or any number (float) from `low` to `high`."""
     limits = f"{low} to {high}" if kind is int else f"{low:g} to {high:g}"
 
     def parsed(given: str | float) -> float:
-        """Return the number of a text, or a default. Refuses any other text in one sentence."""
+        """Return the number that a text holds, or a default, which is one. Raises BadParameter for other texts."""
         text = str(given)
         try:
             value = kind(text) if text.isascii() and "_" not in text else math.nan

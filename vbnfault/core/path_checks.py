@@ -52,6 +52,12 @@ def path_of(value: object, what: str) -> Path:
         raise InputError(f"{what} = {shown(value)}: must be a path") from None
 
 
+def check_folder(path: Path) -> None:
+    """Check that a path to a folder, which `--out` names, is none to a file. Raises InputError."""
+    if path.exists() and not path.is_dir():
+        raise InputError(f"{path}: is a file, not a folder; choose another --out")
+
+
 def check_path(path: str, where: str) -> None:
     """Check that a path is possible. Raises InputError; its message begins with `where`, the key of the path."""
     try:

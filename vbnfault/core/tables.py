@@ -176,6 +176,15 @@ def whole(value: object) -> int | None:
         return None
 
 
+def is_number(text: str) -> bool:
+    """Return whether a text is a number, as Python writes one; `nan` and `inf` are."""
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
 def dotted(key: str) -> str:
     """Return a key with dots before the numbers of entries of lists: `factor[0].low` as `factor.0.low`."""
     return re.sub(r"\[(\d+)\]", r".\1", key)

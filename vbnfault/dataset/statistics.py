@@ -254,7 +254,8 @@ def aligned(table: list[list[str]]) -> list[str]:
 def statistics(path: str | os.PathLike[str] | Store) -> Statistics:
     """Return the planned and realised statistics of the finished samples of a store.
 
-    Scalars are not compared with their checksums, which would take all arrays; `verify` does so.
+    Scalars are not compared with their checksums: one checksum covers all scalars of a sample, so that all of their
+    arrays would have to be read. `verify` does so.
 
     Raises
     ------

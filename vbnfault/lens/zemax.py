@@ -49,6 +49,7 @@ from typing import Any
 
 from ..core import user_files
 from ..core.errors import InputError, shown
+from ..core.tables import is_number
 from .glass import CLEAR, GLASSES, Glass, Transmittance
 
 LENS_SUFFIX, CATALOGUE_SUFFIX = ".zmx", ".agf"
@@ -101,15 +102,6 @@ def _lines(path: Path, what: str, suffix: str) -> list[list[str]]:
         except UnicodeDecodeError:
             text = data.decode("latin-1")
     return [words for line in text.splitlines() if (words := line.split())]
-
-
-def _is_number(word: str) -> bool:
-    """Return whether a word is a number."""
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
 
 
 def _number(words: Sequence[str], place: int, where: str) -> float:
@@ -190,7 +182,7 @@ def read_catalogue(path: str | Path) -> GlassCatalogue:
         if words[0] == "NM" and len(words) > 1:
             of_glass = records.setdefault(words[1].upper(), [])
             of_glass.clear()  # of two glasses of one name, the last counts
-        if of_glass and _is_number(words[0]):
+        if of_glass and is_number(words[0]):
             of_glass[-1].extend(words)  # a record that goes on in the next line
         else:
             of_glass.append(words)

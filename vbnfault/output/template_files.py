@@ -9,6 +9,7 @@ from pathlib import Path
 
 from .. import faults, reflectance
 from ..core.errors import InputError, shown
+from ..core.path_checks import check_folder
 from ..core.whole_files import write_whole
 from ..detector import effects
 
@@ -77,8 +78,7 @@ def write_template(kind: str, name: str, folder: Path, *, overwrite: bool = Fals
     path = folder / f"{name}{ending}"
     if path.exists() and not overwrite:
         raise InputError(f"{path}: exists already; --overwrite replaces it, or choose another name")
-    if folder.is_file():
-        raise InputError(f"{folder}: is a file, not a folder; choose another --out")
+    check_folder(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         write_whole(path, text.replace(f"My{kind.capitalize()}", class_name))

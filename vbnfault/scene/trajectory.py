@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from ..core import file_contents, user_files
+from ..core import file_contents, tables, user_files
 from ..core.errors import InputError, shown, under_key
 from ..core.tables import Table
 
@@ -275,18 +275,9 @@ def _check_types(schema: Any, source: str) -> None:
             raise InputError(f"{source}: column {column.name} has the type {kind}; must hold {wanted}")
 
 
-def _is_number(text: str) -> bool:
-    """Return whether a text is a number."""
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
-
-
 def _check_names(names: Sequence[str], source: str) -> None:
     """Raise InputError unless each column of a table of poses is there once, and no other."""
-    if names and not any(name in COLUMNS for name in names) and any(_is_number(name) for name in names):
+    if names and not any(name in COLUMNS for name in names) and any(tables.is_number(name) for name in names):
         raise InputError(f"{source}: its first line is one of numbers; must name the columns: {', '.join(COLUMNS)}")
     twice = next((name for k, name in enumerate(names) if name in names[:k]), None)
     if twice is not None:

@@ -149,7 +149,7 @@ class Store:
             lost = [i for i, done in self.done(number).items() if done and start <= i < start + len(values)]
             if lost:
                 raise VbnfaultError(
-                    f"{self.path}: {name} of samples {lost[0]}-{lost[-1]} cannot be read: the file {file} is "
+                    f"{self.path}: {name} of {_samples(lost[0], lost[-1] + 1)} cannot be read: the file {file} is "
                     "missing; the build command repairs it"
                 )
 
@@ -276,7 +276,7 @@ class Store:
         return "no sample is finished yet"
 
     def lacks_done(self) -> bool:
-        """Return whether the array that marks the finished samples is missing or damaged."""
+        """Return whether the array that marks the finished samples is missing."""
         try:
             self.files.read(f"done/{DOCUMENT}")
         except OSError:
@@ -486,5 +486,5 @@ def _joined(ranges: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
 
 
 def _samples(start: int, stop: int) -> str:
-    """Return the words for the samples from `start` to `stop` - 1."""
+    """Return how a message names the samples from `start` to `stop` - 1: "sample 3" or "samples 3-5"."""
     return f"sample {start}" if stop == start + 1 else f"samples {start}-{stop - 1}"

@@ -26,7 +26,7 @@ from .. import __version__
 from ..core import environment, file_contents, tables, toml_files, whole_files
 from ..core.errors import InputError, VbnfaultError, shown
 from ..core.interrupts import Stopped, exit_code, finishing, interruptible
-from ..core.path_checks import path_of
+from ..core.path_checks import check_folder, path_of
 from ..dataset import BuildOptions
 from ..dataset.dask import check_scheduler, run_on_dask
 from ..dataset.errors import Interrupted
@@ -356,6 +356,7 @@ def _prepare_folder(path: Path, spec: StudySpec, identity: Mapping[str, Any]) ->
     """Make the folder of a study, or check that it holds this study. Raises InputError."""
     record = path / "identity.json"
     with _writing(path):
+        check_folder(path)
         if path.is_dir() and not record.exists():
             own = {"rows", "study.toml", *(file.name for file in results.partial_files(path))}  # of a begun study
             if any(entry.name not in own for entry in path.iterdir()):
@@ -363,8 +364,6 @@ def _prepare_folder(path: Path, spec: StudySpec, identity: Mapping[str, Any]) ->
                     f"{path}: holds something else than a study of vbnfault, so it is left alone; choose another "
                     "--out"
                 )
-        if path.is_file():
-            raise InputError(f"{path}: is a file, not a folder; choose another --out")
         (path / "rows").mkdir(parents=True, exist_ok=True)
         if record.exists():
             try:

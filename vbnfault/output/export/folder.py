@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from ...core.errors import InputError
+from ...core.path_checks import check_folder
 from ...store import disk
 
 STATE = "export.json"
@@ -61,8 +62,7 @@ class Folder:
         InputError
             The folder holds something else, or another export.
         """
-        if self.path.exists() and not self.path.is_dir():
-            raise InputError(f"{self.path}: is a file, not a folder; choose another --out")
+        check_folder(self.path)
         names = disk.names(self.path)
         if all(_OWN.fullmatch(name) for name in names):  # also what a killed process left of its first file
             for name in names:

@@ -64,7 +64,10 @@ def pick(scalars: Scalars, most: int) -> list[int]:
 
 
 def gallery(store: Store, scalars: Scalars, most: int, unread: dict[int, str]) -> tuple[str, int]:
-    """Return the gallery as markup, and the number of its samples; `unread` is that of `readable`."""
+    """Return the gallery as markup, and the number of its samples.
+
+    The reasons why samples cannot be read are added to `unread`, by position.
+    """
     names = [name for name in ("image", "clean", "mask") if name in store.spec.pixel_layers]
     picked = [_picked(k, sample) for k, sample in readable(store, scalars, pick(scalars, most), names, unread)]
     if not picked:
@@ -285,7 +288,7 @@ def _words(fault: str) -> str:
     return escaped(fault.replace("_", " "))
 
 
-# the square root of the values, as a browser computes it
+# With this filter a browser shows the square root of the values, black and white as they are.
 _BRIGHTER_FILTER = (
     '<svg class="filter" width="0" height="0" aria-hidden="true"><filter id="root" '
     'color-interpolation-filters="sRGB"><feComponentTransfer>'

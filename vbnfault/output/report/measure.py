@@ -278,7 +278,7 @@ class PixelResults:
 def read_pixels(store: Store, scalars: Scalars, most: int, unread: dict[int, str]) -> PixelResults:
     """Return what the pixels of up to `most` finished samples, evenly spaced, say.
 
-    `unread` is that of `readable`.
+    The reasons why samples cannot be read are added to `unread`, by position.
     """
     images = [name for name in ("image", "clean") if name in store.spec.pixel_layers]
     masks = [name for name in ("mask", "mask_effect") if name in store.spec.pixel_layers and store.spec.faults]
@@ -305,7 +305,10 @@ def read_pixels(store: Store, scalars: Scalars, most: int, unread: dict[int, str
 def readable(
     store: Store, scalars: Scalars, positions: Sequence[int], layers: Collection[str], unread: dict[int, str]
 ) -> Iterator[tuple[int, Sample]]:
-    """Yield position and sample, with some layers, of those that can be read; to `unread` add why others cannot."""
+    """Yield the position and the sample, with some layers, of each sample that can be read.
+
+    The reasons why others cannot be read are added to `unread`, by position.
+    """
     for position in positions:
         try:
             sample = store.read_sample(int(scalars.samples[position]), layers)

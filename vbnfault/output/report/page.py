@@ -52,7 +52,7 @@ _PLACE = {
 }
 
 
-# The largest numbers of samples in the gallery, and of samples whose pixels are read.
+# The gallery shows at most so many samples, and the pixels of at most so many are read.
 MOST_SHOWN, MOST_READ = 200, 1_000_000
 
 
@@ -107,7 +107,7 @@ def write_report(
 
 
 def _page(store: Store, scalars: Scalars, shown_samples: int, read_samples: int) -> Page:
-    """Return the page; `shown_samples` in its gallery, and the pixels of `read_samples`, at most."""
+    """Return the page. Its gallery has at most `shown_samples`; the pixels of at most `read_samples` are read."""
     unread: dict[int, str] = {}
     pixels = read_pixels(store, scalars, read_samples, unread)
     drawn, read = read_drawn(store, scalars)
@@ -171,7 +171,7 @@ def _how(text: str) -> str:
 
 
 def _gallery(store: Store, scalars: Scalars, most: int, unread: dict[int, str]) -> Section:
-    """Return the gallery; `unread` is that of `readable`."""
+    """Return the gallery. The reasons why samples cannot be read are added to `unread`, by position."""
     markup, count = gallery(store, scalars, most, unread)
     every = "All finished samples"
     total = len(scalars.samples)
