@@ -221,7 +221,7 @@ def small_scene(**tables: dict[str, Any]) -> dict[str, Any]:
         "title": "small",
         "dataset": {"samples": 16, "seed": 11, "sites": 4, "shard_samples": 4},
         "patch": {"facet_m": 12.0, "radius_m": 60.0, "min_boulder_m": 6.0},
-        "camera": {"width_px": 96, "height_px": 80},
+        "camera": {"width_px": 96, "height_px": 80, "fov_deg": 65.0},
         "render": {"samples_per_pixel": 4},
         "plan": {"faulty_fraction": 0.75},
         "faults": {name: {} for name in ALL_FAULTS},

@@ -43,7 +43,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "navigation": {"core"},
     "faults": PHYSICS,
     "testing": PHYSICS | {"faults"},
-    "scene": {"core", "reflectance", "faults"},
+    "scene": {"core", "lens", "detector", "reflectance", "faults"},
     "world": WORLD,
     "pipeline": PIPELINE,
     "store": {"core", "scene"},

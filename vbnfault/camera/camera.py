@@ -22,7 +22,8 @@ class Camera:
     """Hold a camera in the state in which it takes one image.
 
     `architecture` and `readout_direction` (`core.architecture` names their values) are drawn once per
-    sample, and broken pixels and broken lines share them. `exposure_s` is above 0.
+    sample, and broken pixels and broken lines share them. `exposure_s` is above 0. `gain`, at least 1, is the
+    factor on the detector's own gain in DN/e, which the detector holds already.
 
     `lens_changes` are changes of the prescription that faults trace; a lens of the camera that has surfaces is
     already changed. Only sensitivity studies use them.
@@ -33,6 +34,7 @@ class Camera:
     architecture: str = "full_frame_ccd"
     readout_direction: str = "right"
     exposure_s: float = 1e-3
+    gain: float = 1.0
     lens_changes: tuple[Change, ...] = ()
 
     @property

@@ -155,6 +155,9 @@ class SceneValues:
         int | None,
         whole(0, MOST_SEED, "Seed of all random numbers.", unset="the scene's"),
     ] = None
+    scale: Annotated[
+        float, number(0.01, 1, "Factor on the image's width and height, for a preview with the same field of view.")
+    ] = 1.0
     settings: Annotated[
         list[str] | None,
         replaced("scene", "body.shape=comet.obj"),
@@ -165,7 +168,14 @@ class SceneValues:
         from ..scene import config
 
         named = {key: value for key, value in self._named().items() if value is not None}
-        return config.load_scene(scene, overrides(self.settings) | named)
+        values = overrides(self.settings) | named
+        loaded = config.load_scene(scene, values)
+        if self.scale == 1:
+            return loaded
+        camera = loaded.camera
+        width_px, height_px = (max(16, round(self.scale * n)) for n in (camera.width_px, camera.height_px))
+        values |= {"camera.width_px": width_px, "camera.height_px": height_px}
+        return config.load_scene(scene, values | {"camera.fov_deg": camera.fov_deg, "camera.focal_length_mm": None})
 
     def _named(self) -> dict[str, int | None]:
         """Return the values that have options of their own, by key of the scene."""

@@ -3,6 +3,7 @@
 from .interface import Detector
 from .mosaic_detector import MosaicDetector
 from .noise import EXACT_POISSON_BELOW_E, poisson_quantile
+from .operation import amplified, binned
 from .sensor import Sensor, load_sensor
 from .three_colour import Noise, ThreeColourDetector
 
@@ -13,6 +14,8 @@ __all__ = [
     "Noise",
     "Sensor",
     "ThreeColourDetector",
+    "amplified",
+    "binned",
     "load_sensor",
     "poisson_quantile",
 ]

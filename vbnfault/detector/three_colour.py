@@ -67,7 +67,7 @@ class ThreeColourDetector:
     """Describe a sensor whose pixels sense R, G and B. Lengths are in µm, signals in electrons (e) or DN.
 
     `response` names the relative colour curves in `spectra.RESPONSES`; `quantum_efficiency_peak` in (0, 1] scales
-    them. The full well clips before bias and read noise are added. The converter spans bias … full well.
+    them. The full well clips before bias and read noise are added. The converter spans bias … full well / gain.
     """
 
     name: str = "generic"
@@ -79,6 +79,7 @@ class ThreeColourDetector:
     dark_current_e_s: float = 15.0
     adc_bits: int = 12
     bias_dn: int = 64
+    gain: float = 1.0
     response: str = "nikon_5100"
     quantum_efficiency_peak: float = 0.5
 
@@ -104,8 +105,8 @@ class ThreeColourDetector:
 
     @property
     def gain_dn_per_e(self) -> float:
-        """Return the system gain K in DN/e, with which the full well reaches the top code."""
-        return (self.adc_max_dn - self.bias_dn) / self.full_well_e
+        """Return the system gain K in DN/e: `gain` times that with which the full well reaches the top code."""
+        return self.gain * (self.adc_max_dn - self.bias_dn) / self.full_well_e
 
     @property
     def efficiency(self) -> QuantumEfficiency:
@@ -120,7 +121,7 @@ class ThreeColourDetector:
     @property
     def white_e(self) -> F32:
         """Return the signal of R, G, B in electrons that the 8 bit image shows as 255, float32[3]."""
-        return np.asarray(self.full_well_e / self.white_balance, dtype=np.float32)
+        return np.asarray(self.full_well_e / self.gain / self.white_balance, dtype=np.float32)
 
     def electron_rate_weights(self, wavelength_nm: NDArray[np.float64]) -> F32:
         """Return electrons per second and pixel for 1 W m⁻² nm⁻¹ in each band, float32[3, band]."""

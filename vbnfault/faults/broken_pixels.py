@@ -16,6 +16,10 @@ The paper's table bounds the offset of a line by 65. Its text bounds it by 0.4 t
 (0.4 · 255 = 102). Here both bounds hold: offset = U(0, min(65, 0.4 · brightness)), in whole DN. The table asks for
 10-150 defects, but the paper's own example has 9, so a scene may set `count = 9`.
 
+The paper's figures show that a hot pixel's output is linear in the exposure and grows with ISO (Chapman et al.
+2013, 2022); the paper has a random brightness stand for both. With `reference_exposure_s` the brightness follows
+them, except that of salt-and-pepper defects.
+
 The camera's architecture decides whether the sensor is a CCD or CMOS. Its readout direction is that of all lines.
 Chapman et al. (2022, 2023) see more pairs of defects within 3×3 pixels than chance explains. OSIRIS-REx saw that
 more than three defects close together matter to navigation. These are the reasons for `cluster_fraction` and
@@ -62,6 +66,13 @@ class TextureBrokenPixels(Fault):
     brightness_dn: Interval = bounds(
         0, 255, limits=(0, 255), integer=True, unit="DN", doc="intensity of a broken pixel"
     )
+    reference_exposure_s: float | None = number(
+        None,
+        limits=(1e-9, 1e6),
+        unit="s",
+        doc="exposure at which broken pixels have brightness_dn, with a gain of 1; it then grows with exposure "
+        "and camera.gain, up to white; default: it is the same in every image",
+    )
     line_offset_dn: Interval = bounds(
         0,
         65,
@@ -91,6 +102,9 @@ class TextureBrokenPixels(Fault):
         brightness = rng.integers(int(self.brightness_dn.lo), int(self.brightness_dn.hi), count, endpoint=True)
         extreme = np.where(rng.random(count) < 0.5, 0, 255)
         is_extreme = rng.random(count) < self.salt_and_pepper_fraction
+        if self.reference_exposure_s is not None:
+            grown = context.camera.gain * context.camera.exposure_s / self.reference_exposure_s
+            brightness = np.rint(np.minimum(brightness * grown, 255)).astype(np.int64)
         brightness = np.where(is_extreme, extreme, brightness)
         fraction = rng.random(count)
         params: Params = {

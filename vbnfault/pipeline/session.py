@@ -240,7 +240,11 @@ class Session:
     def warn_of_doubts(self) -> None:
         """Warn if the body has values of another, named one, and if the frame is wider than the lens's field."""
         with in_file(self.source):
-            sentences = assemble.values_of_another_body(self.scene, self.body), assemble.dark_corners(self.scene)
+            sentences = (
+                assemble.values_of_another_body(self.scene, self.body),
+                assemble.dark_corners(self.scene),
+                assemble.scaled_lens(self.scene),
+            )
         for sentence in sentences:
             if sentence:
                 warnings.warn(sentence, stacklevel=2)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
 from ..core import spectra
 from ..core.architecture import ARCHITECTURES, READOUT_DIRECTIONS, Architecture, ReadoutDirection
+from ..core.errors import InputError
 from ..core.tables import Table, pair_within
 
 # Values of a camera without a prescription, where the scene gives none.
@@ -75,12 +77,21 @@ class PointSpreadTable(Table):
 class CameraTable(Table):
     """Describe the camera and its exposure."""
 
-    fov_deg: float = Field(65.0, ge=0.01, le=140, description="full field of view across the width")
+    fov_deg: float = Field(
+        65.0,
+        ge=0.01,
+        le=140,
+        description="full field of view across the width; default: that of focal_length_mm or of lens, if given",
+    )
+    focal_length_mm: float | None = Field(
+        None, ge=0.1, le=1e5, description="in place of fov_deg; default: that of fov_deg, or the lens's own"
+    )
     width_px: int = Field(1024, ge=16, le=16384, description="width of the image")
     height_px: int = Field(1024, ge=16, le=16384, description="height of the image")
     lens: str = Field(
         "",
-        description="a packaged lens or a prescription's TOML, scaled to the field of view; default: a thin lens",
+        description="a packaged lens or a prescription's TOML, as it is, or scaled to fov_deg or focal_length_mm; "
+        "default: a thin lens",
     )
     lens_coating: str = Field(
         "", description="put on all its surfaces between glass and air: none, mgf2, v or bbar; default: its own"
@@ -118,6 +129,19 @@ class CameraTable(Table):
         "are as many as splits",
     )
     detector_temperature_K: float | None = Field(None, ge=100, le=400, description="default: the detector's own")
+    binning: int = Field(
+        1,
+        ge=1,
+        le=16,
+        description="pixels of the detector in each direction, of one colour, that are added to one of the image",
+    )
+    gain: float = Field(
+        1.0,
+        ge=1,
+        le=1000,
+        description="digital number per electron over the detector's own, as a higher ISO setting has it: white is "
+        "reached by fewer electrons",
+    )
     pixel_pitch_um: float = Field(5.5, ge=0.5, le=100, description="distance of neighbouring pixels")
     full_well_e: float = Field(13_500.0, ge=10, le=1e8, description="most electrons that a pixel holds")
     read_noise_e_rms: float = Field(13.0, ge=0, le=1e5, description="noise of one readout of a pixel")
@@ -172,6 +196,43 @@ class CameraTable(Table):
             for key, value in THIN_LENS.items():
                 if getattr(self, key) is None:
                     object.__setattr__(self, key, value)
+        return self
+
+    @model_validator(mode="after")
+    def _field(self) -> CameraTable:
+        """Set the field of view: as given, or that of the focal length, or of the lens as it is."""
+        given = self.model_fields_set
+        focal_length_mm = self.focal_length_mm
+        if focal_length_mm is None and (not self.lens or "fov_deg" in given):
+            return self
+        try:
+            if focal_length_mm is None:
+                from ..lens import load_lens, paraxial_properties
+
+                focal_length_mm = paraxial_properties(load_lens(self.lens)).efl_mm
+            pitch_um = self.pixel_pitch_um
+            if self.detector:
+                from ..detector import load_sensor
+
+                pitch_um = load_sensor(self.detector).pixel_pitch_um
+        except InputError as error:
+            raise ValueError(f"{'lens' if focal_length_mm is None else 'detector'}: {error}") from None
+        width_mm = self.width_px * self.binning * pitch_um * 1e-3
+        fov_deg = math.degrees(2 * math.atan(width_mm / 2 / focal_length_mm))
+        key = "lens" if self.focal_length_mm is None else "focal_length_mm"
+        if not 0.01 <= fov_deg <= 140:
+            raise ValueError(
+                f"{key} = {getattr(self, key)!r}: {focal_length_mm:g} mm give {width_mm:g} mm of the detector a "
+                f"field of {fov_deg:.3g} deg; must be from 0.01 to 140 deg"
+            )
+        # a scene of a store has both keys
+        if "fov_deg" in given and not math.isclose(fov_deg, self.fov_deg, rel_tol=1e-9):
+            raise ValueError(
+                f"focal_length_mm = {focal_length_mm:g}: gives a field of {fov_deg:.4g} deg, and fov_deg = "
+                f"{self.fov_deg:g} another; leave one out"
+            )
+        object.__setattr__(self, "fov_deg", fov_deg)
+        object.__setattr__(self, "focal_length_mm", focal_length_mm)
         return self
 
     @model_validator(mode="after")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,8 +16,17 @@ from ..camera import Camera
 from ..core import file_contents, frames, spectra, spice
 from ..core.errors import InputError, under_key
 from ..core.quantities import Radiance, Truth
-from ..detector import Detector, MosaicDetector, Sensor, ThreeColourDetector, load_sensor
-from ..lens import Halo, RealLens, ThinLens, closed_to, coating, load_lens, scaled_to_focal_length
+from ..detector import Detector, MosaicDetector, Sensor, ThreeColourDetector, amplified, binned, load_sensor
+from ..lens import (
+    Halo,
+    RealLens,
+    ThinLens,
+    closed_to,
+    coating,
+    load_lens,
+    paraxial_properties,
+    scaled_to_focal_length,
+)
 from ..reflectance import REFERENCE_NM, BandReflectance, radiance_factor
 from ..render.description import Sunlight, View
 from ..scene import bodies
@@ -366,26 +376,31 @@ def base_camera(scene: Scene, *, architecture: int = 0, readout_direction: int =
         detector: Detector = _detector_of(scene, sensor, individual, direction)
         pitch_um, which = sensor.pixel_pitch_um, sensor.architecture
     else:
-        detector, pitch_um, which = _three_colours(c), c.pixel_pitch_um, c.architectures[architecture]
+        which = c.architectures[architecture]
+        detector = _three_colours(c, which)
+        pitch_um = detector.pixel_pitch_um
     return Camera(
         lens=real_lens(c, pitch_um) if c.lens else _thin_lens(c, pitch_um),
         detector=detector,
         architecture=which,
         readout_direction=direction,
+        gain=c.gain,
     )
 
 
-def _three_colours(c: CameraTable) -> ThreeColourDetector:
-    """Return the three-colour detector of a camera table."""
+def _three_colours(c: CameraTable, architecture: str) -> ThreeColourDetector:
+    """Return the three-colour detector of a camera table; a CCD reads the sum of binned pixels once."""
+    pixels, readouts = c.binning**2, 1 if architecture != "cmos" else c.binning
     return ThreeColourDetector(
         width_px=c.width_px,
         height_px=c.height_px,
-        pixel_pitch_um=c.pixel_pitch_um,
-        full_well_e=c.full_well_e,
-        read_noise_e_rms=c.read_noise_e_rms,
-        dark_current_e_s=c.dark_current_e_s,
+        pixel_pitch_um=c.pixel_pitch_um * c.binning,
+        full_well_e=c.full_well_e * pixels,
+        read_noise_e_rms=c.read_noise_e_rms * readouts,
+        dark_current_e_s=c.dark_current_e_s * pixels,
         adc_bits=c.adc_bits,
         bias_dn=c.bias_dn,
+        gain=c.gain,
         response=c.response,
         quantum_efficiency_peak=c.quantum_efficiency_peak,
     )
@@ -393,9 +408,9 @@ def _three_colours(c: CameraTable) -> ThreeColourDetector:
 
 @file_contents.cached_with_contents(maxsize=4)
 def mosaic_sensor(c: CameraTable) -> Sensor:
-    """Return the sensor that a camera names, at the camera's temperature. Raises InputError."""
+    """Return the sensor that a camera names, with the camera's temperature, binning and gain. Raises InputError."""
     with under_key("camera.detector"):
-        sensor = load_sensor(c.detector)
+        sensor = amplified(binned(load_sensor(c.detector), c.binning), c.gain)
     if c.detector_temperature_K is not None:
         sensor = replace(sensor, temperature_K=c.detector_temperature_K)
     return sensor
@@ -458,7 +473,7 @@ def _halo(table: PointSpreadTable | None) -> Halo | None:
 
 @file_contents.cached_with_contents(maxsize=4)
 def real_lens(c: CameraTable, pixel_pitch_um: float) -> RealLens:
-    """Return the prescription that a camera names, scaled to its field of view and stopped down to its f-number.
+    """Return the prescription that a camera names, scaled to its focal length and stopped down to its f-number.
 
     Raises InputError for a file that is not a lens, and for an f-number that the lens does not reach.
     """
@@ -470,7 +485,8 @@ def real_lens(c: CameraTable, pixel_pitch_um: float) -> RealLens:
             raise InputError(f"camera.lens_coating = {c.lens_coating!r}: must be one of {known}")
         prescription = prescription.coated(c.lens_coating)
     focal_length_mm = cameras.focal_length_mm(c.fov_deg, c.width_px, pixel_pitch_um)
-    prescription = scaled_to_focal_length(prescription, focal_length_mm)
+    if not math.isclose(focal_length_mm, paraxial_properties(prescription).efl_mm, rel_tol=1e-9):
+        prescription = scaled_to_focal_length(prescription, focal_length_mm)
     if c.f_number is not None:
         prescription = closed_to(prescription, c.f_number, "camera.f_number")
     return RealLens(
@@ -493,6 +509,18 @@ def dark_corners(scene: Scene) -> str:
         f"camera.fov_deg = {scene.camera.fov_deg:g}: {lens.name} passes light up to {field.field_deg:.1f} deg from "
         f"the axis, but the frame's corners lie at {field.corner_deg:.1f} deg, so {1 - field.lit_fraction:.1%} of "
         "the frame is dark; lower fov_deg or choose a wider camera.lens"
+    )
+
+
+def scaled_lens(scene: Scene) -> str:
+    """Return one sentence if the scene's field of view scales its lens by more than 1 %, or ""."""
+    lens = base_camera(scene).lens.real
+    if lens is None or abs(lens.prescription.scale - 1) < 0.01:
+        return ""
+    return (
+        f"camera.fov_deg = {scene.camera.fov_deg:.4g}: scales {lens.name} by {lens.prescription.scale:.3g} to "
+        f"f = {lens.focal_length_mm:.4g} mm; its coatings, roughness and particles keep their size; without "
+        "fov_deg and focal_length_mm the lens stays as it is"
     )
 
 
