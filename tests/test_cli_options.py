@@ -74,7 +74,7 @@ def test_the_flares_options_have_the_limits_of_the_library() -> None:
     found = {option.name: limits(option) for option in flare if limits(option)}
     for name, low, high in RANGES:
         assert found.pop(name) == (low, high), name
-    assert set(found) == {"wavelength_nm", "focal_length_mm", "reflections"}
+    assert set(found) == {"wavelength_nm", "focal_length_mm", "sensor_width_mm", "reflections"}
 
 
 def test_a_number_that_is_none_is_refused_in_a_sentence_with_the_limits() -> None:

@@ -11,9 +11,11 @@ import typer
 from .app import app
 from .options import (
     MOST_SEED,
+    FieldOption,
     FocalLengthOption,
     LensArgument,
     PluginOption,
+    SensorWidthOption,
     check_image_path,
     check_written,
     grouped,
@@ -50,18 +52,8 @@ class LensOptions:
         ),
     ] = 0.03
     focal_length_mm: FocalLengthOption = None
-    fov_deg: Annotated[
-        float | None,
-        number(
-            0.01,
-            140,
-            "Field of view in degrees across --sensor-width-mm to which the lens is scaled.",
-            unset="as prescribed",
-        ),
-    ] = None
-    sensor_width_mm: Annotated[
-        float | None, number(1e-3, 1e4, "Width of the sensor in mm that --fov-deg spans.", unset="none")
-    ] = None
+    fov_deg: FieldOption = None
+    sensor_width_mm: SensorWidthOption = None
     f_number: Annotated[
         float | None, number(0.1, 200, "F-number to which the stop is closed.", unset="as prescribed")
     ] = None
@@ -91,7 +83,8 @@ def lens(
 
     path = Path(f"{Path(lens).stem}.png") if out is None else out
     check_written(lens, {"--json": json_, "--toml": toml, "--out": path})
-    prescription = adapted_lens(LensRequest(lens=lens, **vars(options)))
+    request = LensRequest(lens=lens, **vars(options))
+    prescription = adapted_lens(request)
     check_image_path(path, ".png")
     source = f", {prescription.source}" if prescription.source else ""
     typer.echo(f"{prescription.name}: {len(prescription.surfaces)} surfaces{source}")
@@ -106,7 +99,7 @@ def lens(
             write_lens(prescription, toml)
         typer.echo(str(toml))
     with writing(path):
-        lens_sheet.draw(prescription, path)
+        lens_sheet.draw(prescription, path, half_field_deg=request.field_deg(prescription, 40.0) / 2)
     typer.echo(str(path))
 
 
@@ -119,7 +112,6 @@ class FlareOptions:
         float, number(-360, 360, "Direction of the Sun in the image in degrees: 0 is to the right, 90 is down.")
     ] = 0.0
     model: Annotated[str, typer.Option(help="Model of the ghosts: traced, paraxial or texture.")] = "traced"
-    fov_deg: Annotated[float, number(0.1, 140, "Field of view across the width of the image in degrees.")] = 65.0
     pixels: Annotated[int, whole(16, 4096, "Width and height of the image in pixels.")] = 1024
     sun_distance_au: Annotated[
         float, number(0.01, 1000, "Distance of the Sun in au; it sets the size of the Sun's disc.")
@@ -157,6 +149,8 @@ def flare(
         ),
     ] = None,
     focal_length_mm: FocalLengthOption = None,
+    fov_deg: FieldOption = None,
+    sensor_width_mm: SensorWidthOption = None,
     white: Annotated[
         float | None,
         number(
@@ -178,8 +172,17 @@ def flare(
     from ..lens.adapt import LensRequest, adapted_lens
     from ..output import flare_images
 
+    named = LensRequest(
+        lens=lens,
+        coating=coating,
+        focal_length_mm=focal_length_mm,
+        fov_deg=fov_deg,
+        sensor_width_mm=sensor_width_mm,
+    )
+    prescription = adapted_lens(named)
     request = flare_images.FlareRequest(
-        lens=adapted_lens(LensRequest(lens=lens, coating=coating, focal_length_mm=focal_length_mm)),
+        lens=prescription,
+        fov_deg=named.field_deg(prescription, 65.0),
         wavelength_nm=flare_images.wavelengths_nm(wavelength_nm),
         white=white,
         **vars(options),

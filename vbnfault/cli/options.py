@@ -108,6 +108,17 @@ def whole(low: int, high: int, text: str, *, unset: str | None = None) -> Any:
 FocalLengthOption = Annotated[
     float | None, number(0.01, 1e5, "Focal length in mm to which the lens is scaled.", unset="as prescribed")
 ]
+FieldOption = Annotated[
+    float | None,
+    number(
+        0.1,
+        140,
+        "Field of view in degrees across the width of the image; with --sensor-width-mm, the lens is scaled so "
+        "that the sensor spans it.",
+        unset="of the sensor, or else 40 for lens and 65 for flare",
+    ),
+]
+SensorWidthOption = Annotated[float | None, number(1e-3, 1e4, "Width of the sensor in mm.", unset="none")]
 
 
 def grouped(command: Callable[..., None]) -> Callable[..., None]:
@@ -155,9 +166,6 @@ class SceneValues:
         int | None,
         whole(0, MOST_SEED, "Seed of all random numbers.", unset="the scene's"),
     ] = None
-    scale: Annotated[
-        float, number(0.01, 1, "Factor on the image's width and height, for a preview with the same field of view.")
-    ] = 1.0
     settings: Annotated[
         list[str] | None,
         replaced("scene", "body.shape=comet.obj"),
@@ -167,15 +175,11 @@ class SceneValues:
         """Return the scene with these values."""
         from ..scene import config
 
-        named = {key: value for key, value in self._named().items() if value is not None}
-        values = overrides(self.settings) | named
-        loaded = config.load_scene(scene, values)
-        if self.scale == 1:
-            return loaded
-        camera = loaded.camera
-        width_px, height_px = (max(16, round(self.scale * n)) for n in (camera.width_px, camera.height_px))
-        values |= {"camera.width_px": width_px, "camera.height_px": height_px}
-        return config.load_scene(scene, values | {"camera.fov_deg": camera.fov_deg, "camera.focal_length_mm": None})
+        return config.load_scene(scene, self._values())
+
+    def _values(self) -> dict[str, Any]:
+        """Return the values of all options, by key of the scene."""
+        return overrides(self.settings) | {key: value for key, value in self._named().items() if value is not None}
 
     def _named(self) -> dict[str, int | None]:
         """Return the values that have options of their own, by key of the scene."""
@@ -190,6 +194,21 @@ class SceneOptions(SceneValues):
         int | None,
         whole(1, MOST_SAMPLES, "Number of samples to plan.", unset="the scene's"),
     ] = None
+    scale: Annotated[
+        float, number(0.01, 1, "Factor on the image's width and height, for a preview with the same field of view.")
+    ] = 1.0
+
+    def load(self, scene: str) -> Scene:
+        """Return the scene with these values; a scaled one has fewer pixels over the same field of view."""
+        from ..scene import config
+
+        loaded = super().load(scene)
+        if self.scale == 1:
+            return loaded
+        camera = loaded.camera
+        size = {f"camera.{k}": max(16, round(self.scale * getattr(camera, k))) for k in ("width_px", "height_px")}
+        field = {"camera.fov_deg": camera.fov_deg, "camera.focal_length_mm": None}
+        return config.load_scene(scene, self._values() | size | field)
 
     def _named(self) -> dict[str, int | None]:
         """Return the values that have options of their own, by key of the scene."""

@@ -10,7 +10,7 @@ import numpy as np
 from ..core.errors import InputError
 from .aperture import closed_to
 from .family import relative
-from .paraxial import scaled_to_field, scaled_to_focal_length
+from .paraxial import paraxial_properties, scaled_to_field, scaled_to_focal_length
 from .prescription import Prescription
 from .prescription_file import load_lens
 
@@ -30,7 +30,7 @@ class LensRequest:
     focal_length_mm
         Scale the lens to this focal length.
     fov_deg, sensor_width_mm
-        Scale the lens so that this width of the sensor spans this field of view. Both or none.
+        Scale the lens so that this width of the sensor spans this field of view; one alone scales nothing.
     coating
         Put this coating on every surface between glass and air: none, mgf2, v or bbar.
     f_number
@@ -47,14 +47,19 @@ class LensRequest:
     f_number: float | None = None
 
     def __post_init__(self) -> None:
-        for key, other in (("fov_deg", "sensor_width_mm"), ("sensor_width_mm", "fov_deg")):
-            value = getattr(self, key)
-            if value is not None and getattr(self, other) is None:
-                raise InputError(f"{key} = {value:g}: needs {other} beside it")
-        if self.focal_length_mm is not None and self.fov_deg is not None:
+        if None not in (self.focal_length_mm, self.fov_deg, self.sensor_width_mm):
             raise InputError(
-                f"focal_length_mm = {self.focal_length_mm:g}: contradicts fov_deg = {self.fov_deg:g}; leave one out"
+                f"focal_length_mm = {self.focal_length_mm:g}: contradicts fov_deg = {self.fov_deg:g} and "
+                f"sensor_width_mm = {self.sensor_width_mm:g}; leave one out"
             )
+
+    def field_deg(self, lens: Prescription, default_deg: float) -> float:
+        """Return the field of view in degrees: as given, or that of the sensor's width, or else the default."""
+        if self.fov_deg is not None:
+            return self.fov_deg
+        if self.sensor_width_mm is None:
+            return default_deg
+        return float(2 * np.degrees(np.arctan(self.sensor_width_mm / 2 / paraxial_properties(lens).efl_mm)))
 
 
 def adapted_lens(request: LensRequest) -> Prescription:
