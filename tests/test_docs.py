@@ -255,7 +255,8 @@ def test_figures_are_small() -> None:
 
 # Numbers without a unit: counts, fractions, ratios, exponents, and coefficients of formulas.
 _DIMENSIONLESS = """
-    adc_bits angularity antiblooming apron asymmetry axis bands binning bits blade_rounding blades boulder_index bounces
+    adc_bits angularity antiblooming apron asymmetry axis bands binning bits blade_rounding blades boulder_index
+    bounces
     camera_axes classes_per_sample coefficients coherent_amplitude coherent_width conic dark_nonuniformity
     dead_share default_material distance_exponent dsnu_freedom dust_contrast eccentricity exposure_stops f_number
     faulty_fraction fill_power gain grain_albedo halo_index hot_clustered_share hot_offset_share hurst individuals
