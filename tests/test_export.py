@@ -114,6 +114,7 @@ def test_the_card_says_what_a_user_must_know(name: str, exported: Any, data: st.
     assert classes == list(data.spec.faults)
 
 
+@pytest.mark.filterwarnings("ignore:The inplace keyword:DeprecationWarning")  # mlcroissant and pandas
 @pytest.mark.parametrize("name", NAMES)
 def test_mlcroissant_accepts_the_description_and_reads_the_samples(
     name: str, exported: Any, data: st.Store, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
@@ -125,6 +126,11 @@ def test_mlcroissant_accepts_the_description_and_reads_the_samples(
     rows = list(described.records("samples"))
     splits = split_of(data)
     assert {r["samples/sample"]: r["samples/split"].decode() for r in rows} == dict(enumerate(splits))
+    if name not in ("exr", "webdataset"):  # which a reader of Croissant cannot open
+        images = {r["images/sample"]: np.asarray(r["images/image"]) for r in described.records("images")}
+        assert images.keys() == set(range(data.samples))
+        for k, image in images.items():
+            assert np.array_equal(image, data.read_sample(k, ["image"]).layers["image"][..., :3])
     faults = [row["fault_classes/name"] for row in described.records("fault_classes")]
     assert faults == list(data.spec.faults)
 

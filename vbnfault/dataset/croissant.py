@@ -142,6 +142,31 @@ def columns(name: str, description: str, file: str, rows: Mapping[str, tuple[str
     return {"@type": "cr:RecordSet", "@id": name, "name": name, "description": description, "field": fields}
 
 
+def image_records(files: str, image: Mapping[str, Any], sample: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a set of records that are the images of a file set, each with the index of its sample.
+
+    `files`: the `@id` of the file set. `image`, `sample`: how a reader finds both in a file (`extract`, `transform`).
+    """
+    fields = {"sample": ("sc:Integer", sample), "image": ("sc:ImageObject", image)}
+    return {
+        "@type": "cr:RecordSet",
+        "@id": "images",
+        "name": "images",
+        "description": "R, G, B of the image of each sample, 8 bits a channel",
+        "field": [
+            {
+                "@type": "cr:Field",
+                "@id": f"images/{name}",
+                "name": name,
+                "description": "index of the sample in the store" if name == "sample" else "the image",
+                "dataType": kind,
+                "source": {"fileSet": {"@id": files}, **taken},
+            }
+            for name, (kind, taken) in fields.items()
+        ],
+    }
+
+
 def _type_of(value: Any) -> str:
     """Return Croissant's type of a value."""
     return _WHOLE if type(value) is int else _NUMBER if type(value) is float else _TEXT

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple
 
@@ -82,6 +82,12 @@ class Format(ABC):
     usage: ClassVar[Sequence[str]] = ()  # lines of Markdown for the card: the files, and how to read them
     media_type: ClassVar[str] = "image/png"  # of the files in which the images are
     pattern: ClassVar[str] = "**/*.png"  # which matches the names of these files
+    # how a reader of Croissant finds the image, and the index of its sample, in these files; none: it cannot
+    croissant_image: ClassVar[Mapping[str, Any]] = {"extract": {"fileProperty": "content"}}
+    croissant_sample: ClassVar[Mapping[str, Any]] = {
+        "extract": {"fileProperty": "filename"},
+        "transform": {"regex": r"^0*(\d+)\D"},
+    }
     part_samples: ClassVar[int] = 16
     part_bytes: ClassVar[int | None] = None  # if given, a part has about this size instead
 

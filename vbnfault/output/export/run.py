@@ -21,7 +21,7 @@ from ...core.path_checks import path_of
 from ...core.quantities import Sample
 from ...core.tables import did_you_mean
 from ...dataset.card import to_json
-from ...dataset.croissant import columns, croissant
+from ...dataset.croissant import columns, croissant, image_records
 from ...dataset.lock import locked
 from ...dataset.progress import Progress
 from ...dataset.statistics import Statistics, statistics
@@ -327,13 +327,15 @@ def _croissant(store: Store, kind: Format, sha256: str, numbers: Statistics, mas
         },
         {
             "@type": "cr:FileSet",
-            "@id": "images",
-            "name": "images",
+            "@id": "files",
+            "name": "files",
             "description": kind.summary,
             "encodingFormat": kind.media_type,
             "includes": kind.pattern,
         },
     ]
     records = [columns("samples", f"The {numbers.finished} samples", SAMPLES, _COLUMNS)]
+    if kind.croissant_image:
+        records.append(image_records("files", kind.croissant_image, kind.croissant_sample))
     rules = [EFFECT_RULE] * len(store.spec.faults) if masks == "effect" else None
     return croissant(store, files, records, rules)

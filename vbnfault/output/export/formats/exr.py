@@ -25,6 +25,7 @@ class Exr(Format):
     name = "exr"
     summary = "OpenEXR: one file of named channels for each sample, with image, radiance, depth, normals and masks."
     media_type = "image/x-exr"
+    croissant_image: ClassVar = {}  # a reader decodes no OpenEXR
     pattern = "*/*.exr"
     usage: ClassVar = (
         "A file is `SPLIT/NUMBER.exr`; the number is the index of the sample in the store. Its channels, in "

@@ -27,6 +27,8 @@ class HuggingFace(Format):
     summary = "Hugging Face: Parquet files with images, masks, labels and pose as typed columns."
     media_type = "application/x-parquet"
     pattern = "data/*.parquet"
+    croissant_image: ClassVar = {"extract": {"column": "image"}, "transform": {"jsonPath": "bytes"}}
+    croissant_sample: ClassVar = {"extract": {"column": "sample"}}
     part_bytes = 2**28
     usage: ClassVar = (
         '- `data/SPLIT-*.parquet`: `datasets.load_dataset("PATH_OF_THIS_FOLDER")` gives all splits; '

@@ -28,6 +28,7 @@ class WebDataset(Format):
     summary = "WebDataset: tar files of PNG images and masks, NumPy arrays and JSON, each of one split."
     media_type = "application/x-tar"
     pattern = "*.tar"
+    croissant_image: ClassVar = {}  # a reader unpacks no set of archives
     part_bytes = 2**28
     usage: ClassVar = (
         "- `SPLIT-NUMBER.tar`: read them with `webdataset.WebDataset`. The key of a sample is its "
