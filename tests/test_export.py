@@ -25,7 +25,7 @@ from vbnfault.core.errors import InputError, VbnfaultError
 from vbnfault.output.export import Entry, Format, export_store, formats
 from vbnfault.output.export.folder import Folder
 from vbnfault.output.export.formats import coco
-from vbnfault.output.export.regions import coco_text, polygon, regions, whole
+from vbnfault.output.export.regions import coco_text, flare_discs, polygon, regions, whole
 from vbnfault.store import disk
 
 NAMES = ("coco", "exr", "huggingface", "png", "webdataset", "yolo")
@@ -291,6 +291,52 @@ def test_regions_come_in_the_order_of_their_first_pixel_down_the_columns() -> No
     mask = np.zeros((5, 7), bool)
     mask[0, 5] = mask[3, 1] = True
     assert [region.box for region in regions(mask)] == [(1, 3, 1, 1), (5, 0, 1, 1)]
+
+
+def test_a_flare_in_pieces_is_one_instance() -> None:
+    """Two flares at 0.5 and 2 of the way from the Sun through the centre, a glare on the Sun; all in crumbs."""
+    sun, shape = np.array([20.0, 50.0]), (100, 200)
+    params = {
+        "flares": [{"position": 0.5, "radius": 0.06}, {"position": 2.0, "radius": 0.1}],
+        "glare": {"radius": 0.05},
+    }
+    discs = flare_discs(params, sun, shape)
+    assert discs.tolist() == [[60, 50, 12], [180, 50, 20], [20, 50, 10]]
+    y, x = np.mgrid[:100, :200] + 0.5
+    near = [np.hypot(x - cx, y - cy) < r for cx, cy, r in discs]
+    crumbs = (np.arange(100)[:, None] + np.arange(200)) % 3 == 0
+    found = regions((near[0] | near[1] | near[2]) & crumbs, discs)
+    assert len(regions(near[0] & crumbs)) > 10
+    assert [region.area for region in found] == [int((near[k] & crumbs).sum()) for k in (2, 0, 1)]
+    assert flare_discs(params, np.array([np.nan, np.nan]), shape).shape == (0, 3)
+    assert flare_discs({}, sun, shape).shape == (0, 3)
+
+
+@pytest.mark.parametrize("name", ["coco", "yolo"])
+def test_small_instances_are_left_out(name: str, described_store: Path, data: st.Store, tmp_path: Path) -> None:
+    export_store(described_store, tmp_path / "e", name, min_area_px=12, progress=False)
+    localised = [k for k, f in enumerate(data.spec.faults) if f in (data.spec.localised_faults or ())]
+    masks = [data.read_sample(i).layers["mask"] for i in range(data.samples)]
+    areas = [region.area for mask in masks for k in localised for region in regions(mask[k])]
+    kept = sum(area >= 12 for area in areas)
+    assert 0 < kept < len(areas)
+    if name == "yolo":
+        lines = [path.read_text().splitlines() for path in (tmp_path / "e/labels").rglob("*.txt")]
+        assert sum(map(len, lines)) == kept
+    else:
+        notes = [json.loads(path.read_text()) for path in (tmp_path / "e/annotations").glob("*.json")]
+        of_localised = [a for n in notes for a in n["annotations"] if a["category_id"] - 1 in localised]
+        assert sum(not a["iscrowd"] for a in of_localised) == kept
+    with pytest.raises(InputError, match="holds another export: min_area_px is 12 there and 1 now"):
+        export_store(described_store, tmp_path / "e", name, progress=False)
+
+
+def test_a_least_area_is_for_instances_only(described_store: Path, tmp_path: Path) -> None:
+    command = ["export", str(described_store), "--format", "png", "--out", str(tmp_path / "e"), "--min-area", "4"]
+    refused = CliRunner().invoke(cli.app, command)
+    assert "--min-area 4: must be a whole number from 1; png has no instances, so it must be 1" in str(
+        refused.exception
+    )
 
 
 @pytest.mark.parametrize("content", [b"1", b"123"])

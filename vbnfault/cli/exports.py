@@ -26,12 +26,13 @@ def export(
         str,
         typer.Option(metavar="RULE", help="Which mask the files hold: footprint or effect; exr and png hold both."),
     ] = "footprint",
+    min_area: Annotated[int, whole(1, 10_000_000, "Fewest pixels of an instance that coco and yolo write.")] = 1,
     workers: Annotated[int, whole(1, 64, "Number of threads; the files do not depend on it.")] = 2,
 ) -> None:
     """Write a finished store in the format of other tools, with its splits, classes and a card."""
     from ..output.export import export_store
 
-    for line in export_store(store, out, format, masks=masks, workers=workers).lines():
+    for line in export_store(store, out, format, masks=masks, min_area_px=min_area, workers=workers).lines():
         typer.echo(line)
 
 

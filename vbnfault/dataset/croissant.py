@@ -145,7 +145,8 @@ def columns(name: str, description: str, file: str, rows: Mapping[str, tuple[str
 def image_records(files: str, image: Mapping[str, Any], sample: Mapping[str, Any]) -> dict[str, Any]:
     """Return a set of records that are the images of a file set, each with the index of its sample.
 
-    `files`: the `@id` of the file set. `image`, `sample`: how a reader finds both in a file (`extract`, `transform`).
+    `files`: the `@id` of the file set. `image`, `sample`: how a reader finds both in a file (`extract`,
+    `transform`).
     """
     fields = {"sample": ("sc:Integer", sample), "image": ("sc:ImageObject", image)}
     return {

@@ -12,11 +12,13 @@ from numpy.typing import NDArray
 
 from ..core.errors import InputError
 from ..core.images import write_exr, write_png
-from ..core.quantities import Sample
+from ..core.quantities import Sample, soft_kind
 from ..pipeline import masks
+from ..pipeline.labels import strength
 from ..pipeline.record import to_sample
 from ..pipeline.spec import Frame
 from . import contact_sheet
+from .export.regions import flare_discs
 from .json_files import write_json
 
 _MARKED_GHOSTS = 10
@@ -26,19 +28,28 @@ def write_frame(frame: Frame, folder: Path) -> list[Path]:
     """Write one simulated frame to `folder` (made if missing) and return the paths of the files.
 
     - `sample.exr`: `radiance.<wavelength>nm` (W m⁻² sr⁻¹ nm⁻¹), `depth.Z` (m), `normal.X/Y/Z` (C frame),
-      `semantic`, and the soft layers of the scene.
+      `semantic`, and how strongly each drawn fault acts (`straylight_added`, …).
     - `image.png`, `clean.png`, `without_<fault>.png`: RGB. The intensity channel of each is in
       `<name>_intensity.png`.
     - `mask_<fault>.png`, `mask_effect_<fault>.png`, `mask_any.png`.
+    - `straylight_added.png`, `vignetting_factor.png`, `dust_opacity.png`: how strongly a drawn fault acts on each
+      pixel, 255 for white or for 1; the numbers are in the EXR.
     - `annotated_<fault>.png`: the image with one class marked, see `annotated`.
     - `parameters.json`: every scalar of the dataset, null where it is not a finite number.
 
     Raises InputError if a file cannot be written.
     """
     sample = to_sample(frame)
+    drawn = [frame.spec.faults[name] for name in frame.drawn if frame.spec.faults[name].soft_layer]
+    strengths = {fault.soft_layer: strength(fault, frame.injection) for fault in drawn}
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        files = [_write_exr(frame, sample, folder / "sample.exr")]
+        files = [_write_exr(frame, strengths, folder / "sample.exr")]
+        for name, values in strengths.items():
+            white = 255 if soft_kind(name).units == "1" else 1
+            files.append(
+                write_png(folder / f"{name}.png", np.clip(np.rint(values * white), 0, 255).astype(np.uint8))
+            )
         for name, layer in sample.layers.items():
             if layer.ndim == 3 and layer.shape[-1] == 4:
                 files.append(write_png(folder / f"{name}.png", layer[..., :3]))
@@ -96,14 +107,12 @@ def _marks(
     """
     if sun is None:
         return []
-    centre = np.array([width / 2, height / 2])
-    marks = [
-        (str(flare["index"]), sun + flare["position"] * (centre - sun), flare["radius"] * width)
-        for flare in params.get("flares", ())
-    ]
+    discs = flare_discs(params, sun, (height, width))
+    named = zip((str(flare["index"]) for flare in params.get("flares", ())), discs, strict=False)  # not the glare
+    marks = [(name, disc[:2], float(disc[2])) for name, disc in named]
     for ghost in params.get("ghosts", ())[:_MARKED_GHOSTS]:
         position = np.array([ghost["x_px"], ghost["y_px"]])
-        if np.abs(position - centre).max() < width and ghost["rms_radius_px"] < width:
+        if np.abs(position - np.array([width, height]) / 2).max() < width and ghost["rms_radius_px"] < width:
             marks.append(("-".join(map(str, ghost["pair"])), position, np.sqrt(2) * ghost["rms_radius_px"]))
     return marks
 
@@ -114,8 +123,8 @@ def _scalars(sample: Sample) -> dict[str, Any]:
     return {"sample": sample.index, **flat}
 
 
-def _write_exr(frame: Frame, sample: Sample, path: Path) -> Path:
-    """Write radiance, truth and soft layers to one EXR file and return its path."""
+def _write_exr(frame: Frame, strengths: Mapping[str, NDArray[Any]], path: Path) -> Path:
+    """Write radiance, truth and the strengths of faults to one EXR file and return its path."""
     truth, radiance = frame.rendering.truth, frame.exposure.light.on_image
     channels: dict[str, NDArray[Any]] = {
         f"radiance.{wavelength:.1f}nm": np.ascontiguousarray(band)
@@ -125,6 +134,4 @@ def _write_exr(frame: Frame, sample: Sample, path: Path) -> Path:
     normal = truth.normal.astype(np.float32)
     channels |= {f"normal.{axis}": np.ascontiguousarray(normal[..., k]) for k, axis in enumerate("XYZ")}
     channels["semantic"] = truth.semantic.astype(np.uint32)
-    soft = [fault.soft_layer for fault in frame.spec.faults.values()]
-    channels |= {name: sample.layers[name] for name in soft if name in sample.layers}
-    return write_exr(path, channels)
+    return write_exr(path, {**channels, **strengths})

@@ -27,11 +27,11 @@ def label(spec: SampleSpec, injection: Injection) -> Labels:
     return Labels(
         masks=masks.mask_layers(spec.faults, params, development.context, changed),
         effects={name: development.effect(draws, name) for name in draws} if "mask_effect" in layers else {},
-        strengths={layer: _strength(soft[layer], injection) for layer in layers if layer in soft},
+        strengths={layer: strength(soft[layer], injection) for layer in layers if layer in soft},
     )
 
 
-def _strength(fault: Fault, injection: Injection) -> NDArray[Any]:
+def strength(fault: Fault, injection: Injection) -> NDArray[Any]:
     """Return how strongly a fault acts on each pixel, [y, x], in the data type of its soft layer."""
     kind, development = soft_kind(fault.soft_layer), injection.development
     draw = injection.draws.get(fault.fault)

@@ -23,7 +23,8 @@ _registry: Registry[type[Format]]
 class ExportPart(NamedTuple):
     """Name a part of an export, which is written and resumed as a whole: some samples of one split.
 
-    `number` counts the parts of the export. `of_split` and `parts_of_split` count those of the split.
+    `number` counts the parts of the export. `of_split` and `parts_of_split` count those of the split. Instances of
+    fewer than `min_area_px` pixels are left out.
     """
 
     number: int
@@ -31,6 +32,7 @@ class ExportPart(NamedTuple):
     samples: tuple[int, ...]
     of_split: int
     parts_of_split: int
+    min_area_px: int = 1
 
 
 class Entry(NamedTuple):
@@ -82,6 +84,7 @@ class Format(ABC):
     usage: ClassVar[Sequence[str]] = ()  # lines of Markdown for the card: the files, and how to read them
     media_type: ClassVar[str] = "image/png"  # of the files in which the images are
     pattern: ClassVar[str] = "**/*.png"  # which matches the names of these files
+    has_instances: ClassVar[bool] = False  # whether masks become instances, of which small ones may be left out
     # how a reader of Croissant finds the image, and the index of its sample, in these files; none: it cannot
     croissant_image: ClassVar[Mapping[str, Any]] = {"extract": {"fileProperty": "content"}}
     croissant_sample: ClassVar[Mapping[str, Any]] = {

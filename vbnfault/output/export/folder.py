@@ -23,7 +23,7 @@ from ...store import disk
 STATE = "export.json"
 _PARTS = ".parts"
 _OWN = re.compile(rf"{re.escape(STATE)}\.[0-9a-f]{{32}}{re.escape(disk.PARTIAL)}")
-_UNSAID = {"masks": "footprint"}  # what holds where `export.json` does not name a key
+_UNSAID = {"masks": "footprint", "min_area_px": 1}  # what holds where `export.json` does not name a key
 _FILES_AT_ONCE = 8  # files that are open and in memory at once, in each thread
 
 

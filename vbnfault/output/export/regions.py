@@ -2,11 +2,33 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from ...core.quantities import Sample
+from ...store import StoreSpec
+
+
+def flare_discs(
+    params: Mapping[str, Any], sun_xy_px: NDArray[np.float64], shape: tuple[int, int]
+) -> NDArray[np.float64]:
+    """Return x, y and radius in pixels of the flares and the glare that a fault's parameters list, float64[n, 3].
+
+    The flares lie on the line from the Sun through the image's centre. `shape` is (height, width). Parameters
+    without them, or a Sun that is not in front of the camera, have none.
+    """
+    sun, middle = np.asarray(sun_xy_px, dtype=np.float64), np.array([shape[1], shape[0]]) / 2
+    if not np.all(np.isfinite(sun)):
+        return np.zeros((0, 3))
+    lights = [(flare["position"], flare["radius"]) for flare in params.get("flares", ())]
+    lights += [(0.0, glare["radius"]) for glare in [params.get("glare")] if glare]
+    return np.array([[*(sun + p * (middle - sun)), r * shape[1]] for p, r in lights]).reshape(-1, 3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,33 +53,58 @@ class Region:
     inside: NDArray[np.bool_]
 
 
-def regions(mask: NDArray[np.bool_]) -> list[Region]:
+def regions(mask: NDArray[np.bool_], discs: NDArray[np.float64] | None = None) -> list[Region]:
     """Return the regions of a mask, bool[y, x], in the order of their first pixel down the columns.
 
-    Pixels that touch at a side or a corner are connected.
+    Pixels that touch at a side or a corner are connected. With `discs`, float64[n, 3] of centre and radius in
+    pixels, a region is instead all pixels that are nearest to one disc, by their distance from its centre over its
+    radius.
     """
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
-    down = np.asarray(labels).T.ravel()  # down the columns, as COCO counts
+    if discs is None or not len(discs):
+        labels = np.asarray(cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)[1])
+    else:
+        y, x = np.nonzero(mask)
+        distance = np.hypot(x[:, None] + 0.5 - discs[:, 0], y[:, None] + 0.5 - discs[:, 1]) / discs[:, 2]
+        labels = np.zeros(mask.shape, dtype=np.int32)
+        labels[y, x] = 1 + np.argmin(distance, axis=1)
+    down = labels.T.ravel()  # down the columns, as COCO counts
     pixels = np.flatnonzero(down)
-    by_label = np.argsort(down[pixels], kind="stable")
-    if count < 2:
-        return []
-    ends = np.cumsum(np.bincount(down[pixels], minlength=count)[1:])[:-1]
-    found = []
-    for label, indices in enumerate(np.split(pixels[by_label], ends), start=1):
-        x, y, w, h, area = (int(v) for v in stats[label])
-        inside = np.asarray(labels[y : y + h, x : x + w] == label)
-        found.append((int(indices[0]), Region(area, (x, y, w, h), _run_lengths(indices, mask.size), inside)))
-    return [region for _, region in sorted(found, key=lambda pair: pair[0])]
+    by_label = pixels[np.argsort(down[pixels], kind="stable")]
+    groups = np.split(by_label, 1 + np.flatnonzero(np.diff(down[by_label]))) if len(pixels) else []
+    return [_region(group, mask.shape) for group in sorted(groups, key=lambda group: int(group[0]))]
+
+
+def instances(
+    spec: StoreSpec, sample: Sample, min_area_px: int, *, whole_frame: bool = False
+) -> Iterator[list[Region]]:
+    """Yield the instances of each class of a sample of at least `min_area_px` pixels.
+
+    With `whole_frame`, a class that is not localised has one of its whole mask; without, it has none.
+    """
+    parameters = json.loads(sample.scalars["parameters"] or "{}")
+    for fault, mask in zip(spec.faults, sample.layers["mask"], strict=True):
+        found: list[Region] = []
+        if fault in (spec.localised_faults or ()):
+            params = parameters.get(fault) or {}
+            found = regions(mask, flare_discs(params, sample.scalars["sun_xy_px"], (spec.height, spec.width)))
+        elif whole_frame and mask.any():
+            found = [whole(mask)]
+        yield [region for region in found if region.area >= min_area_px]
 
 
 def whole(mask: NDArray[np.bool_]) -> Region:
     """Return all pixels of a mask as one region, connected or not; the mask must not be empty."""
-    y, x = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    box = (int(x[0]), int(y[0]), int(np.ptp(x)) + 1, int(np.ptp(y)) + 1)
-    inside = mask[y[0] : y[-1] + 1, x[0] : x[-1] + 1]
-    counts = _run_lengths(np.flatnonzero(mask.T.ravel()), mask.size)
-    return Region(int(mask.sum()), box, counts, inside)
+    return _region(np.flatnonzero(mask.T.ravel()), mask.shape)
+
+
+def _region(indices: NDArray[np.int64], shape: tuple[int, ...]) -> Region:
+    """Return the region of some pixels, whose sorted indices count down the columns of an image of a shape."""
+    x, y = np.divmod(indices, shape[0])
+    left, top = int(x[0]), int(y.min())
+    inside = np.zeros((int(y.max()) - top + 1, int(x[-1]) - left + 1), dtype=bool)
+    inside[y - top, x - left] = True
+    counts = _run_lengths(indices, shape[0] * shape[1])
+    return Region(len(indices), (left, top, inside.shape[1], inside.shape[0]), counts, inside)
 
 
 def _run_lengths(indices: NDArray[np.int64], size: int) -> NDArray[np.int64]:

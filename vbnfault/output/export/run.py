@@ -59,6 +59,7 @@ def export_store(
     format: str,
     *,
     masks: str = "footprint",
+    min_area_px: int = 1,
     workers: int = 1,
     progress: bool = True,
 ) -> ExportSummary:
@@ -76,6 +77,8 @@ def export_store(
         Name of a format: coco, exr, huggingface, png, webdataset, yolo, or one of a plug-in.
     masks
         "footprint" or "effect": which mask the files hold. The formats exr and png hold both, each by its name.
+    min_area_px
+        Instances of fewer pixels are left out of the formats coco and yolo; 1 keeps all.
     workers
         Number of threads, 1 to 64. Each holds one sample in memory.
     progress
@@ -98,15 +101,21 @@ def export_store(
     _check_finished(store)
     kind = known[format]()
     _check_masks(store, kind, masks)
+    if type(min_area_px) is not int or min_area_px < 1 or (min_area_px > 1 and not kind.has_instances):
+        raise InputError(
+            f"--min-area {shown(min_area_px)}: must be a whole number from 1; {format} "
+            + ("leaves out smaller instances" if kind.has_instances else "has no instances, so it must be 1")
+        )
     identity = {
         "format": format,
         "vbnfault": __version__,
         "samples": store.samples,
         "masks": masks,
+        "min_area_px": min_area_px,
         "contents_sha256": _contents_sha256(store),
     }
     with locked(target), disk.explained(target, "writing the export"):
-        folder, parts = Folder(target), _parts(store, kind.samples_of_part(store.spec))
+        folder, parts = Folder(target), _parts(store, kind.samples_of_part(store.spec), min_area_px)
         if folder.begin(identity):
             folder.clear()
             return ExportSummary(path=target, format=format, samples=store.samples, written=0)
@@ -174,7 +183,7 @@ def _column(store: Store, name: str, number: int) -> NDArray[Any]:
         ) from error
 
 
-def _parts(store: Store, size: int) -> tuple[ExportPart, ...]:
+def _parts(store: Store, size: int, min_area_px: int) -> tuple[ExportPart, ...]:
     """Return the parts of an export: of each split, in ascending order, up to `size` samples."""
     split = [str(name) for number in range(store.shards) for name in _column(store, "split", number)]
     parts: list[ExportPart] = []
@@ -182,7 +191,8 @@ def _parts(store: Store, size: int) -> tuple[ExportPart, ...]:
         samples = [i for i, of_sample in enumerate(split) if of_sample == name]
         starts = range(0, len(samples), size)
         for k, start in enumerate(starts):
-            parts.append(ExportPart(len(parts), name, tuple(samples[start : start + size]), k, len(starts)))
+            of_part = tuple(samples[start : start + size])
+            parts.append(ExportPart(len(parts), name, of_part, k, len(starts), min_area_px))
     return tuple(parts)
 
 

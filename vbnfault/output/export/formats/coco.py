@@ -8,14 +8,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, TextIO
 
-import numpy as np
-from numpy.typing import NDArray
-
 from .... import __version__
 from ....core.quantities import Sample
 from ....store import Store, StoreSpec
 from ..contract import Closing, Entry, ExportPart, Finished, Format, number_text, png
-from ..regions import Region, coco_text, regions, whole
+from ..regions import Region, coco_text, instances, whole
 
 # regions of one class in one image from which they are written as one crowd region: COCO's own limit of detections
 # that are compared is 100, and a reader holds all of them in memory
@@ -35,14 +32,16 @@ class Coco(Format):
         "- `annotations/instances_SPLIT.json`: read it with `pycocotools.coco.COCO`. `categories` "
         "are all classes in "
         "the order of the table below; `id` is the index there plus 1.",
-        "- The instances are the connected regions (8 neighbours) of `mask`: grains, defects, lines, "
-        "flares. Grains "
-        "or flares that touch are one region. A class that is not localised, such as vignetting, has one instance "
-        "of its whole mask. `area` counts pixels; `bbox` is left, top, width, height in pixels.",
+        "- The instances are the connected regions (8 neighbours) of `mask`: grains, defects, lines. Grains that "
+        "touch are one region. Where the parameters list flares, each flare and the glare is one instance, in one "
+        "piece or in several. A class that is not localised, such as vignetting, has one instance of its whole "
+        "mask. `area` counts pixels; `bbox` is left, top, width, height in pixels.",
         f"- A class with more than {MOST_INSTANCES} regions in one image has one annotation of its "
         f"whole mask there, "
-        "with `iscrowd` 1; all others have `iscrowd` 0. No pixel of a mask is left out.",
+        "with `iscrowd` 1; all others have `iscrowd` 0. No pixel of a mask is left out, except in instances that "
+        "are smaller than `--min-area`.",
     )
+    has_instances = True
 
     def layers(self, spec: StoreSpec) -> Collection[str]:
         """Return image and mask."""
@@ -51,7 +50,7 @@ class Coco(Format):
     def files(self, store: Store, part: ExportPart, sample: Sample) -> tuple[Entry, Iterable[tuple[str, bytes]]]:
         """Return the image of one sample; its annotations are the note of the entry."""
         name = f"images/{part.split}/{number_text(sample.index, store.samples)}.png"
-        note = list(annotations_of(store.spec, sample.layers["mask"]))
+        note = list(annotations_of(store.spec, sample, part.min_area_px))
         return Entry(sample.index, name, note), [(name, png(sample.layers["image"][..., :3]))]
 
     def finish(self, finished: Finished) -> Closing:
@@ -74,15 +73,12 @@ class Coco(Format):
         )
 
 
-def annotations_of(spec: StoreSpec, masks: NDArray[np.bool_]) -> Iterator[dict[str, Any]]:
-    """Yield the annotations of one sample, without `id` and `image_id`; `masks`: bool[fault, y, x]."""
-    for k, (fault, mask) in enumerate(zip(spec.faults, masks, strict=True)):
-        if not mask.any():
-            continue
-        found = regions(mask) if fault in (spec.localised_faults or ()) else [whole(mask)]
+def annotations_of(spec: StoreSpec, sample: Sample, min_area_px: int = 1) -> Iterator[dict[str, Any]]:
+    """Yield the annotations of one sample, without `id` and `image_id`."""
+    for k, found in enumerate(instances(spec, sample, min_area_px, whole_frame=True)):
         is_crowd = len(found) > MOST_INSTANCES
-        for region in [whole(mask)] if is_crowd else found:
-            yield _annotation(region, mask.shape, k + 1, is_crowd)
+        for region in [whole(sample.layers["mask"][k])] if is_crowd else found:
+            yield _annotation(region, (spec.height, spec.width), k + 1, is_crowd)
 
 
 def _annotation(region: Region, shape: tuple[int, ...], category: int, is_crowd: bool) -> dict[str, Any]:

@@ -10,7 +10,7 @@ import numpy as np
 from ....core.quantities import Sample
 from ....store import SPLITS, Store, StoreSpec
 from ..contract import Closing, Entry, ExportPart, Finished, Format, number_text, png
-from ..regions import Region, polygon, regions
+from ..regions import Region, instances, polygon
 
 
 class Yolo(Format):
@@ -29,11 +29,14 @@ class Yolo(Format):
         "- `boxes/SPLIT/NUMBER.txt`: the same instances as exact boxes, `class x_centre y_centre "
         "width height`, for "
         "programs that read boxes only; rename the folder to `labels` for them.",
-        "- The instances are the connected regions (8 neighbours) of `mask` of the localised "
-        "classes. An outline runs "
-        "through the centres of the pixels at the edge and has no holes. A class that is not localised, such as "
-        "vignetting, has no instances here; `samples.jsonl` says which samples have it.",
+        "- The instances are the connected regions (8 neighbours) of `mask` of the localised classes; where the "
+        "parameters list flares, each flare and the glare is one. An outline runs through the centres of the "
+        "pixels at the edge and has no holes; that of an instance in several pieces is the outline of the longest. "
+        "A class that is not localised, such as vignetting, has no instances here; `samples.jsonl` says which "
+        "samples have it.",
     )
+
+    has_instances = True
 
     def layers(self, spec: StoreSpec) -> Collection[str]:
         """Return image and mask."""
@@ -42,12 +45,7 @@ class Yolo(Format):
     def files(self, store: Store, part: ExportPart, sample: Sample) -> tuple[Entry, Iterable[tuple[str, bytes]]]:
         """Return image, outlines and boxes of one sample."""
         spec, name = store.spec, f"{part.split}/{number_text(sample.index, store.samples)}"
-        found = [
-            (k, region)
-            for k, fault in enumerate(spec.faults)
-            if fault in (spec.localised_faults or ())
-            for region in regions(sample.layers["mask"][k])
-        ]
+        found = [(k, r) for k, of_class in enumerate(instances(spec, sample, part.min_area_px)) for r in of_class]
         outlines = "".join(_outline_line(k, region, spec) for k, region in found)
         boxes = "".join(_box_line(k, region, spec) for k, region in found)
         image = f"images/{name}.png"
