@@ -170,6 +170,10 @@ def test_a_rendered_sample_equals_the_stored_one(
     for k, name in enumerate(names):
         mask = cv2.imread(str(tmp_path / f"mask_{name}.png"), cv2.IMREAD_UNCHANGED) > 0
         assert np.array_equal(mask, stored.layers["mask"][k])
+    soft = {"dust_on_optics": "dust_opacity", "straylight": "straylight_added", "vignetting": "vignetting_factor"}
+    drawn = {name for name, on in zip(names, stored.scalars["injected"], strict=True) if on}
+    for name, layer in soft.items():
+        assert (tmp_path / f"{layer}.png").exists() == (name in drawn or layer == "dust_opacity")
     # NaN and Infinity, which Python also reads, are not JSON
     scalars = json.loads((tmp_path / "parameters.json").read_text(), parse_constant=pytest.fail)
     assert scalars["noise_fraction_p99"] is None

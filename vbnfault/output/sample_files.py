@@ -40,8 +40,11 @@ def write_frame(frame: Frame, folder: Path) -> list[Path]:
     Raises InputError if a file cannot be written.
     """
     sample = to_sample(frame)
-    drawn = [frame.spec.faults[name] for name in frame.drawn if frame.spec.faults[name].soft_layer]
-    strengths = {fault.soft_layer: strength(fault, frame.injection) for fault in drawn}
+    strengths = {
+        fault.soft_layer: strength(fault, frame.injection)
+        for name, fault in frame.spec.faults.items()
+        if fault.soft_layer and (name in frame.drawn or fault.soft_layer in sample.layers)
+    }
     try:
         folder.mkdir(parents=True, exist_ok=True)
         files = [_write_exr(frame, strengths, folder / "sample.exr")]
