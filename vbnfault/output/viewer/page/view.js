@@ -25,6 +25,8 @@ document.title = `${about.title || about.name}: vbnfault view`;
 $("title").textContent = about.title || about.name;
 $("facts").textContent = `${about.name}, ${about.width} × ${about.height} px`;
 
+if (matchMedia("(max-width: 800px)").matches) $("fold").open = false; // on a phone, images come first
+
 // --- the listing and its filters ----------------------------------------------------------------------------
 
 const count = () => (order ? order.length : samples);
@@ -634,7 +636,7 @@ function inGrid(key) {
   else if (key === "b") toggleBrighter();
   else if (key === "0") clear();
   else if (key === "g" || key === "/") { $("number").focus(); $("number").select(); }
-  else if (key === "f") $("filters").querySelector(".filter")?.focus();
+  else if (key === "f") { $("fold").open = true; $("filters").querySelector(".filter")?.focus(); }
   else return false;
   return true;
 }
