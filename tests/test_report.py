@@ -346,5 +346,12 @@ def test_the_page_in_a_browser(described_store: Path, tmp_path: Path) -> None:
         for width in (1920, 1366, 390):
             page.look(width, 768)
             assert page.evaluate(wide), width
+        # at 390 px: the letters of every chart are as large as those of small print
+        heights = (
+            "[...document.querySelectorAll('svg[role=img] text')].map((t) => t.getBoundingClientRect().height)"
+        )
+        assert min(h for h in page.evaluate(heights) if h) > 8
+        page.look(1920, 768)
+        assert page.evaluate("document.querySelector('.gallery').clientWidth") > 1750
         assert page.errors == []
         assert [u for u in page.requests if not u.startswith(("data:", "file:"))] == []

@@ -378,6 +378,29 @@ def ready(page: Page, served: Served) -> None:
 
 
 @needs_browser
+def test_filters_fold_and_leave_a_phone_to_the_images(page: Page, served: Served) -> None:
+    page.look(390, 800)
+    ready(page, served)
+    height = "document.getElementById('scroller').clientHeight"
+    assert page.evaluate("document.getElementById('fold').open") is False
+    folded = page.evaluate(height)
+    assert folded > 560
+    page.press("f")
+    page.wait("document.getElementById('fold').open")
+    assert page.evaluate(height) < folded
+    page.look(1366, 768)
+
+
+@needs_browser
+def test_a_tile_that_waits_differs_from_a_black_image(page: Page, served: Served) -> None:
+    ready(page, served)
+    waiting = "getComputedStyle(document.querySelector('.tile .image')).backgroundImage"
+    assert page.evaluate(waiting).startswith("repeating-linear-gradient")
+    page.evaluate("document.querySelector('.tile img').classList.add('waiting')")
+    page.wait("getComputedStyle(document.querySelector('.tile img')).opacity === '0'")
+
+
+@needs_browser
 def test_the_grid_shows_filters_and_goes(page: Page, served: Served) -> None:
     ready(page, served)
     injected = served.store.read("injected").astype(bool)
