@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -230,6 +231,31 @@ def test_a_complete_study_evaluates_nothing_again(spec: StudySpec, reference: Pa
     assert summary.seconds_by_stage == {"function": pytest.approx(0.32)}  # those of the run that evaluated
     assert table_bytes(reference) == before
     assert not list((reference / "rows").glob(".*"))
+
+
+@pytest.mark.parametrize("value", [1.25, None, "x", [1, 2]])
+def test_a_damaged_row_is_computed_again(
+    value: Any, reference: Path, tmp_path: Path, spec: StudySpec, capfd: pytest.CaptureFixture[str]
+) -> None:
+    folder = shutil.copytree(reference, tmp_path / "s")
+    file = folder / "rows" / "0000001.json"
+    record = json.loads(file.read_text())
+    number = next(iter(record))
+    record[number]["values"]["y"] = value
+    file.write_text(json.dumps(record))
+    summary = run.run_study(spec, folder, BuildOptions(), report=False, evaluator=kit.Stopping)
+    assert summary.finished == 320 - (len(record) - 2)  # without the seconds and the checksum
+    assert "note: " in (said := capfd.readouterr().err) and "damaged; its evaluations are made again" in said
+    assert table_bytes(folder) == table_bytes(reference)
+
+
+def test_a_damaged_table_is_not_recomputed_from(reference: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(reference, tmp_path / "s")
+    content = bytearray(table_bytes(folder))
+    content[len(content) // 2] ^= 1
+    (folder / results.TABLE).write_bytes(content)
+    with pytest.raises(InputError, match=rf"{results.TABLE}: damaged .*; the command of the study writes it again"):
+        run.recompute(folder)
 
 
 # ------------------------------------------------------------------------------------ failures
