@@ -200,7 +200,9 @@ def test_a_wrong_level_is_named(table: dict[str, Any], message: str) -> None:
 def test_a_value_of_a_level_that_no_key_can_have_is_named(tmp_path: Path, fault: str, value: float) -> None:
     path = table_file(tmp_path)
     path.write_text(path.read_text().replace(" 2.0,", f" {value},").replace("2000.0", str(value)))
-    with pytest.raises(InputError, match=rf"{fault}\.severity = 3: .*levels.toml has .* there: must be a number above"):
+    with pytest.raises(
+        InputError, match=rf"{fault}\.severity = 3: .*levels.toml has .* there: must be a number above"
+    ):
         vbnfault.load_scene("quickstart", {"severity.file": str(path), f"faults.{fault}": {"severity": 3}})
 
 

@@ -124,7 +124,9 @@ class Order:
 
     def state(self, epoch: int, batch: int) -> dict[str, Any]:
         """Return plain data that say which batch of which epoch comes next, and of which order."""
-        return {"epoch": epoch, "batch": self.checked_batch(batch)} | {name: getattr(self, name) for name in _OF_STATE}
+        return {"epoch": epoch, "batch": self.checked_batch(batch)} | {
+            name: getattr(self, name) for name in _OF_STATE
+        }
 
     def position(self, state: Mapping[str, Any]) -> tuple[int, int]:
         """Return epoch and next batch of a state. Raises InputError if it is of another order."""
