@@ -293,8 +293,8 @@ def _result(measured: _Measurement) -> Result:
     tested = before & (signal >= low) & (signal <= high)
     if min(linear.sum(), tested.sum()) < 2 or min(signal[last], measured.light_dn) <= 0:
         raise InputError(
-            f"channel {measured.channel}: its signal does not rise with the light up to {signal[last]:.4g} DN, where "
-            "its variance is largest, so that no line can be fitted"
+            f"channel {measured.channel}: its signal does not rise with the light up to {signal[last]:.4g} DN, "
+            "where its variance is largest, so that no line can be fitted"
         )
     gain, response = _slopes(photons[linear], signal[linear], (transfer.variance_dn2 - dark_variance)[linear])
     if min(gain, response) <= 0:

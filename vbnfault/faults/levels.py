@@ -112,8 +112,8 @@ def with_severity(
     most = declared["limits"][1]
     if not (0 < value <= most and math.isfinite(value)):
         raise InputError(
-            f"{where}.severity = {level}: {levels.path or 'the packaged table'} has {severity.key} = {value:g} there: "
-            f"must be a number above 0 and at most {most:g}"
+            f"{where}.severity = {level}: {levels.path or 'the packaged table'} has {severity.key} = {value:g} "
+            f"there: must be a number above 0 and at most {most:g}"
         )
     rest = {key: value for key, value in table.items() if key != "severity"}
     return {**severity.keys, **rest, severity.key: severity.setting(value, declared)}
