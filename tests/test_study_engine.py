@@ -200,7 +200,7 @@ def test_what_few_points_cannot_tell_is_said(tmp_path: Path) -> None:
     spec = kit.spec(design={"method": "latin_hypercube", "n": 4})
     summary = run.run_study(spec, tmp_path / "s", QUIET, report=False, evaluator=kit.Function)
     assert [sentence.partition(":")[2][:16] for sentence in summary.warnings] == [
-        " below n = 16 th",
+        " below n = 16 in",
         " delta needs n =",
     ]
 
