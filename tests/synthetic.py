@@ -7,6 +7,7 @@ import json
 import os
 import signal
 import sys
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -183,6 +184,7 @@ class Session:
     dies_once: str = ""  # a file that is made at the first death
     log: str = ""
     stage: str = ""  # told before every sample
+    warns: str = ""  # before every sample
     dies_writing: str = ""  # a folder of files; a process dies, once each, as it writes the shards 0 and 1
 
     def __call__(self) -> Session:
@@ -194,6 +196,8 @@ class Session:
                 log.write(f"{os.getpid()} {index}\n")
         if self.stage:
             activity.begin(f"{self.stage} {index}")
+        if self.warns:
+            warnings.warn(self.warns, stacklevel=1)
         if self.dies_writing:
             die_once_as_two_shards_are_written(Path(self.dies_writing))
         if index in self.raises:

@@ -430,7 +430,10 @@ def test_without_dask_the_sentence_says_how_to_get_it(tmp_path: Path, monkeypatc
         run(tmp_path / "s.zarr", scheduler="tcp://127.0.0.1:1")
 
 
-@pytest.mark.parametrize("address", ["nonsense", "foo://x:1", "tcp://127.0.0.1:1", "tcp://127.0.0.1:99999999"])
+@pytest.mark.parametrize(
+    "address",
+    ["nonsense", "foo://x:1", "tcp://127.0.0.1:1", "tcp://127.0.0.1:99999999", "ucx://127.0.0.1:1", "inproc://x"],
+)
 def test_a_scheduler_that_cannot_be_reached_is_one_sentence(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], address: str
 ) -> None:

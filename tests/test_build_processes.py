@@ -39,6 +39,13 @@ def test_two_workers_make_the_same_bits_and_share_the_work(undisturbed: tuple[Pa
     assert len({pid for pid, _ in calls} - {str(os.getpid())}) >= 3
 
 
+def test_a_warning_of_a_worker_is_one_sentence(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    run(tmp_path / "s.zarr", Session(warns="site 3: the ground is coarse"), workers=2, samples=8)
+    said = capfd.readouterr().err.splitlines()
+    assert said
+    assert set(said) == {"warning: site 3: the ground is coarse"}
+
+
 def test_workers_run_no_python_files_of_the_working_folder(
     undisturbed: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

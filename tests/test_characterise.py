@@ -76,6 +76,31 @@ def test_characterisation_finds_what_the_sensor_was_made_from() -> None:
     assert result.black_level_dn == pytest.approx(80 + 40 * 0.01 * spec.system_gain_dn_per_e, abs=0.1)
 
 
+@pytest.mark.parametrize(
+    ("mean_dn", "noise_dn"),
+    [
+        (lambda photons: 100.0, lambda photons: 3.0),  # no light arrives, as behind traps without end
+        (lambda photons: 4095.0, lambda photons: 0.0),  # every point saturates
+        (lambda photons: 100 + min(10 * photons, 2000), lambda photons: 1.0 if photons < 300 else 0.0),
+        (lambda photons: 3000 - photons, lambda photons: photons**0.5),  # the signal falls
+        (lambda photons: 100 + photons, lambda photons: 0.0),  # no noise: there is no gain
+        (lambda photons: 100 + photons, lambda photons: 50.0 if photons < 900 else 49.0),  # noise without a gain
+        (lambda photons: 100 + (photons > 900) * 1000, lambda photons: photons**0.5),  # a step: no line
+    ],
+)
+def test_a_signal_without_a_line_is_one_sentence(mean_dn: Any, noise_dn: Any) -> None:
+    class Camera:
+        def take(self, photons: float, exposure_s: float, number: int) -> Any:
+            drawn = np.random.default_rng([1, number]).standard_normal((32, 32))
+            return np.clip(np.rint(mean_dn(photons) + noise_dn(photons) * drawn), 0, 4095).astype(np.uint16)
+
+    sites = {"mono": (slice(None), slice(None))}
+    use = Settings(points=8, stack=2, dark_exposures_s=(0.1, 1.0))
+    with pytest.raises(InputError, match=r"^channel mono: it(s| saturates) .*, so that ") as error:
+        characterise(Camera(), sites=sites, photons_at_saturation=800.0, settings=use)
+    assert "\n" not in str(error.value)
+
+
 def test_zero_light_gives_the_black_level_and_saturation_the_top_code() -> None:
     dark = replace(sensor().individual, dsnu_e=0.0, dark_current_e_s=0.0)
     device = Device(sensor(individual=dark), 1, shape=SHAPE)

@@ -339,14 +339,37 @@ def test_a_least_area_is_for_instances_only(described_store: Path, tmp_path: Pat
     )
 
 
-@pytest.mark.parametrize("content", [b"1", b"123"])
-def test_a_part_whose_file_has_another_size_is_not_finished(content: bytes, tmp_path: Path) -> None:
+@pytest.mark.parametrize("content", [b"1", b"13"])  # another size, and the same with a flipped bit
+def test_a_part_whose_file_has_changed_is_not_finished(content: bytes, tmp_path: Path) -> None:
     folder = Folder(tmp_path)
     folder.put([("a.png", b"12")])
-    folder.write_part(0, {})
+    folder.write_part(0, {"rows": [1]})
     assert folder.has_part(0)
     (tmp_path / "a.png").write_bytes(content)
     assert not folder.has_part(0)
+
+
+def test_a_part_whose_record_has_changed_is_not_finished(tmp_path: Path) -> None:
+    folder = Folder(tmp_path)
+    folder.put([("a.png", b"12")])
+    folder.write_part(0, {"rows": [1]})
+    record = tmp_path / ".parts" / "000000.json"
+    record.write_text(record.read_text().replace("[1]", "[2]"))
+    assert not folder.has_part(0)
+
+
+def test_a_complete_export_with_a_flipped_bit_is_written_again(described_store: Path, tmp_path: Path) -> None:
+    export_store(described_store, tmp_path, "png", progress=False)
+    before, image = tree(tmp_path), next(tmp_path.glob("*/image/*.png"))
+    lines = [line.split("  ") for line in (tmp_path / "SHA256SUMS").read_text().splitlines()]
+    own = ("SHA256SUMS", "export.json")
+    assert {name: checksum for checksum, name in lines} == {k: v for k, v in before.items() if k not in own}
+    content = bytearray(image.read_bytes())
+    content[-20] ^= 1
+    image.write_bytes(content)
+    assert export_store(described_store, tmp_path, "png", progress=False).written == SAMPLES
+    assert tree(tmp_path) == before
+    assert export_store(described_store, tmp_path, "png", progress=False).written == 0
 
 
 def test_an_outline_runs_through_the_centres_of_pixels() -> None:
@@ -553,7 +576,7 @@ def test_masks_of_the_effect_replace_the_footprints(name: str, described_store: 
     export_store(first, tmp_path / "effect", name, masks="effect", progress=False)
     export_store(second, tmp_path / "footprint", name, progress=False)
     export_store(first, tmp_path / "plain", name, progress=False)
-    texts = {"README.md", "croissant.json", "export.json"}
+    texts = {"README.md", "croissant.json", "export.json", "SHA256SUMS"}
     effect, footprint, plain = (
         {k: v for k, v in tree(tmp_path / folder).items() if k not in texts}
         for folder in ("effect", "footprint", "plain")

@@ -195,6 +195,17 @@ def test_a_wrong_level_is_named(table: dict[str, Any], message: str) -> None:
         from_dict("vignetting", table, source="s")
 
 
+@pytest.mark.parametrize("value", [float("inf"), -5.0, 0.0, 1e308])
+@pytest.mark.parametrize("fault", ["broken_lines", "cosmic_rays"])  # a whole number, and any number
+def test_a_value_of_a_level_that_no_key_can_have_is_named(tmp_path: Path, fault: str, value: float) -> None:
+    path = table_file(tmp_path)
+    path.write_text(path.read_text().replace(" 2.0,", f" {value},").replace("2000.0", str(value)))
+    with pytest.raises(
+        InputError, match=rf"{fault}\.severity = 3: .*levels.toml has .* there: must be a number above"
+    ):
+        vbnfault.load_scene("quickstart", {"severity.file": str(path), f"faults.{fault}": {"severity": 3}})
+
+
 def test_a_level_that_does_not_exist_is_named(tmp_path: Path) -> None:
     def loaded(fault: str, table: dict[str, Any], **changes: Any) -> Any:
         values = {"severity.file": str(table_file(tmp_path, **changes)), f"faults.{fault}": table}
@@ -397,8 +408,9 @@ def test_a_criterion_is_checked() -> None:
         Criterion(metric="orb_repeatability")
     with pytest.raises(InputError, match="quantile = 2: must be from 0 to 1"):
         Criterion(quantile=2)
-    with pytest.raises(InputError, match="must be 5 rising numbers above 0"):
-        Criterion(errors=(0.1, 0.2, 0.2, 0.3, 0.4))
+    for errors in ((0.1, 0.2, 0.2, 0.3, 0.4), (0.1, 0.2, 0.3, 0.4, math.inf), (-5.0, 0.2, 0.3, 0.4, 0.5)):
+        with pytest.raises(InputError, match="must be 5 rising, finite numbers above 0"):
+            Criterion(errors=errors)
 
 
 def test_models_are_named() -> None:

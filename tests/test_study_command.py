@@ -26,13 +26,14 @@ def test_a_dry_run_says_how_much_a_study_evaluates_and_writes_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
-    words = ("study", "flare_models", "--out", str(out), "--dry-run", "--set", "design.n=8")
+    words = ("study", "flare_textures", "--out", str(out), "--dry-run", "--set", "design.n=8")
     code, said, errors = run(monkeypatch, capsys, *words)
     assert (code, errors, out.exists()) == (0, "", False)
     lines = said.splitlines()
-    assert lines[1] == ("latin_hypercube, n = 8: 8 points × 200 views × 1 seed × 3 models = 4800 evaluations")
+    assert lines[1] == ("latin_hypercube, n = 8: 8 points × 20 views × 1 seed × 3 models = 480 evaluations")
     assert lines[2].startswith("factors: sun.distance_au (au), ")
     assert "straylight_total_e (electrons), " in lines[3]
+    assert lines[4].startswith("warning: design.n = 8: below n = 16 ")
 
 
 def test_a_file_in_place_of_the_folder_is_one_sentence(
@@ -49,7 +50,7 @@ def test_a_file_in_place_of_the_folder_is_one_sentence(
     [
         ("factor[4].high=-0.5", "factor[4].low = -0.03, high = -0.5: bounds reversed or equal"),
         ("factor.4.key=lens.coating.thicknes", "did you mean lens.coating.thickness?"),
-        ("factor[12].low=1", "factor[12].low = 1: factor is a list; its entries are 0 to 11"),
+        ("factor[15].low=1", "factor[15].low = 1: factor is a list; its entries are 0 to 14"),
         ("metrics.names[0]=straylight_total", "did you mean straylight_total_e?"),
         ("scene.samples=[999]", "scene.samples: sample 999: must be below dataset.samples = "),
     ],

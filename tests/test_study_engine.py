@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -99,6 +100,11 @@ def test_morris_is_that_of_salib() -> None:
     exact = morris.analyze(problem, points, y, num_resamples=200, num_levels=4, seed=5)
     np.testing.assert_allclose(data["mu_star"].values[0, 0], exact["mu_star"], atol=1e-12)
     np.testing.assert_allclose(data["sigma"].values[0, 0], exact["sigma"], atol=1e-12)
+    half = np.diff(data["mu_star_interval"].values[0, 0], axis=-1)[:, 0] / 2
+    # Student's quantile for 10 trajectories over the normal one, and the spread of 10 values about their mean
+    np.testing.assert_allclose(
+        half, np.array(exact["mu_star_conf"]) * 2.2622 / 1.9600 * (10 / 9) ** 0.5, rtol=1e-4, atol=1e-12
+    )
     assert data["mu_star"].values[0, 0, -1] == 0
 
 
@@ -152,6 +158,51 @@ def test_blocks_are_pooled_and_seeds_have_their_own_indices() -> None:
     np.testing.assert_allclose(data["ST_by_seed"].values[0, 0, :2], [[1, 0], [0, 1]], atol=0.02)
     assert list(data["seed"].values) == [4, 9]
     assert data["ST_seed_deviation"].values[0, 0, 0] == pytest.approx(2**-0.5, abs=0.02)
+
+
+@pytest.mark.parametrize("n", [1, 2, 4, 8])
+def test_intervals_of_few_samples_hold_the_indices(n: int) -> None:
+    """Bootstraps of so few samples gave an ST of 1.73 with the interval 1.32 to 2.89."""
+    for seed in range(10):
+        spec = kit.spec(
+            design={"n": n, "seed": seed, "resamples": 100}, models={"fault": "f", "compare": ["a", "b"]}
+        )
+        y = kit.Function(spec).function(np.array(make_design(spec).values, dtype=float))
+        both = np.stack([y, y + 1], axis=-1)[None, None, ..., None]
+        data = indices.compute(indices.Results(make_design(spec), tuple(kit.Function.metrics[:1]), both))
+        for name, exact in kit.ANALYTIC_ISHIGAMI.items():
+            low, high = np.moveaxis(data[f"{name}_interval"].values[0, 0], -1, 0)
+            assert (low[:-1] <= exact).all()
+            assert (exact <= high[:-1]).all()
+            assert low[-1] <= 0 <= high[-1]  # of the dummy factor
+            assert ((data[name].values >= low) & (data[name].values <= high)).all()
+            assert data[name].max() <= 1
+        for name in ("interaction", "model_share", "ST_by_seed", "S1_by_seed"):
+            finite = data[name].values[np.isfinite(data[name].values)]
+            assert (np.abs(finite) <= 1).all()
+        assert data["model_share_interval"].values.tolist() == [[0.0, 1.0]]
+
+
+@pytest.mark.parametrize("method", ["latin_hypercube", "morris"])
+def test_a_missing_library_is_told_before_the_first_evaluation(
+    method: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in [name for name in sys.modules if name.partition(".")[0] == "SALib"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "SALib", None)
+    spec = kit.spec(design={"method": method, "n": 4})
+    with pytest.raises(InputError, match=f"design.method = '{method}': needs SALib; pip install"):
+        run.run_study(spec, tmp_path / "s", QUIET, report=False, evaluator=kit.Function)
+    assert not (tmp_path / "s").exists()
+
+
+def test_what_few_points_cannot_tell_is_said(tmp_path: Path) -> None:
+    spec = kit.spec(design={"method": "latin_hypercube", "n": 4})
+    summary = run.run_study(spec, tmp_path / "s", QUIET, report=False, evaluator=kit.Function)
+    assert [sentence.partition(":")[2][:16] for sentence in summary.warnings] == [
+        " below n = 16 in",
+        " delta needs n =",
+    ]
 
 
 # ------------------------------------------------------------------------------------ resuming and workers
@@ -230,6 +281,31 @@ def test_a_complete_study_evaluates_nothing_again(spec: StudySpec, reference: Pa
     assert summary.seconds_by_stage == {"function": pytest.approx(0.32)}  # those of the run that evaluated
     assert table_bytes(reference) == before
     assert not list((reference / "rows").glob(".*"))
+
+
+@pytest.mark.parametrize("value", [1.25, None, "x", [1, 2]])
+def test_a_damaged_row_is_computed_again(
+    value: Any, reference: Path, tmp_path: Path, spec: StudySpec, capfd: pytest.CaptureFixture[str]
+) -> None:
+    folder = shutil.copytree(reference, tmp_path / "s")
+    file = folder / "rows" / "0000001.json"
+    record = json.loads(file.read_text())
+    number = next(iter(record))
+    record[number]["values"]["y"] = value
+    file.write_text(json.dumps(record))
+    summary = run.run_study(spec, folder, BuildOptions(), report=False, evaluator=kit.Stopping)
+    assert summary.finished == 320 - (len(record) - 2)  # without the seconds and the checksum
+    assert "0000001.json: damaged; its evaluations are made again" in capfd.readouterr().err
+    assert table_bytes(folder) == table_bytes(reference)
+
+
+def test_a_damaged_table_is_not_recomputed_from(reference: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(reference, tmp_path / "s")
+    content = bytearray(table_bytes(folder))
+    content[len(content) // 2] ^= 1
+    (folder / results.TABLE).write_bytes(content)
+    with pytest.raises(InputError, match=rf"{results.TABLE}: damaged .*; the command of the study writes it again"):
+        run.recompute(folder)
 
 
 # ------------------------------------------------------------------------------------ failures

@@ -261,10 +261,69 @@ def test_metrics_are_those_of_their_equations() -> None:
         "mask_area": 1.0,  # half of 100 e are more than 30 DN everywhere
         "ghost_1_flux_e": 3.0,
         "ghost_2_flux_e": np.nan,
+        "veiling_glare_index": 0.0,
+        "straylight_over_signal": 300.25 / 800,
+        "sun_direct_e": 0.0,
+        "ghost_peak_e": np.nan,  # of a model without ghosts of its own
+        "ghost_difference": np.nan,
     }
     assert {name: image_metrics.value(name, image) for name in expected} == pytest.approx(
         expected, rel=1e-6, nan_ok=True
     )
+
+
+def test_spatial_metrics_of_ghosts_are_those_of_their_equations() -> None:
+    ghosts, traced = np.zeros((2, 5, 9), np.float32)
+    ghosts[2, 7], ghosts[2, 5] = 30.0, 10.0  # 3 and 1 px right of the middle
+    traced[2, 7], traced[0, 0] = 30.0, 20.0
+    clean = np.full((3, 5, 9), 100.0, np.float32)
+    image = LitImage(
+        clean=clean,
+        kept=clean + 50,
+        direct=np.full_like(clean, 60.0),
+        ghosts=ghosts,
+        traced_ghosts=traced,
+        added=np.full_like(clean, 12.0),
+        parts_e={},
+        ghosts_e=(),
+        lit=np.arange(9),
+        dark_e=4.0,
+        read_noise_e=3.0,
+        full_well_e=1e4,
+        white_e=np.full(3, 1e4, np.float32),
+        mask_level_dn=1.0,
+    )
+    expected = {
+        "ghost_peak_e": 30.0,
+        "ghost_area": 1 / 45,  # the noise is √113 = 10.6 e
+        "ghost_offset_px": 2.5,
+        "ghost_spread_px": 0.75**0.5,
+        "ghost_difference": 30 / 50,
+        "veiling_glare_index": 12 / 162,
+        "sun_direct_e": 60.0 * 45,
+        "straylight_over_signal": 12 / 90,  # without the Sun's direct image
+    }
+    assert {name: image_metrics.value(name, image) for name in expected} == pytest.approx(expected, rel=1e-6)
+
+
+def test_ghosts_of_two_models_are_compared_pixel_by_pixel(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Veil and starburst, which both models share, hide the difference in all light that straylight adds."""
+    names = ["ghost_difference", "ghost_total_e", "ghost_offset_px", "straylight_total_e", "sun_direct_e"]
+    models = {"fault": "straylight", "compare": ["paraxial", "traced"]}
+    spec = study(tmp_path_factory, factor("sun.angle_deg", 0, 30, "deg"), names=names, models=models)
+    made = SceneEvaluator(spec)
+    near, far = (
+        {m: made.evaluate(point({"sun.angle_deg": angle}, model=m)) for m in ("paraxial", "traced")}
+        for angle in (5.0, 30.0)
+    )
+    for values in (near, far):
+        assert values["traced"]["ghost_difference"] == 0
+        assert values["paraxial"]["straylight_total_e"] == pytest.approx(
+            values["traced"]["straylight_total_e"], rel=0.1
+        )
+    # paraxial rays leave the rims and the aberrations of oblique light out
+    assert far["paraxial"]["ghost_difference"] > near["paraxial"]["ghost_difference"] > 0.1
+    assert near["traced"]["sun_direct_e"] > near["traced"]["straylight_total_e"]
 
 
 # --- errors ------------------------------------------------------------------------------------------------------

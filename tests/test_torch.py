@@ -100,7 +100,7 @@ def test_weights_balance_classes_and_pixels(finished_store: Path) -> None:
     assert 0 < clear.sum() < len(injected)
     assert np.allclose(without.class_weights().numpy(), wanted)
     assert without.class_weights()[0] == without.pixel_weights()[0] == 1  # of a class that never occurs
-    with pytest.raises(InputError, match="most = 0: must be at least 1"):
+    with pytest.raises(InputError, match="most = 0: must be a whole number of at least 1"):
         dataset.pixel_weights(most=0)
     with pytest.raises(InputError, match="the dataset reads no masks; add masks to targets"):
         SampleDataset(finished_store).pixel_weights()
@@ -180,6 +180,36 @@ def test_a_state_of_another_order_is_refused(finished_store: Path) -> None:
     state = Loader(batches(finished_store)).state_dict()
     with pytest.raises(InputError, match="state: its batch_size = 2, but here batch_size = 3"):
         Loader(batches(finished_store, batch_size=3)).load_state_dict(state)
+
+
+@pytest.mark.parametrize("state", [None, [], 5, "x"])
+def test_what_is_no_state_is_refused(finished_store: Path, state: Any) -> None:
+    for of in (batches(finished_store), ShardSampler(data(finished_store)), Loader(batches(finished_store))):
+        with pytest.raises(InputError, match=r"^state = .*: must be what state_dict\(\) returned, a mapping$"):
+            of.load_state_dict(state)
+
+
+@pytest.mark.parametrize("batch", [10**6, 6, -1, "x", None])
+def test_a_batch_beyond_the_epoch_is_refused(finished_store: Path, batch: Any) -> None:
+    of, loader = batches(finished_store), Loader(batches(finished_store))
+    assert len(of) == 5
+    for use in (of.state_dict, lambda batch: of.set_epoch(0, batch)):
+        with pytest.raises(InputError, match=r"^batch = .*: must be a whole number from 0 to 5, the batches of an"):
+            use(batch)
+    with pytest.raises(InputError, match="whole number"):
+        loader.load_state_dict({**loader.state_dict(), "batch": batch})
+    of.set_epoch(0, np.int64(5))
+
+
+def test_arguments_of_another_kind_are_refused(finished_store: Path) -> None:
+    wrong: Any
+    for wrong in (5, "ab", (1,), (0, 1, 2)):
+        with pytest.raises(InputError, match=r"^ranks = .*: must be two whole numbers"):
+            batches(finished_store, ranks=wrong)
+    for key in ("containing", "classes", "where", "transform", "masks"):
+        wrong = [5] if key == "masks" else 5
+        with pytest.raises(InputError, match=f"^{key} = .*: must be "):
+            SampleDataset(finished_store, **{key: wrong})
 
 
 @pytest.mark.parametrize("epoch", [-1, 10**30, 1.0, "x", None, True])

@@ -147,7 +147,7 @@ def characterise(
     ------
     InputError
         `settings` has fewer than 8 points, 2 images in a stack or 2 dark exposures, or a channel saturates within
-        the first three levels.
+        the first three levels, or its signal or variance does not rise with the light.
     """
     use = Settings() if settings is None else settings
     if use.points < 8 or use.stack < 2 or len(use.dark_exposures_s) < 2:
@@ -276,7 +276,7 @@ def _measurement(
 
 
 def _result(measured: _Measurement) -> Result:
-    """Return the parameters of one channel. Raises InputError if it saturates too early."""
+    """Return the parameters of one channel. Raises InputError if no line fits its signal and its variance."""
     transfer = measured.transfer
     photons, signal = transfer.photons, transfer.mean_dn - transfer.dark_mean_dn
     dark_variance = transfer.dark_variance_dn2
@@ -287,9 +287,20 @@ def _result(measured: _Measurement) -> Result:
             f"channel {measured.channel}: it saturates within the first three exposures, so that no line can be "
             "fitted"
         )
-    linear = signal <= _LINEAR_RANGE * signal[last]
-    linear &= np.arange(len(signal)) <= last
+    before = np.arange(len(signal)) <= last
+    linear = before & (signal <= _LINEAR_RANGE * signal[last])
+    low, high = (fraction * signal[last] for fraction in _LINEARITY_RANGE)
+    tested = before & (signal >= low) & (signal <= high)
+    if min(linear.sum(), tested.sum()) < 2 or min(signal[last], measured.light_dn) <= 0:
+        raise InputError(
+            f"channel {measured.channel}: its signal does not rise with the light up to {signal[last]:.4g} DN, "
+            "where its variance is largest, so that no line can be fitted"
+        )
     gain, response = _slopes(photons[linear], signal[linear], (transfer.variance_dn2 - dark_variance)[linear])
+    if min(gain, response) <= 0:
+        raise InputError(
+            f"channel {measured.channel}: its variance does not rise with its signal, so that it has no gain"
+        )
     efficiency = response / gain
     dark_noise_e = float(np.sqrt(max(dark_variance - _QUANTISATION_DN2, 0.0)) / gain)
     saturation_photons = float(photons[last])
@@ -309,7 +320,7 @@ def _result(measured: _Measurement) -> Result:
         saturation_photons=saturation_photons,
         snr_max=float(np.sqrt(saturation_e)),
         dynamic_range=float(saturation_photons / least),
-        linearity_error_percent=_linearity(photons, signal, last),
+        linearity_error_percent=_linearity(photons[tested], signal[tested]),
         dark_current_mean_e_s=float(slope_mean / gain),
         dark_current_variance_e_s=float(slope_variance / gain**2),
         dsnu_e=float(np.sqrt(measured.dark_spatial_dn2) / gain),
@@ -319,11 +330,11 @@ def _result(measured: _Measurement) -> Result:
 
 
 def _characterisation(measured: _Measurement) -> Characterisation:
-    """Return the characterisation of one channel. Raises InputError if it saturates too early."""
+    """Return the characterisation of one channel. Raises InputError as `_result` does."""
     flat, dark = measured.flat_dn, measured.dark_dn
     return Characterisation(
         channel=measured.channel,
-        result=_result(measured),
+        result=_result(measured),  # refuses what the maps could not divide by
         transfer=measured.transfer,
         dark_mean_dn=measured.dark_mean_dn,
         dark_variance_dn2=measured.dark_variance_dn2,
@@ -339,13 +350,10 @@ def _slopes(photons: F64, signal: F64, noise: F64) -> tuple[float, float]:
     return float(signal @ noise / (signal @ signal)), float(photons @ signal / (photons @ photons))
 
 
-def _linearity(photons: F64, signal: F64, last: int) -> float:
+def _linearity(photons: F64, signal: F64) -> float:
     """Return the mean relative deviation from the line with the best relative fit, in % (section 6.7)."""
-    low, high = (fraction * signal[last] for fraction in _LINEARITY_RANGE)
-    chosen = (signal >= low) & (signal <= high) & (np.arange(len(signal)) <= last)
-    p, y = photons[chosen], signal[chosen]
-    slope, offset = np.polyfit(p, y, 1, w=1 / y)
-    return float(100 * np.mean(np.abs(y - (offset + slope * p)) / (offset + slope * p)))
+    slope, offset = np.polyfit(photons, signal, 1, w=1 / signal)
+    return float(100 * np.mean(np.abs(signal - (offset + slope * photons)) / (offset + slope * photons)))
 
 
 def _spectrum(flat: F64, dark: F64) -> Spectrum:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import sys
-import warnings
 from typing import Annotated
 
 import typer
@@ -34,7 +33,7 @@ def main() -> None:
     # numpy's products of matrices are small. A thread of OpenBLAS that waits for the next one keeps a core busy and
     # takes it from render threads. The library reads this when numpy is imported; to change it later is not safe.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    warnings.showwarning = lambda message, *_, **__: typer.echo(f"warning: {message}", err=True)
+    streams.warn_in_sentences()
     with streams.steady(), interrupts.interruptible():
         try:
             code, stopped = _exit_code(), False

@@ -12,6 +12,7 @@ import io
 import os
 import signal
 import sys
+import warnings
 from collections.abc import Iterator
 from typing import Any, TextIO, cast
 
@@ -41,6 +42,11 @@ def steady() -> Iterator[None]:
         stack.enter_context(contextlib.redirect_stdout(cast(TextIO, _Output(out))))
         stack.enter_context(contextlib.redirect_stderr(cast(TextIO, _Messages(error))))
         yield
+
+
+def warn_in_sentences() -> None:
+    """Have this process print a warning as one sentence on standard error, without the line of code that warns."""
+    warnings.showwarning = lambda message, *_, **__: print(f"warning: {message}", file=sys.stderr, flush=True)
 
 
 def is_unread(stop: BaseException) -> bool:

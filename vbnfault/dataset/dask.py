@@ -30,6 +30,7 @@ from .work import Fatal, Job, Worker, WorkerFactory, describe
 # cluster may need many seconds to answer.
 _SECONDS_TO_CONNECT = 30.0
 _SECONDS_TO_ANSWER = 60.0
+_WITHOUT_TCP = ("inproc", "ucx", "ucxx")  # protocols
 _SECONDS_BETWEEN_CHECKS = 2.0  # of whether the cluster has workers
 _SECONDS_WITHOUT_WORKERS = 600.0  # after which a build ends whose workers have all gone
 _SECONDS_TO_STOP = 60.0  # for the workers to write their finished items; a second Ctrl-C ends the wait
@@ -112,17 +113,22 @@ def check_scheduler(address: str) -> None:
     except ImportError as error:
         raise InputError(f"--scheduler {address}: Dask is not installed; pip install 'vbnfault[dask]'") from error
     try:
-        if comm.parse_address(address)[0] in ("inproc", "ucx"):  # these do not use TCP
-            return
-        host, port = comm.get_address_host_port(address)
+        protocol = comm.parse_address(address)[0]
+        host, port = (None, 0) if protocol in _WITHOUT_TCP else comm.get_address_host_port(address)
     except ValueError as error:
         raise InputError(f"--scheduler {address}: is no address such as tcp://host:8786: {error}") from error
     try:
-        socket.create_connection((host, port), timeout=_SECONDS_TO_CONNECT).close()
+        if host is not None:
+            socket.create_connection((host, port), timeout=_SECONDS_TO_CONNECT).close()
     except (OSError, OverflowError, UnicodeError) as error:
         raise InputError(f"--scheduler {address}: nothing answers there: {error}") from error
     with ThreadPoolExecutor(1) as pool:  # another thread: an event loop may be running in the caller's
         kind = pool.submit(asyncio.run, _kind_of_dask_node(address)).result()
+    if not kind and host is None:
+        raise InputError(
+            f"--scheduler {address}: no Dask scheduler answers there, or the protocol {protocol} is not installed; "
+            "use an address such as tcp://host:8786"
+        )
     if not kind:
         raise InputError(f"--scheduler {address}: what listens there does not answer as a Dask scheduler does")
     if kind != "Scheduler":

@@ -47,6 +47,7 @@ def _worker(factory: WorkerFactory, pipe: connection.Connection) -> None:
     """Run a worker process: receive tasks from the pipe, and send events back. It ends when its parent ends."""
     with contextlib.suppress(EOFError, OSError, interrupts.Stopped), streams.steady():
         interrupts.obey_parent()
+        streams.warn_in_sentences()
         threading.Thread(target=_die_with_parent, daemon=True).start()
         worker = factory()
         while True:

@@ -109,6 +109,12 @@ def with_severity(
         raise InputError(f"{where}.severity = {level}: sets {severity.key}, which is given, too; leave one out")
     value = _value(levels, model, severity, level, f"{where}.severity = {level}")
     declared = next(f.metadata for f in dataclasses.fields(model) if f.name == severity.key)
+    most = declared["limits"][1]
+    if not (0 < value <= most and math.isfinite(value)):
+        raise InputError(
+            f"{where}.severity = {level}: {levels.path or 'the packaged table'} has {severity.key} = {value:g} "
+            f"there: must be a number above 0 and at most {most:g}"
+        )
     rest = {key: value for key, value in table.items() if key != "severity"}
     return {**severity.keys, **rest, severity.key: severity.setting(value, declared)}
 

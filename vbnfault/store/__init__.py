@@ -41,6 +41,7 @@ from .files import Location, files_of, located
 from .formats import FORMAT_VERSION
 from .group import check_free, create, is_store, open_store, write_samples
 from .labelled import open_dataset
+from .layout import is_sealed, sealed
 from .metadata import append_samples, recover
 from .migration import check_target, migrate, migrate_copy
 from .opened import Store
@@ -86,6 +87,7 @@ __all__ = [
     "examine",
     "examine_shard",
     "files_of",
+    "is_sealed",
     "is_store",
     "located",
     "mask_union",
@@ -95,6 +97,7 @@ __all__ = [
     "open_store",
     "problem_samples",
     "recover",
+    "sealed",
     "spans",
     "unplanned_samples",
     "verify",

@@ -95,9 +95,8 @@ class ChunkWorker:
         If `tick` raises OSError, they are not: the study that started this worker has ended.
         """
         folder = self._source.path
-        outcomes: dict[int, Mapping[str, Any]] = dict(results.read_chunk(folder, task.number))
+        outcomes, seconds_before = _finished(folder, task.number)
         unwritten, written = 0, time.monotonic()
-        seconds_before = results.read_seconds(folder, task.number)
 
         def write() -> None:
             now = Counter(self._evaluator().timings())
@@ -156,6 +155,13 @@ class ChunkWorker:
         return {name: float(values[name]) for name in self._source.metrics}
 
 
+def _finished(folder: Path, chunk: int) -> tuple[dict[int, dict[str, Any]], dict[str, float]]:
+    """Return the finished evaluations of a chunk and what they took; none where its file is damaged."""
+    with contextlib.suppress(ValueError):
+        return results.read_chunk(folder, chunk)
+    return {}, {}
+
+
 @contextlib.contextmanager
 def _as_error(folder: Path) -> Iterator[None]:
     """Turn an OSError of a block that writes rows into a VbnfaultError."""
@@ -181,9 +187,12 @@ class StudyJob:
             for first in range(0, in_block, size)
         ]
         self._queue = Queue({n: chunk.start // in_block for n, chunk in enumerate(self._chunks)})
-        self.finished = sum(
-            len(results.read_chunk(path, number).keys() & set(chunk)) for number, chunk in enumerate(self._chunks)
-        )
+        self.finished = 0
+        for number, chunk in enumerate(self._chunks):
+            try:
+                self.finished += len(results.read_chunk(path, number)[0].keys() & set(chunk))
+            except ValueError as damaged:
+                progress.say(f"note: {damaged}; its evaluations are made again")
         self.failures: dict[int, str] = {}
         self._succeeded = 0
         self._counted: set[int] = set()
@@ -227,7 +236,7 @@ class StudyJob:
         """Return values and error of each evaluation, in order."""
         outcomes: list[dict[str, Any]] = []
         for number, chunk in enumerate(self._chunks):
-            finished = results.read_chunk(self.path, number)
+            finished, _ = _finished(self.path, number)
             for i in chunk:
                 error = self.failures.get(i, "not evaluated").splitlines()[0]
                 outcomes.append(finished.get(i, {"values": {}, "error": error}))
@@ -237,7 +246,7 @@ class StudyJob:
         """Return the seconds that all finished evaluations took, by stage, in this run and in those before."""
         seconds: Counter[str] = Counter()
         for number in range(self.tasks):
-            seconds.update(results.read_seconds(self.path, number))
+            seconds.update(_finished(self.path, number)[1])
         return dict(seconds)
 
     def raise_failures(self, indices: Any, why: str = "") -> None:

@@ -20,6 +20,7 @@ from .distributions import Categorical
 from .spec import Evaluation, StudySpec
 
 _MOST_ROWS = 10_000_000
+_ANALYSED_BY_SALIB = {"morris": "analyze.morris", "latin_hypercube": "analyze.delta"}
 
 
 @dataclass(frozen=True)
@@ -84,7 +85,12 @@ def _plain(value: Any) -> float | str:
 
 
 def make_design(spec: StudySpec) -> Design:
-    """Return the design of a study. Raises InputError if it is too large, or if its library is missing."""
+    """Return the design of a study. Raises InputError if it is too large, or if its library is missing.
+
+    That includes the library that computes the indices in the end.
+    """
+    if spec.design.method in _ANALYSED_BY_SALIB:
+        salib(_ANALYSED_BY_SALIB[spec.design.method], f"design.method = {spec.design.method!r}")
     makers: dict[str, Callable[[StudySpec, int], tuple[NDArray[np.float64], Iterator[str]]]] = {
         "sobol": _sobol,
         "morris": _morris,

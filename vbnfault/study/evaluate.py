@@ -403,9 +403,11 @@ class SceneEvaluator:
         if source is None:
             if of_scene is None:
                 unchanged = {"kept": exposed.clean, "added": np.zeros_like(exposed.clean)}
-                return {**unchanged, "parts_e": {}, "ghosts_e": ()}
+                return {**unchanged, "direct": exposed.direct_e, "parts_e": {}, "ghosts_e": ()}
             remaining = 1 - fault.scene_lost(params, exposed.context).astype(np.float32)[:, None, None]
-            return {"kept": exposed.clean * remaining, "added": of_scene, "parts_e": {}, "ghosts_e": ()}
+            direct = None if exposed.direct_e is None else exposed.direct_e * remaining
+            kept_e = exposed.clean * remaining
+            return {"kept": kept_e, "direct": direct, "added": of_scene, "parts_e": {}, "ghosts_e": ()}
         light: SunlightInLens = source.light
         camera, pitch_mm = exposed.camera, light.sensor.pitch_mm
         per_s = camera.detector.electron_rate_weights(light.nodes_nm) * source.irradiance_W_m2_nm
@@ -443,12 +445,26 @@ class SceneEvaluator:
             for channel, plane in enumerate(added):
                 plane += veil_plane * sun_veil[channel]
                 plane += of_scene[channel]
-            left = scene_e * (1 - lost).astype(np.float32)[:, None, None]
+            left, direct = scene_e * (1 - lost).astype(np.float32)[:, None, None], None
             if exposed.direct_e is not None:
-                left += exposed.direct_e * direct_left.astype(np.float32)[:, None, None]
+                direct = exposed.direct_e * direct_left.astype(np.float32)[:, None, None]
+                left += direct
+            ghosts = parts["ghosts"][0].mean(axis=0) * seconds
+            reference = self._traced_ghosts(light, per_s * light.past_baffle)
+            reference = None if reference is None else reference.mean(axis=0) * seconds
         ghosts_e = self._single_ghosts(light, per_s * light.past_baffle * camera.exposure_s / pitch_mm**2)
         totals = {name: float(total.mean() * camera.exposure_s) for name, (_, total) in parts.items()}
-        return {"kept": left, "added": added, "parts_e": totals, "ghosts_e": ghosts_e}
+        spatial = {"direct": direct, "ghosts": ghosts, "traced_ghosts": reference}
+        return {"kept": left, "added": added, "parts_e": totals, "ghosts_e": ghosts_e, **spatial}
+
+    def _traced_ghosts(self, light: SunlightInLens, weights: F64) -> F32 | None:
+        """Return the ghosts of exact rays, float32[channel, y, x] per second; None where no metric compares."""
+        if "ghost_difference" not in self.spec.metrics.names:
+            return None
+        ghosts = replace(light.settings.ghosts, model="traced")
+        traced = replace(light, settings=replace(light.settings, ghosts=ghosts))
+        levels = self.kept.once("ghosts", traced.ghost_key, traced.ghost_levels)
+        return self._channels("ghosts", levels.mixed, traced.ghost_key, weights)[0]
 
     def _channels(self, name: str, mixed: Callable[[F64], F32], key: Hashable, weights: F64) -> tuple[F32, F64]:
         """Return a part of straylight in electrons per second, float32[channel, y, x], and its sums by channel."""
@@ -637,4 +653,5 @@ def _added_by(fault: Fault, exposed: Exposed, params: Any) -> dict[str, Any]:
     clean = exposed.exposure.rate.scaled(exposed.camera.exposure_s)
     image = act(fault, clean, params, exposed.context).merged.array
     added = np.ascontiguousarray(np.moveaxis(image, -1, 0)) - exposed.clean
-    return {"kept": exposed.clean, "added": np.maximum(added, 0), "parts_e": {}, "ghosts_e": ()}
+    light = {"kept": exposed.clean, "direct": exposed.direct_e, "added": np.maximum(added, 0)}
+    return {**light, "parts_e": {}, "ghosts_e": ()}

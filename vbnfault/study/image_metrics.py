@@ -1,9 +1,10 @@
 """Compute metrics of straylight in an image, in electrons before the converter.
 
-Symbols: S is the expected signal of the scene and the Sun's direct image with straylight, V the light that
-straylight adds (that of the Sun and the veil of the scene), S₀ the signal without straylight, all in electrons per
-pixel and channel. A number "per pixel" is the mean of the channels of the sensor (R, G, B, or those of the mosaic,
-each with the same weight). No noise is drawn: the noise of a pixel is the detector's own model,
+Symbols: S is the expected signal of the scene and the Sun's direct image with straylight, D☉ the part of S that is
+the Sun's direct image, V the light that straylight adds (that of the Sun and the veil of the scene), G the ghosts
+in V, S₀ the signal without straylight, all in electrons per pixel and channel. A number "per pixel" is the mean of
+the channels of the sensor (R, G, B, or those of the mosaic, each with the same weight). No noise is drawn: the
+noise of a pixel is the detector's own model,
 
     σ² = S + V + D + r²,
 
@@ -56,6 +57,11 @@ class LitImage:
         float32[channel]: signal that the 8-bit image shows as 255.
     mask_level_dn
         Change of the 8-bit image from which a pixel belongs to the mask.
+    direct
+        D☉, what straylight leaves of the Sun's direct image, which `kept` contains; None out of view.
+    ghosts, traced_ghosts
+        float32[y, x]: G per pixel, and that of exact rays through the same lens; None for a model that does not
+        separate ghosts, and where no metric needs them.
     """
 
     clean: F32
@@ -69,6 +75,9 @@ class LitImage:
     full_well_e: float
     white_e: F32
     mask_level_dn: float
+    direct: F32 | None = None
+    ghosts: F32 | None = None
+    traced_ghosts: F32 | None = None
 
     @cached_property
     def added_mean(self) -> F32:
@@ -105,6 +114,62 @@ def _part(name: str) -> Value:
     return lambda image: image.parts_e.get(name, float("nan"))
 
 
+def _ghosts(of: Callable[[F32, LitImage], float]) -> Value:
+    """Return the function that gives a value of the ghosts; nan where there are none or they are unknown."""
+
+    def value(image: LitImage) -> float:
+        ghosts = image.ghosts
+        return float("nan") if ghosts is None or not ghosts.any() else of(ghosts, image)
+
+    return value
+
+
+def _moments(ghosts: F32) -> tuple[float, float]:
+    """Return the distance of the centre of brightness from the frame's middle, and the rms radius, in pixels."""
+    weights = ghosts.astype(np.float64) / ghosts.sum(dtype=np.float64)
+    total, square = 0.0, 0.0
+    for axis, size in enumerate(weights.shape):
+        of_axis, place = weights.sum(axis=1 - axis), np.arange(size) - (size - 1) / 2
+        mean = float(of_axis @ place)
+        total += mean**2
+        square += float(of_axis @ (place - mean) ** 2)
+    return float(np.sqrt(total)), float(np.sqrt(square))
+
+
+def _ghost_difference(ghosts: F32, image: LitImage) -> float:
+    traced = image.traced_ghosts
+    if traced is None or not traced.any():
+        return float("nan")
+    return float(np.abs(ghosts - traced).sum(dtype=np.float64) / traced.sum(dtype=np.float64))
+
+
+def _noise_variance(image: LitImage) -> F32:
+    """Return the variance of the noise without straylight, S₀ + D + r²."""
+    dark = np.asarray(image.dark_e, dtype=np.float32) + np.float32(image.read_noise_e**2)
+    return np.asarray(image.clean_mean + dark)
+
+
+def _above(light: F32, image: LitImage) -> float:
+    """Return the fraction of pixels whose light exceeds the noise without straylight."""
+    return float(np.count_nonzero(light * light > _noise_variance(image)) / light.size)
+
+
+def _sun_direct(image: LitImage) -> float:
+    return 0.0 if image.direct is None else float(image.direct.mean(axis=0).sum(dtype=np.float64))
+
+
+def _over_signal(image: LitImage) -> float:
+    signal = float(image.kept.mean(axis=0).sum(dtype=np.float64)) - _sun_direct(image)
+    return _straylight_total(image) / signal if signal > 0 else float("nan")
+
+
+def _veiling_glare_index(image: LitImage) -> float:
+    if not len(image.lit):
+        return float("nan")
+    kept, added, _ = image.on_lit
+    return _veil_median(image) / float(np.median(kept + added))
+
+
 def _veil_median(image: LitImage) -> float:
     values = image.added_mean.ravel()
     return float(np.partition(values, len(values) // 2)[len(values) // 2])
@@ -123,9 +188,7 @@ def _above_1dn(image: LitImage) -> float:
 
 
 def _above_noise(image: LitImage) -> float:
-    dark = np.asarray(image.dark_e, dtype=np.float32) + np.float32(image.read_noise_e**2)
-    variance = image.clean_mean + dark
-    return float(np.count_nonzero(image.added_mean * image.added_mean > variance) / variance.size)
+    return _above(image.added_mean, image)
 
 
 def _saturated(image: LitImage) -> float:
@@ -176,6 +239,38 @@ _ALL: dict[str, tuple[Metric, Value]] = {
         _metric(
             "ghost_total_e", "electrons", "Light of all ghosts in the frame", _part("ghosts"), "Hullin et al. 2011"
         ),
+        _metric(
+            "ghost_peak_e",
+            "electrons",
+            "Most light of ghosts in a pixel, max G",
+            _ghosts(lambda g, _: float(g.max())),
+        ),
+        _metric(
+            "ghost_area",
+            "1",
+            "Fraction of pixels to which ghosts alone add more than the noise without straylight, G > √(S₀ + D + r²)",
+            _ghosts(_above),
+            "EMVA 1288",
+        ),
+        _metric(
+            "ghost_offset_px",
+            "px",
+            "Distance of the centre of brightness of all ghosts, Σ G r / Σ G, from the middle of the frame",
+            _ghosts(lambda g, _: _moments(g)[0]),
+        ),
+        _metric(
+            "ghost_spread_px",
+            "px",
+            "Root mean square distance of the ghosts' light from its centre of brightness",
+            _ghosts(lambda g, _: _moments(g)[1]),
+        ),
+        _metric(
+            "ghost_difference",
+            "1",
+            "Difference of the ghosts, pixel by pixel, from those of exact rays through the same lens, "
+            "Σ |G − G traced| / Σ G traced; 0 for the model traced, and up to 2",
+            _ghosts(_ghost_difference),
+        ),
         _metric("starburst_total_e", "electrons", "Light in the frame that the stop diffracts", _part("starburst")),
         _metric(
             "glare_total_e",
@@ -194,6 +289,27 @@ _ALL: dict[str, tuple[Metric, Value]] = {
             "the ground appears as m S / (S + V)",
             _contrast_loss,
             "ISO 9358:1994",
+        ),
+        _metric(
+            "veiling_glare_index",
+            "1",
+            "Veil over the light of the sunlit ground, median of V over the frame / median of S + V over the ground: "
+            "the Sun and the ground stand for the bright field of the standard, the median for its black area",
+            _veiling_glare_index,
+            "ISO 9358:1994",
+        ),
+        _metric(
+            "straylight_over_signal",
+            "1",
+            "Light that straylight adds over that of the scene without the Sun's direct image, Σ V / Σ (S − D☉)",
+            _over_signal,
+        ),
+        _metric(
+            "sun_direct_e",
+            "electrons",
+            "Light of the Sun's direct image that straylight leaves, Σ D☉; it is no part of V",
+            _sun_direct,
+            better="high",
         ),
         _metric(
             "pixels_above_1dn",

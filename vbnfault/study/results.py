@@ -16,6 +16,7 @@ import numpy as np
 
 from ..core.errors import InputError
 from ..core.whole_files import replacing
+from ..store import is_sealed, sealed
 from .designs import Design
 from .distributions import Categorical
 from .spec import DUMMY, Metric
@@ -88,7 +89,7 @@ def write_table(
         add(metric.name, column, pa.float64(), **about)
     table = pa.Table.from_arrays(columns, schema=pa.schema(fields, metadata={"title": spec.title}))
     with replacing(path) as temporary:
-        parquet.write_table(table, temporary)
+        parquet.write_table(table, temporary, write_page_checksum=True)
     return table
 
 
@@ -99,7 +100,10 @@ def read_table(folder: str | Path) -> pyarrow.Table:
     path = Path(folder) / TABLE
     if not path.is_file():
         raise InputError(f"{path}: no such file; a study writes it when it is complete")
-    return parquet.read_table(path)
+    try:
+        return parquet.read_table(path, page_checksum_verification=True)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: damaged ({error}); the command of the study writes it again") from None
 
 
 def holds_design(table: pyarrow.Table, design: Design) -> bool:
@@ -170,34 +174,26 @@ def write_chunk(
     path = chunk_path(folder, chunk)
     record = {str(index): outcomes[index] for index in sorted(outcomes)} | {_SECONDS: dict(seconds)}
     with replacing(path) as temporary, open(temporary, "w", encoding="utf-8") as file:
-        json.dump(record, file)
+        json.dump(sealed(record), file)
         file.flush()
         os.fsync(file.fileno())
 
 
-def read_chunk(folder: Path, chunk: int) -> dict[int, dict[str, Any]]:
-    """Return the finished evaluations of a chunk; none where the file is missing or no whole one."""
+def read_chunk(folder: Path, chunk: int) -> tuple[dict[int, dict[str, Any]], dict[str, float]]:
+    """Return the finished evaluations of a chunk, and what they took, by stage; none where there is no file.
+
+    Raises ValueError if the file is damaged: its evaluations must be made again.
+    """
     try:
-        return {
-            int(index): {"values": dict(outcome["values"]), "error": str(outcome["error"])}
-            for index, outcome in _chunk(folder, chunk).items()
-            if index != _SECONDS
-        }
-    except (OSError, ValueError, TypeError, KeyError, AttributeError):
-        return {}
-
-
-def read_seconds(folder: Path, chunk: int) -> dict[str, float]:
-    """Return what the finished evaluations of a chunk took, by stage; nothing where this is not known."""
-    try:
-        return {str(stage): float(seconds) for stage, seconds in _chunk(folder, chunk).get(_SECONDS, {}).items()}
-    except (OSError, ValueError, TypeError, AttributeError):
-        return {}
-
-
-def _chunk(folder: Path, chunk: int) -> Any:
-    """Return the record of a chunk."""
-    return json.loads(chunk_path(folder, chunk).read_text(encoding="utf-8"))
+        record = json.loads(chunk_path(folder, chunk).read_text(encoding="utf-8"))
+        intact = is_sealed(record)
+    except FileNotFoundError:
+        return {}, {}
+    except (OSError, ValueError, AttributeError, RecursionError):
+        intact = False
+    if not intact:
+        raise ValueError(f"{chunk_path(folder, chunk)}: damaged")
+    return {int(index): record[index] for index in record if index.isdigit()}, record[_SECONDS]
 
 
 def partial_files(folder: Path) -> Iterator[Path]:

@@ -216,6 +216,7 @@ def describe_study(study: StudySpec | str | Path, *, overrides: Mapping[str, Any
         f"{spec.design.method}, n = {spec.design.n}: {product} = {len(plan.design)} evaluations",
         f"factors: {', '.join(factors)}",
         f"metrics: {', '.join(metrics)}",
+        *(f"warning: {sentence}" for sentence in _too_few(spec)),
     ]
 
 
@@ -324,12 +325,9 @@ def _chosen_metrics(evaluator: Evaluator, spec: StudySpec, source: str) -> tuple
 
 
 def _check_half_width(spec: StudySpec, source: str) -> None:
-    """Raise InputError if the study asks for a half-width that needs more samples even in the best case."""
-    n, asked = spec.design.n, spec.design.half_width
-    if asked is None:
-        return
-    least = indices_module.least_samples(len(spec.factors), asked, spec.design.confidence)
-    if n < least:
+    """Raise InputError if the study asks for a half-width that no study of this size has."""
+    n, asked, least = spec.design.n, spec.design.half_width, indices_module.LEAST_SAMPLES_OF_INTERVALS
+    if asked is not None and n < least and asked < 0.5:
         raise InputError(
             f"{source}: design.n = {n}: too few samples for half_width = {asked:g}, which needs at least "
             f"n = {least}, and more where the metric is no smooth function of the factors; design.half_width = 0 "
@@ -416,11 +414,11 @@ def _flat(node: Any, above: str = "") -> Iterator[tuple[str, Any]]:
 
 def _evaluate(source: ChunkWorkers, evaluator: Evaluator, job: StudyJob, options: BuildOptions) -> tuple[str, ...]:
     """Do all chunks on a cluster, here, or in worker processes, and return the warnings of the evaluator."""
-    warnings: tuple[str, ...] = ()
+    warnings = tuple(_too_few(source.spec))
     try:
         if job.finished < len(job.design):
             with source.contents.in_use():
-                warnings = tuple(evaluator.check() or ())
+                warnings += tuple(evaluator.check() or ())
         _warn(warnings)
         with job.progress:
             if options.scheduler is not None:
@@ -485,6 +483,15 @@ def _write_report(
     except VbnfaultError as error:
         print(f"warning: {path}: no images of best and worst values: {error}", file=sys.stderr)
     write_report(path, data, table, plain)
+
+
+def _too_few(spec: StudySpec) -> Iterator[str]:
+    """Yield sentences on what a design with few points cannot tell."""
+    n, method, least = spec.design.n, spec.design.method, indices_module.LEAST_SAMPLES_OF_INTERVALS
+    if method in ("sobol", "latin_hypercube") and n < least:
+        yield f"design.n = {n}: below n = {least} intervals of indices are 0 to 1: so few points tell nothing"
+    if method == "latin_hypercube" and n < (of_delta := indices_module.LEAST_SAMPLES_OF_DELTA):
+        yield f"design.n = {n}: delta needs n = {of_delta}, so this study gives none"
 
 
 def _missed_half_widths(spec: StudySpec, data: xr.Dataset) -> list[str]:

@@ -66,9 +66,9 @@ class Criterion:
         if not 0 <= self.quantile <= 1:
             raise InputError(f"quantile = {self.quantile:g}: must be from 0 to 1")
         if len(self.errors) != LEVELS or not all(
-            0 < a < b for a, b in zip(self.errors, self.errors[1:], strict=False)
+            0 < a < b < np.inf for a, b in zip(self.errors, self.errors[1:], strict=False)
         ):
-            raise InputError(f"errors = {list(self.errors)}: must be {LEVELS} rising numbers above 0")
+            raise InputError(f"errors = {list(self.errors)}: must be {LEVELS} rising, finite numbers above 0")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -91,6 +91,8 @@ class SampleDataset(Dataset[Batch]):
         masks: str = "footprint",
         transform: Transform | None = None,
     ) -> None:
+        if transform is not None and not callable(transform):
+            raise InputError(f"transform = {shown(transform)}: must be a function of a sample, or None")
         opened = open_store(store)
         self.path = opened.path
         self.targets = Targets(opened, targets, classes, masks)
@@ -161,8 +163,8 @@ class SampleDataset(Dataset[Batch]):
         This is the `pos_weight` for the target `masks`, after `[:, None, None]`. `most`: number of samples that are
         read, evenly spaced over the chosen ones.
         """
-        if most < 1:
-            raise InputError(f"most = {shown(most)}: must be at least 1")
+        if type(most) is not int or most < 1:
+            raise InputError(f"most = {shown(most)}: must be a whole number of at least 1")
         layer = next((t for t in ("mask", "mask_effect") if t in self.targets.layers), "")
         if not layer:
             raise InputError("pixel_weights: the dataset reads no masks; add masks to targets")
@@ -284,11 +286,12 @@ class BatchDataset(IterableDataset[Batch]):
 
     def set_epoch(self, epoch: int, batch: int = 0) -> None:
         """Choose the epoch, and its first batch, of the next iteration."""
-        self._position[0], self._position[1] = checked_epoch(epoch), batch
+        self._position[0], self._position[1] = checked_epoch(epoch), self.order.checked_batch(batch)
 
     def state_dict(self, batches: int = 0) -> dict[str, Any]:
         """Return the state after the training loop has used `batches` batches since `set_epoch`."""
-        return self.order.state(int(self._position[0]), int(self._position[1]) + batches)
+        epoch, first = (int(number) for number in self._position)
+        return self.order.state(epoch, first + self.order.checked_batch(batches))
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from a state in the next iteration. Raises InputError if it is of another order."""
@@ -346,6 +349,8 @@ def _order(
         parallel = torch.distributed
         known = parallel.is_available() and parallel.is_initialized()
         ranks = (parallel.get_rank(), parallel.get_world_size()) if known else (0, 1)
+    if not isinstance(ranks, tuple | list) or len(ranks) != 2:
+        raise InputError(f"ranks = {shown(ranks)}: must be two whole numbers, the rank and the number of ranks")
     return Order(
         samples=data.samples,
         shard_samples=data.targets.spec.shard_samples,

@@ -124,10 +124,14 @@ class Order:
 
     def state(self, epoch: int, batch: int) -> dict[str, Any]:
         """Return plain data that say which batch of which epoch comes next, and of which order."""
-        return {"epoch": epoch, "batch": batch} | {name: getattr(self, name) for name in _OF_STATE}
+        return {"epoch": epoch, "batch": self.checked_batch(batch)} | {
+            name: getattr(self, name) for name in _OF_STATE
+        }
 
     def position(self, state: Mapping[str, Any]) -> tuple[int, int]:
         """Return epoch and next batch of a state. Raises InputError if it is of another order."""
+        if not isinstance(state, Mapping):
+            raise InputError(f"state = {shown(state)}: must be what state_dict() returned, a mapping")
         epoch, batch = state.get("epoch"), state.get("batch")
         if not (is_count(epoch) and is_count(batch)):
             raise InputError("state: it must hold epoch and batch, whole numbers from 0 to 2⁶³ - 1")
@@ -137,7 +141,16 @@ class Order:
                 if name == "samples_sha256":
                     raise InputError("state: it belongs to other samples; choose the same store, split and filter")
                 raise InputError(f"state: its {name} = {shown(saved)}, but here {name} = {shown(own)}")
-        return epoch, batch
+        return epoch, self.checked_batch(batch)
+
+    def checked_batch(self, batch: int) -> int:
+        """Return the number of a batch. Raises InputError if an epoch ends before it."""
+        number = int(batch) if isinstance(batch, np.integer) else batch
+        if not is_count(number) or number > len(self):
+            raise InputError(
+                f"batch = {shown(batch)}: must be a whole number from 0 to {len(self)}, the batches of an epoch"
+            )
+        return number
 
 
 def is_count(value: object) -> TypeGuard[int]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,6 +75,8 @@ def select(
     InputError
         For a split or a class that the store lacks, or if no sample is left.
     """
+    if where is not None and not callable(where):
+        raise InputError(f"where = {shown(where)}: must be a function of the scalars of all samples, or None")
     columns = Columns(store)
     if len(columns.samples) < store.samples:
         warnings.warn(
@@ -108,6 +110,8 @@ def select(
 
 def known_classes(store: Store, names: Sequence[str], key: str) -> tuple[str, ...]:
     """Return the names of fault classes. Raises InputError if the store lacks one or a name is there twice."""
+    if not isinstance(names, Collection):
+        raise InputError(f"{key} = {shown(names)}: must be a list of names")
     chosen = (names,) if isinstance(names, str) else tuple(names)
     for name in chosen:
         if name not in store.spec.faults:

@@ -72,7 +72,7 @@ class Targets:
             raise InputError(f"targets = {shown(names)}: must be a list of names")
         self.names = tuple(dict.fromkeys(["image", *((names,) if isinstance(names, str) else names)]))
         self.classes = store.spec.faults if classes is None else known_classes(store, classes, "classes")
-        if masks not in MASK_RULES:
+        if masks not in tuple(MASK_RULES):
             raise InputError(f"masks = {shown(masks)}: must be one of {', '.join(MASK_RULES)}")
         self._of: dict[str, Target] = {name: self._target(store, name, MASK_RULES[masks]) for name in self.names}
         self._chosen = (

@@ -1,14 +1,18 @@
 """Write the files of an export durably, and keep a record of the parts that are finished.
 
     export.json             what is exported, in which format; written first and, when all is done, last
-    .parts/00012.json       the record of a finished part: its files with their sizes, and its entries
+    SHA256SUMS              checksum and name of each file, as `sha256sum --check` reads them
+    .parts/00012.json       the record of a finished part: its files with their checksums, its entries, and a
+                            checksum of all that
 
-A part's record is written after its files, so a part with a record needs no work when an export is resumed. The
-folder `.parts` is removed at the end.
+A part's record is written after its files, so a part with a record needs no work when an export is resumed and the
+files have their checksums still. The folder `.parts` is removed at the end; then `SHA256SUMS` tells a later command
+whether the export is whole. If not, all its files are written again.
 """
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 import json
 import re
@@ -18,9 +22,10 @@ from typing import Any
 
 from ...core.errors import InputError
 from ...core.path_checks import check_folder
-from ...store import disk
+from ...store import disk, is_sealed, sealed
 
 STATE = "export.json"
+SUMS = "SHA256SUMS"
 _PARTS = ".parts"
 _OWN = re.compile(rf"{re.escape(STATE)}\.[0-9a-f]{{32}}{re.escape(disk.PARTIAL)}")
 _UNSAID = {"masks": "footprint", "min_area_px": 1}  # what holds where `export.json` does not name a key
@@ -28,14 +33,14 @@ _FILES_AT_ONCE = 8  # files that are open and in memory at once, in each thread
 
 
 class Folder:
-    """Write files of one export; `sizes` has the size in bytes of each file written by this object."""
+    """Write files of one export; `checksums` has the sha256 (hex) of each file written by this object."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.sizes: dict[str, int] = {}
+        self.checksums: dict[str, str] = {}
 
     def fresh(self) -> Folder:
-        """Return the same folder with no file in `sizes`."""
+        """Return the same folder with no file in `checksums`."""
         return Folder(self.path)
 
     def put(self, files: Iterable[tuple[str, bytes]]) -> None:
@@ -43,14 +48,14 @@ class Folder:
         rest = iter(files)
         while batch := list(itertools.islice(rest, _FILES_AT_ONCE)):
             disk.write(self.path, batch)
-            self.sizes |= {name: len(content) for name, content in batch}
+            self.checksums |= {name: hashlib.sha256(content).hexdigest() for name, content in batch}
 
     def put_with(self, name: str, make: Callable[[Path], object]) -> None:
         """Write one file by a function that gets a temporary path; it is complete or not there."""
         target = self.path / name
         target.parent.mkdir(parents=True, exist_ok=True)
         disk.write_with(target, make)
-        self.sizes[name] = target.stat().st_size
+        self.checksums[name] = _sha256(target)
 
     # --- what an earlier command has done -------------------------------------------------------------------
 
@@ -84,10 +89,18 @@ class Folder:
                 "choose another --out, or delete the folder"
             )
         disk.remove_partials(self.path)
-        return bool(state.get("complete"))
+        return bool(state.get("complete")) and self._is_whole()
 
-    def end(self, identity: dict[str, Any]) -> None:
-        """Mark the export as complete and remove what only its resumption needs."""
+    def end(self, identity: dict[str, Any], parts: int) -> None:
+        """Mark an export of `parts` parts as complete and remove what only its resumption needs."""
+        own = dict(self.checksums)
+
+        def write_sums(path: Path) -> None:
+            with path.open("w", encoding="utf-8") as file:
+                for files in (*(self.part(number)["files"] for number in range(parts)), own):
+                    file.writelines(f"{checksum}  {name}\n" for name, checksum in files.items())
+
+        self.put_with(SUMS, write_sums)
         self._write_state(identity, complete=True)
         self.clear()
 
@@ -96,6 +109,21 @@ class Folder:
         if (self.path / _PARTS).is_dir():
             disk.remove_tree(self.path / _PARTS)
 
+    def _is_whole(self) -> bool:
+        """Return whether all files of a complete export have their checksums still."""
+        try:
+            lines = disk.read(self.path / SUMS).decode().splitlines()
+        except (OSError, ValueError):
+            return False
+        return all(self._has(name, checksum) for checksum, _, name in (line.partition("  ") for line in lines))
+
+    def _has(self, name: str, checksum: str) -> bool:
+        """Return whether a file has a checksum."""
+        try:
+            return _sha256(self.path / name) == checksum
+        except OSError:
+            return False
+
     def _write_state(self, identity: dict[str, Any], *, complete: bool) -> None:
         """Write what is exported, and whether all of it is there."""
         state = {"kind": "vbnfault export", **identity, "complete": complete}
@@ -103,30 +131,38 @@ class Folder:
 
     def part(self, number: int) -> dict[str, Any]:
         """Return the record of a finished part."""
-        record = _document(self.path / _PARTS / _part_name(number))
+        record = self._record(number)
         if record is None:
-            raise InputError(f"{self.path}: {_PARTS}/{_part_name(number)} is missing; run the same command again")
+            raise InputError(
+                f"{self.path}: {_PARTS}/{_part_name(number)} is missing or damaged; run the same command again"
+            )
         return record
 
     def write_part(self, number: int, record: dict[str, Any]) -> None:
         """Write the record of a part whose files are written; the files of this object are added to it."""
-        text = json.dumps({**record, "files": self.sizes}, allow_nan=False)
+        text = json.dumps(sealed({**record, "files": self.checksums}), allow_nan=False)
         disk.write(self.path, [(f"{_PARTS}/{_part_name(number)}", text.encode())])
 
     def has_part(self, number: int) -> bool:
-        """Return whether a part is finished and its files have their sizes still."""
+        """Return whether a part is finished and its files have their checksums still."""
+        record = self._record(number)
+        return record is not None and all(self._has(*file) for file in record["files"].items())
+
+    def _record(self, number: int) -> dict[str, Any] | None:
+        """Return the record of a part; None if there is none, or a damaged one."""
         record = _document(self.path / _PARTS / _part_name(number))
-        try:
-            return record is not None and all(
-                (self.path / name).stat().st_size == size for name, size in record["files"].items()
-            )
-        except (OSError, KeyError):
-            return False
+        return record if record is not None and is_sealed(record) else None
 
 
 def _part_name(number: int) -> str:
     """Return the file name of a part's record."""
     return f"{number:06d}.json"
+
+
+def _sha256(path: Path) -> str:
+    """Return the sha256 of a file (hex)."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _document(path: Path) -> dict[str, Any] | None:

@@ -122,7 +122,7 @@ def export_store(
         with Progress(store.samples, shown=progress) as bar:
             written = _write_parts(store, kind, parts, folder, bar, workers, masks)
         warnings = _finish(store, kind, parts, folder, masks)
-        folder.end(identity)
+        folder.end(identity, len(parts))
     return ExportSummary(path=target, format=format, samples=store.samples, written=written, warnings=warnings)
 
 
