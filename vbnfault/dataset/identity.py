@@ -126,6 +126,8 @@ def _leave_out_unused(identity: dict[str, Any], scene: Scene) -> None:
         ("dataset", "radiance_dtype"),
         ("camera", "exposure_stops"),
         ("patch", "facet_px"),
+        ("plan", "order"),
+        ("plan", "unusable_views"),
     ):
         values = getattr(scene, table)
         if getattr(values, key) == type(values).model_fields[key].default:

@@ -33,12 +33,16 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Terrain:
-    """Hold a site, the renderer's copy of its patch, and the spacecraft above it if there is one."""
+    """Hold a site, the renderer's copy of its patch, and the spacecraft above it if there is one.
+
+    `of_shard` keeps what the samples of a shard need that exchange views.
+    """
 
     body: Body
     site: Site
     surface: TerrainMesh
     vehicle: SpacecraftMesh | None = None
+    of_shard: SharedResults = field(default_factory=lambda: SharedResults(kept=True))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
