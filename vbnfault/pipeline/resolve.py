@@ -223,10 +223,13 @@ def _usable(
         met[of_the_frame if lit_fraction else f"sunlit ground, for {', '.join(needing_light)}"] = enough | ~good
         good = good & enough
     good[count:] = False
-    for k in np.flatnonzero(good) if vehicle is not None else ():
-        parts = views.position_L_m[k] + vehicle.outline_B_m @ views.L_from_C[k].T
-        good[k] = not render.is_between(surface, views.position_L_m[k], parts)
-        met.setdefault("the spacecraft above the ground", np.ones(len(good), dtype=bool))[k] = good[k]
+    if vehicle is not None:
+        above = np.ones(len(good), dtype=bool)
+        for k in np.flatnonzero(good):
+            parts = views.position_L_m[k] + vehicle.outline_B_m @ views.L_from_C[k].T
+            above[k] = not render.is_between(surface, views.position_L_m[k], parts)
+        met["the spacecraft above the ground"] = above
+        good = good & above
     if good.any():
         return good
     for text, is_met in met.items():

@@ -246,6 +246,8 @@ class Labels:
     ----------
     masks
         bool[fault, y, x]: the mask of each class of the scene, in dataset order.
+    mask_any
+        bool[y, x]: the pixels that the classes of `mask_any_faults` mark, or change together.
     effects
         bool[y, x]: the pixels of the noise-free image that change by 1 DN or more without a fault, by class, for
         the injected faults whose effect is stored or needed by their mask.
@@ -254,6 +256,7 @@ class Labels:
     """
 
     masks: Mask
+    mask_any: Mask
     effects: Mapping[str, Mask]
     strengths: Mapping[str, NDArray[Any]]
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from .light import Sampled, direct, direct_by_sample, sun_in_view
     from .resolve import (
         first_ground,
-    first_hit_m,
+        first_hit_m,
         ground_height_m,
         hidden_points,
         is_between,

@@ -103,7 +103,7 @@ class Scene(Table):
 
     @property
     def exchanges_views(self) -> bool:
-        """Return whether samples keep what was drawn, and exchange it where it cannot be used (`scene.exchange`)."""
+        """Return whether samples keep the values that were drawn, and exchange them (`scene.exchange`)."""
         return self.plan.unusable_views == "exchange" and not (self.is_aimed or self.is_flown)
 
     @model_validator(mode="after")

@@ -110,7 +110,7 @@ class Plan:
         return index - index % self.variants
 
     def members(self, index: int) -> list[int]:
-        """Return the first samples of the views that a sample's view may be exchanged with, and its own, in order."""
+        """Return the first samples of the views that a sample's view may be exchanged with, itself included."""
         if self.group is None:
             return [self.first_of_view(index)]
         near = range(max(0, index - exchange.MOST), min(len(self), index + exchange.MOST))

@@ -1,8 +1,8 @@
 """Choose sites for the Suns that Sun-facing samples see there.
 
-A Sun below the horizon is seen where the ground falls away towards it. With `plan.unusable_views = "exchange"` the
-Suns of a site come from one sector of azimuth (`scene.exchange`). Each site is the best of several random positions:
-the one from which most of its Suns are seen, over the shape model, from the positions drawn for them.
+A Sun below the horizon is seen where the ground falls away towards it. With `plan.unusable_views = "exchange"`
+the Suns of a site come from one sector of azimuth (`scene.exchange`). Each site is the best of several random
+positions: the one from which most of its Suns are seen, over the shape model, from the positions drawn for them.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 
 F64 = NDArray[np.float64]
 
-# Random positions compared for a site. On the packaged shape of 67P, 53 % of the paper's pairs of position and Sun
-# see the Sun at a random site, and 91 % at the best of 64.
+# Random positions compared for a site. On the packaged shape of 67P, 53 % of the paper's Suns are seen at a random
+# site, and 95 % from the best of 64.
 _CANDIDATES = 64
 _MOST_SUNS = 32  # of a site that are tried, each from all of their camera positions
 _START_M = 300.0  # height above the site from which the ground below a camera is looked for
