@@ -115,7 +115,8 @@ WHOLE = ("count", "brightness_dn", "index", "filter_size_px")
 def variables_of(opened: store.Store) -> Iterator[tuple[str, tuple[float, float], F64]]:
     """Yield name, bounds and values of each variable of a store's tables; the values are uniform in [0, 1]."""
     scene, need = stored_scene(opened.attributes), ("stratum", "parameters", "proposal")
-    stratum, parameters, proposal = (np.asarray(opened.read(name)) for name in need)
+    done = np.flatnonzero(np.asarray(opened.read("done")))
+    stratum, parameters, proposal = (np.asarray(opened.read(name))[done] for name in need)
     proposals = [json.loads(str(text)) for text in proposal]
     for code, name in enumerate(names.STRATA):
         for variable in VARIABLES:
@@ -163,10 +164,12 @@ def print_table(path: Path) -> bool:
         tries, stratum = (np.asarray(opened.read(name)) for name in ("tries", "stratum"))
         members = np.array([len(made.members(i)) for i in range(len(made))])
         for code, name in enumerate(names.STRATA):
-            t, m = tries[stratum == code], members[stratum == code]
+            here = (stratum == code) & (tries > 0)
+            t, m = tries[here], members[here]
+            again = t > m if code == plan.SUN_AVERTED else t > m + exchange.KEPT_TRIES
             print(
                 f"{name}: {int((t == 1).sum())} views as drawn, {int(((t > 1) & (t <= m)).sum())} exchanged, "
-                f"{int((t > m).sum())} drawn again, {int((t > m + exchange.KEPT_TRIES).sum())} of them as a whole"
+                f"{int((t > m).sum())} drawn again, {int(again.sum())} of them with another Sun"
             )
     return not counts.missing and min(chances) > least
 

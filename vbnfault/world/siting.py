@@ -17,6 +17,7 @@ from ..body import Body, Site, Sites, choose_sites
 from ..core import frames
 from ..scene.config import Scene
 from ..scene.plan import Plan
+from .ground import shape_model
 
 if TYPE_CHECKING:
     from ..render import TerrainMesh
@@ -34,13 +35,7 @@ def sites_for_suns(scene: Scene, body: Body, plan: Plan) -> Sites:
     """Return the sites of a plan whose samples keep their Suns. Each is chosen when it is first used."""
     count = scene.dataset.sites
     candidates = choose_sites(body, count * _CANDIDATES, scene.dataset.seed)
-
-    @cache
-    def model() -> TerrainMesh:
-        from .. import render
-
-        smooth = np.zeros(len(body.faces), dtype=bool)
-        return render.TerrainMesh(body.vertices_m.astype(np.float32), body.faces, smooth)
+    model = cache(lambda: shape_model(body))
 
     def make(index: int) -> Site:
         suns = plan.suns_of_site(index)
