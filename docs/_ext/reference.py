@@ -441,6 +441,7 @@ def store_arrays() -> dict[str, Any]:
         width=1,
         faults=(*classes, "<fault>"),
         mask_any_faults=(),
+        mask_any_joint=True,
         soft_layers=(*(next((s for s, f in soft.items() if f == name), "") for name in classes), ""),
         layers=(*(n for n in stores.LAYERS if n not in stores.REQUIRED_LAYERS), "without_<fault>", *soft),
         wavelength_nm=(550.0,),

@@ -18,7 +18,7 @@ from ..scene import aims, names, plan
 from ..scene.bodies import named_body
 from ..scene.config import Scene
 from ..scene.trajectory import Trajectory
-from ..world import assemble, ground
+from ..world import assemble, ground, siting
 from .progress import duration_text, size_text
 
 _SITES_DESCRIBED = 8  # a site takes 9 ms on a shape of 20,000 facets
@@ -28,6 +28,7 @@ _SITES_DESCRIBED = 8  # a site takes 9 ms on a shape of 20,000 facets
 _LEAST_RADIUS_M = 5.0
 _PATCH_RADII = 3.0
 _LENGTHS_AWAY = 50.0
+_SITES_SEARCHED = 4  # a site that is chosen for its Suns takes 0.8 s
 _POSES_DESCRIBED = 200  # rows of a trajectory whose distance from the ground is computed
 
 
@@ -37,7 +38,8 @@ def describe(session: Session, *, sample_bytes: int, seconds: float) -> list[str
     Parameters
     ----------
     session : Session
-        Session of the scene, with its plan. The function uses neither the terrain nor the renderer.
+        Session of the scene, with its plan. The function makes no terrain. It loads the renderer only where sites
+        are chosen for their Suns, for a few rays.
     sample_bytes : int
         Approximate size of a sample on disk.
     seconds : float
@@ -77,7 +79,10 @@ def _samples(session: Session) -> list[str]:
     for name, samples in chosen.items():
         counts = [int(samples.sum()), *(int((samples & split).sum()) for split in splits.values())]
         lines.append(f"  {name:<{wide}}" + "".join(f"{count:>9}" for count in counts))
-    return lines
+    nominal = int(chosen["no fault"].sum())
+    share = f"faults: {nominal} of {len(table)} samples ({nominal / len(table):.0%}) get none, as plan.mode = "
+    share += f"{scene.plan.mode!r} and plan.faulty_fraction = {scene.plan.faulty_fraction:g} set"
+    return [*lines, "; ".join([share, *(f"{k}: {f.remark}" for k, f in session.faults.items() if f.remark)])]
 
 
 def _body(session: Session) -> list[str]:
@@ -158,7 +163,29 @@ def _geometry(session: Session) -> list[str]:
             f"{_bounds(stratum.sun_azimuth_deg)} deg; camera from {towards} by roll {_bounds(stratum.roll_deg)}, "
             f"pitch {_bounds(stratum.pitch_deg)}, yaw {_bounds(stratum.yaw_deg)} deg; {lit}"
         )
-    return [*lines, _redrawn(session)]
+    return [*lines, _redrawn(session), *([_suns_seen(session)] if scene.exchanges_views else [])]
+
+
+def _suns_seen(session: Session) -> str:
+    """Say how often the Suns of Sun-facing views are seen at the sites that are chosen for them, at a few sites."""
+    scene, table = session.scene, session.plan
+    used = np.unique(table.site[table.stratum == plan.SUN_FACING])
+    some = used[np.linspace(0, len(used) - 1, min(_SITES_SEARCHED, len(used))).astype(int)]
+    model = ground.shape_model(session.body)
+    of_sites = []
+    for index in some.tolist():
+        suns = table.suns_of_site(index)
+        drawn = {name: values[suns] for name, values in table.variables.items()}
+        of_sites.append(siting.suns_seen(scene, model, session.sites[index], drawn))
+    own, never, count = (
+        sum(int(number) for number in numbers)
+        for numbers in zip(*((s.diagonal().sum(), (~s.any(axis=0)).sum(), len(s)) for s in of_sites), strict=True)
+    )
+    return (
+        f"Suns: on the shape model, at {len(some)} of {len(used)} sites chosen for their Suns, {own} of {count} are "
+        f"seen from the position drawn for them, {count - own - never} only from that of another sample, and {never} "
+        "from none, so that a new position is drawn, or at last another Sun"
+    )
 
 
 def _aims(session: Session, aim: NDArray[np.uint8]) -> list[str]:
@@ -184,6 +211,11 @@ def _aims(session: Session, aim: NDArray[np.uint8]) -> list[str]:
 def _redrawn(session: Session) -> str:
     """Return a line about the views that are drawn again."""
     scene, geometry = session.scene, session.scene.geometry
+    if scene.exchanges_views:
+        return (
+            f"views: nothing within {geometry.clearance_m:g} m; Suns and attitudes stay as drawn: sites are chosen "
+            "for the Suns, and the samples of a shard exchange positions or views that they cannot use"
+        )
     hidden = "is drawn again" if geometry.sun_visibility == "required" else "is kept, without this fault"
     unseen = f"gets another view, of {scene.plan.max_views} at most"
     if scene.plan.on_invisible == "drop":

@@ -126,6 +126,8 @@ def _leave_out_unused(identity: dict[str, Any], scene: Scene) -> None:
         ("dataset", "radiance_dtype"),
         ("camera", "exposure_stops"),
         ("patch", "facet_px"),
+        ("plan", "order"),
+        ("plan", "unusable_views"),
     ):
         values = getattr(scene, table)
         if getattr(values, key) == type(values).model_fields[key].default:
@@ -238,6 +240,7 @@ def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
         width=camera.width_px,
         faults=tuple(session.faults),
         mask_any_faults=mask_any_faults(scene, session.faults),
+        mask_any_joint=True,
         localised_faults=tuple(name for name, fault in session.faults.items() if fault.localised),
         mask_kinds=kinds,
         mask_rules=tuple(

@@ -59,6 +59,7 @@ class TextureBrokenPixels(Fault):
     default = True
     after = "vignetting"
     axis = 1
+    remark = "each defect shows as a plus of five pixels, itself and four neighbours"
     step = "rgbi"
     severity = Severity(key="count", low=1, high=10_000, width_power=1)
 

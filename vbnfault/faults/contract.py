@@ -101,6 +101,8 @@ class Fault:
         Packaged lens that the model traces if the camera has a thin lens and the scene names no lens. Its contents
         belong to the scene's identity. "": none.
 
+    remark
+        What `vbnfault describe` says of the model, as a clause behind the name of its class. "": nothing.
     packaged_images
         Folder of packaged images that the model may read. Their contents belong to the scene's identity. "": none.
 
@@ -137,6 +139,7 @@ class Fault:
     adds_past_rims: ClassVar[bool] = False
     at_rims: ClassVar[bool] = False
     lens_of_thin_camera: ClassVar[str] = ""
+    remark: ClassVar[str] = ""
     packaged_images: ClassVar[str] = ""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:

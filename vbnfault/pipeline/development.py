@@ -258,6 +258,17 @@ class Development:
             self._effects[key] = self._effect(draws, name, least_dn)
         return self._effects[key]
 
+    def joint_effect(self, draws: Draws, names: Collection[str]) -> Mask:
+        """Return where the noise-free image changes by 1 DN or more without all of some drawn faults, bool[y, x].
+
+        A pixel that two faults turn into the same value, such as white, is in the effect of neither, but in this.
+        """
+        if len(names) == 1:
+            return self.effect(draws, next(iter(names)))
+        others = {name: draw for name, draw in draws.items() if name not in names}
+        lacking = self.image(others, noisy=False, keep_signals=False)
+        return masks.effect(self.image(draws, noisy=False).array, lacking.array)
+
     def _effect(self, draws: Draws, name: str, least_dn: float) -> Mask:
         """Return `effect`, computed anew."""
         others = without(draws, name)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ..core.quantities import soft_kind
 from ..faults import Fault
 from . import masks
-from .spec import Injection, Labels, SampleSpec, stored_layers
+from .spec import Injection, Labels, SampleSpec, mask_any_faults, stored_layers
 
 
 def label(spec: SampleSpec, injection: Injection) -> Labels:
@@ -22,10 +22,16 @@ def label(spec: SampleSpec, injection: Injection) -> Labels:
         for name, draw in draws.items()
         if draw.fault.effect_mask or masks.spreads(draw.fault, development.context)
     }
+    together = [name for name in mask_any_faults(spec.scene, spec.faults) if name in draws]
     params = {name: draw.params for name, draw in draws.items()}
     soft = {fault.soft_layer: fault for fault in spec.faults.values() if fault.soft_layer}
+    its_masks = masks.mask_layers(spec.faults, params, development.context, changed)
+    mask_any = masks.union(its_masks, spec.faults, together)
+    if together:
+        mask_any |= development.joint_effect(draws, together)
     return Labels(
-        masks=masks.mask_layers(spec.faults, params, development.context, changed),
+        masks=its_masks,
+        mask_any=mask_any,
         effects={name: development.effect(draws, name) for name in draws} if "mask_effect" in layers else {},
         strengths={layer: strength(soft[layer], injection) for layer in layers if layer in soft},
     )

@@ -14,7 +14,7 @@ from ..scene import plan
 from ..scene.config import Scene
 from ..world import assemble
 from . import masks
-from .spec import Frame, mask_any_faults, stored_layers
+from .spec import Frame, stored_layers
 
 F64 = NDArray[np.float64]
 
@@ -30,12 +30,11 @@ def to_sample(frame: Frame) -> Sample:
 def _layers(frame: Frame) -> dict[str, NDArray[Any]]:
     """Return the layers that every dataset has, and the optional ones that the scene stores."""
     spec, images, labels = frame.spec, frame.images, frame.labels
-    names = list(spec.faults)
     layers: dict[str, Any] = {
         "image": images.image.array,
         "clean": images.clean.array,
         "mask": labels.masks,
-        "mask_any": masks.union(labels.masks, names, mask_any_faults(spec.scene, spec.faults)),
+        "mask_any": labels.mask_any,
     }
     for name in stored_layers(spec.scene, spec.faults):
         if name.startswith("without_"):

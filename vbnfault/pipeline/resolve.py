@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..core import frames
 from ..core.errors import VbnfaultError, shown
 from ..render.description import Sunlight
-from ..scene import names, plan
+from ..scene import exchange, names, plan
 from ..scene.trajectory import FlownPose
 from ..world import assemble
 from ..world.ground import encloses
@@ -50,15 +50,67 @@ def resolve(spec: SampleSpec, first_try: int = 0) -> Pose:
         return _on_the_trajectory(spec, spec.flown or assemble.flown_pose(spec.scene))
     if spec.scene.is_aimed:
         return resolve_aimed(spec, first_try)
-    max_tries = spec.scene.geometry.max_tries
+    required = spec.scene.geometry.sun_visibility == "required"
     unmet: dict[str, int] = {}
-    for start in range(first_try, first_try + max_tries, _BATCH):
+    tries = range(first_try, first_try + spec.scene.geometry.max_tries)
+    if spec.plan.group is not None:
+        members = len(spec.plan.members(spec.index))
+        exchanged = _exchanged(spec) if first_try == 0 else max(first_try, members)
+        if not required:  # the Sun is sought, but may be missed
+            sought = range(exchanged, max(exchanged, members) + exchange.KEPT_TRIES)
+            pose = _first_usable(spec, sought, {}, sun_required=True)
+            if pose is not None:
+                return pose
+            exchanged = first_try
+        tries = range(exchanged, exchanged + len(tries))
+    pose = _first_usable(spec, tries, unmet, sun_required=required)
+    if pose is None:
+        raise no_view(spec, names.STRATA[spec.plan.stratum[spec.index]], unmet)
+    return pose
+
+
+def _exchanged(spec: SampleSpec) -> int:
+    """Return the try with which a sample's search begins if the samples of its shard exchange positions or views.
+
+    Each of `plan.members` takes another's position or view, so that as many of them as possible meet every
+    condition, and as few as possible exchange something. A sample that is left over begins behind all of them.
+    """
+
+    def chosen() -> list[int]:
+        from scipy.optimize import linear_sum_assignment
+
+        count = len(members)
+        usable = np.zeros((count, count), dtype=bool)  # of each member, by try
+        for row, index in enumerate(members):
+            of_member = replace(spec, index=index)
+            for start in range(0, count, _BATCH):
+                views = _Views.of(of_member, start)
+                some = _usable(of_member, views, {}, sun_required=True)
+                usable[row, start : start + _BATCH] = some[: count - start]
+        rows = np.arange(count)
+        attempt = (rows - rows[:, None]) % count  # [member, whose view it takes]
+        takes = np.take_along_axis(usable, attempt, axis=1)
+        cost = np.where(takes, np.minimum(attempt, 1), 2 * count)
+        _, whose = linear_sum_assignment(cost)
+        return [int(attempt[k, j]) if takes[k, j] else count for k, j in zip(rows, whose, strict=True)]
+
+    members = spec.plan.members(spec.index)
+    starts = spec.terrain.of_shard.once("exchanged", (spec.plan, members[0]), chosen)
+    return starts[members.index(spec.plan.first_of_view(spec.index))]
+
+
+def _first_usable(spec: SampleSpec, tries: range, unmet: dict[str, int], *, sun_required: bool) -> Pose | None:
+    """Return the pose of the first of some tries that meets every condition, or None.
+
+    The failures of each condition are counted in `unmet`.
+    """
+    for start in tries[::_BATCH]:
         views = _Views.of(spec, start)
-        count = min(_BATCH, first_try + max_tries - start)
-        chosen = _first_usable(spec, views, count, unmet)
-        if chosen is not None:
-            return views.pose(chosen, start)
-    raise no_view(spec, names.STRATA[spec.plan.stratum[spec.index]], unmet)
+        count = min(_BATCH, tries.stop - start)
+        usable = _usable(spec, views, unmet, count, sun_required=sun_required)
+        if usable.any():
+            return views.pose(int(np.argmax(usable)), start)
+    return None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -137,10 +189,12 @@ def references_L(reference: str, terrain: Terrain, position_L_m: F64, sun_direct
     return [frames.unit(centre_L_m - camera_L_m) for camera_L_m in position_L_m]
 
 
-def _first_usable(spec: SampleSpec, views: _Views, count: int, unmet: dict[str, int]) -> int | None:
-    """Return the index of the first of `count` views that meets every condition.
+def _usable(
+    spec: SampleSpec, views: _Views, unmet: dict[str, int], count: int = _BATCH, *, sun_required: bool
+) -> Mask:
+    """Return which views meet every condition, bool[view], False behind the first `count`.
 
-    If there is none, return None and count the failures of each condition in `unmet`.
+    If there is none, the failures of each condition are counted in `unmet`.
     """
     from .. import render
 
@@ -155,7 +209,7 @@ def _first_usable(spec: SampleSpec, views: _Views, count: int, unmet: dict[str, 
         least = plan.least_sun_angle_deg(scene)
         met[f"the Sun at least {least:.1f} deg from the boresight"] = views.sun_angle_deg() >= least
     needing_sun = [name for name in spec.commanded_in_view if spec.faults[name].needs_sun]
-    if geometry.sun_visibility == "required" and needing_sun:
+    if sun_required and needing_sun:
         # with the Sun behind the camera these faults cannot show, so such a view is rejected before it is rendered
         seen = (views.sun_visible == 1.0) & (views.sun_angle_deg() < 90)
         met[f"the whole Sun visible before the camera, for {', '.join(needing_sun)}"] = seen
@@ -168,18 +222,21 @@ def _first_usable(spec: SampleSpec, views: _Views, count: int, unmet: dict[str, 
         of_the_frame = f"geometry.min_lit_fraction = {lit_fraction:g} of the frame sunlit ground"
         met[of_the_frame if lit_fraction else f"sunlit ground, for {', '.join(needing_light)}"] = enough | ~good
         good = good & enough
-    for k in np.flatnonzero(good[:count]):
-        if vehicle is None:
-            return int(k)
-        parts = views.position_L_m[k] + vehicle.outline_B_m @ views.L_from_C[k].T
-        if not render.is_between(surface, views.position_L_m[k], parts):
-            return int(k)
-        met.setdefault("the spacecraft above the ground", np.ones(len(good), dtype=bool))[k] = False
+    good[count:] = False
+    if vehicle is not None:
+        above = np.ones(len(good), dtype=bool)
+        for k in np.flatnonzero(good):
+            parts = views.position_L_m[k] + vehicle.outline_B_m @ views.L_from_C[k].T
+            above[k] = not render.is_between(surface, views.position_L_m[k], parts)
+        met["the spacecraft above the ground"] = above
+        good = good & above
+    if good.any():
+        return good
     for text, is_met in met.items():
         failed = int(np.count_nonzero(~is_met[:count]))
         if failed:
             unmet[text] = unmet.get(text, 0) + failed
-    return None
+    return good
 
 
 def _may_have_light(spec: SampleSpec, views: _Views) -> Mask:

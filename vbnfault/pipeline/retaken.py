@@ -112,6 +112,10 @@ class RetakeSession:
         assert plan.views is not None
         self._scene, self._plan, self._views, self._read = scene, plan, plan.views, read
         self._world = Session(_world_of(scene, plan.views), blocks=blocks, threads=threads)
+        of_sites = plan
+        while of_sites.views is not None:
+            of_sites = of_sites.views.plan
+        self._world.plan_of_sites = of_sites
         self._last: tuple[int, SampleSpec, Pose, Rendering, int] | None = None
 
     def simulate(self, number: int) -> Sample:

@@ -26,6 +26,7 @@ from ..scene.trajectory import FlownPose, Trajectory, as_trajectory, load_trajec
 from ..world import assemble
 from ..world.coma import check_coma
 from ..world.ground import GroundDetail, ground_details
+from ..world.siting import sites_for_suns
 from ..world.spacecraft import SpacecraftMesh
 from .record import to_sample
 from .spec import DEFAULT_TWINS, Frame, SampleSpec, Terrain
@@ -208,7 +209,7 @@ class Session:
             )
         self.faults = configure_faults(scene, source)
         need_sun = [name for name, fault in self.faults.items() if fault.needs_sun]
-        self.plan = plan.make_plan(scene, list(self.faults), blocks, need_sun=need_sun)
+        self.plan = self.plan_of_sites = plan.make_plan(scene, list(self.faults), blocks, need_sun=need_sun)
         if threads is not None and not 1 <= (tables.whole(threads) or 0) <= _MOST_THREADS:
             raise InputError(f"threads = {shown(threads)}: must be a whole number from 1 to {_MOST_THREADS}")
         self.source = source
@@ -260,6 +261,8 @@ class Session:
         """Return the sites of the scene. Each is drawn at its first use."""
         if self.scene.spice.spacecraft:
             return assemble.trajectory_sites(self.scene, self.body)
+        if self.scene.exchanges_views:
+            return sites_for_suns(self.scene, self.body, self.plan_of_sites)
         return choose_sites(self.body, self.scene.dataset.sites, self.scene.dataset.seed)
 
     def terrain(self, site: int) -> Terrain:

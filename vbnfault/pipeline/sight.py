@@ -71,12 +71,16 @@ def no_view(spec: SampleSpec, kind: str, unmet: Mapping[str, int]) -> VbnfaultEr
 
 
 def faults_needing_light(spec: SampleSpec) -> list[str]:
-    """Return the commanded faults in whose samples a dark view is replaced, if several samples share the view.
+    """Return the commanded faults in whose samples a dark view is replaced before its render.
 
     A single sample finds out by its render. Of samples that share a view, each would have a second view rendered
-    for it, so the darkness is looked for before the render, on a grid of rays.
+    for it, so the darkness is looked for before the render, on a grid of rays; so it is for samples that exchange
+    views, of which those with the Sun have its light.
     """
-    if spec.plan.variants == 1 or spec.scene.plan.on_invisible == "drop":
+    exchanges = spec.plan.group is not None
+    if (spec.plan.variants == 1 and not exchanges) or spec.scene.plan.on_invisible == "drop":
+        return []
+    if exchanges and any(spec.faults[name].needs_sun for name in spec.commanded_in_view):
         return []
     return [name for name in spec.commanded_in_view if spec.faults[name].needs_light]
 

@@ -33,12 +33,16 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Terrain:
-    """Hold a site, the renderer's copy of its patch, and the spacecraft above it if there is one."""
+    """Hold a site, the renderer's copy of its patch, and the spacecraft above it if there is one.
+
+    `of_shard` keeps what the samples of a shard need that exchange views.
+    """
 
     body: Body
     site: Site
     surface: TerrainMesh
     vehicle: SpacecraftMesh | None = None
+    of_shard: SharedResults = field(default_factory=lambda: SharedResults(kept=True))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -242,6 +246,8 @@ class Labels:
     ----------
     masks
         bool[fault, y, x]: the mask of each class of the scene, in dataset order.
+    mask_any
+        bool[y, x]: the pixels that the classes of `mask_any_faults` mark, or change together.
     effects
         bool[y, x]: the pixels of the noise-free image that change by 1 DN or more without a fault, by class, for
         the injected faults whose effect is stored or needed by their mask.
@@ -250,6 +256,7 @@ class Labels:
     """
 
     masks: Mask
+    mask_any: Mask
     effects: Mapping[str, Mask]
     strengths: Mapping[str, NDArray[Any]]
 

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from .light import Sampled, direct, direct_by_sample, sun_in_view
     from .resolve import (
         first_ground,
+        first_hit_m,
         ground_height_m,
         hidden_points,
         is_between,
@@ -47,6 +48,7 @@ _HOMES = {
     "air_light": "atmosphere",
     "direct": "light",
     "first_ground": "resolve",
+    "first_hit_m": "resolve",
     "direct_by_sample": "light",
     "direct_in_cells": "cells",
     "ground_height_m": "resolve",
@@ -119,6 +121,7 @@ __all__ = [
     "direct_by_sample",
     "direct_in_cells",
     "first_ground",
+    "first_hit_m",
     "ground_height_m",
     "heights_towards_sun",
     "hidden_points",

@@ -112,6 +112,21 @@ def first_ground(surface: TerrainMesh, position_L_m: F64, direction_L: F64) -> t
     return float(distance.numpy()[0]), bool(outward @ direction_L < 0)
 
 
+def first_hit_m(surface: TerrainMesh, origin_m: F64, direction: F64) -> F64:
+    """Return the distance of the first surface on each ray, float64[n], infinite without one.
+
+    `origin_m` and the unit vectors `direction` are float64[n, 3], in the axes of the surface.
+    """
+    start, towards = (
+        [mi.Float(np.ascontiguousarray(column, np.float32)) for column in vectors.T]
+        for vectors in (origin_m, direction)
+    )
+    (met,) = surface.trace(mi.Ray3f(mi.Point3f(*start), mi.Vector3f(*towards)), coherent=False)
+    distance, valid = met.t, met.is_valid()
+    dr.eval(distance, valid)
+    return np.where(valid.numpy(), distance.numpy().astype(np.float64), np.inf)
+
+
 def is_between(surface: TerrainMesh, origin_L_m: F64, points_L_m: F64) -> bool:
     """Return whether any surface lies between `origin_L_m`, float64[3], and any of the points, float64[n, 3]."""
     ray = points_L_m - origin_L_m

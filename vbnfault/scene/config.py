@@ -101,6 +101,11 @@ class Scene(Table):
         """Return whether the camera aims at what `geometry.aim` names."""
         return self.geometry.aim is not None
 
+    @property
+    def exchanges_views(self) -> bool:
+        """Return whether samples keep the values that were drawn, and exchange them (`scene.exchange`)."""
+        return self.plan.unusable_views == "exchange" and not (self.is_aimed or self.is_flown)
+
     @model_validator(mode="after")
     def _aimed_alone(self) -> Scene:
         given = self.geometry
@@ -150,10 +155,11 @@ class Scene(Table):
             if self.is_aimed and strata[name] != unbounded.model_copy(update=bounds):
                 raise ValueError(f"geometry.{name}: does not apply beside geometry.aim; leave it out")
         object.__setattr__(self, "geometry", self.geometry.model_copy(update=strata))
-        if self.plan.pair_strata and self.geometry.sun_visibility != "as_drawn":
+        if self.plan.pair_strata and self.geometry.sun_visibility != "as_drawn" and not self.exchanges_views:
             raise ValueError(
                 f"plan.pair_strata = true: needs geometry.sun_visibility = 'as_drawn', not "
-                f"{self.geometry.sun_visibility!r}: the Sun of a pair is not drawn again"
+                f"{self.geometry.sun_visibility!r}, or plan.unusable_views = 'exchange': the Sun of a pair is not "
+                "drawn again"
             )
         return self
 

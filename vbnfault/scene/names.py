@@ -6,4 +6,5 @@ This module imports nothing, so that a process that only reads a store starts qu
 from __future__ import annotations
 
 STRATA = ("sun-facing", "sun-averted")
+SUN_FACING, SUN_AVERTED = 0, 1
 SPLITS = ("train", "val", "test")

@@ -9,7 +9,8 @@ it.
 
 A sample's view (position, Sun, attitude) is a function of (sample, try). Where a view cannot be used, the whole
 view is drawn again within the same bounds. The views that are kept therefore follow the table's distribution, under
-the condition that they can be used.
+the condition that they can be used. With `plan.unusable_views = "exchange"` they follow the table itself: see
+`scene.exchange`.
 """
 
 from __future__ import annotations
@@ -24,16 +25,15 @@ from numpy.typing import NDArray
 
 from ..core import frames
 from ..core.errors import InputError
-from . import aims, keyed_random
+from . import aims, exchange, keyed_random
 from .config import Scene
-from .names import SPLITS
+from .names import SPLITS, SUN_AVERTED, SUN_FACING
 from .sampling import StratumTable
 
-SUN_FACING, SUN_AVERTED = 0, 1
-
 _SUN = ("sun_azimuth_deg", "sun_elevation_deg")
+_ATTITUDE = ("roll_deg", "pitch_deg", "yaw_deg")
 _POSITION = ("x_m", "y_m", "height_m")
-VARIABLES = (*_SUN, "roll_deg", "pitch_deg", "yaw_deg", *_POSITION)
+VARIABLES = (*_SUN, *_ATTITUDE, *_POSITION)
 _MAX_ATTITUDE_TRIES = 1000
 # Limits of the search for rows to exchange between splits: rows compared on each side, and exchanges.
 _ROWS_COMPARED = 128
@@ -65,6 +65,9 @@ class Plan:
     - `light` int64[n] is the sample whose Sun each sample has: itself, or the Sun-facing sample of its pair.
     - `paired` bool[n] marks the samples of pairs (`plan.pair_strata`).
     - `aim` uint8[n] is the aim, an index in `aims.AIMS`; None without `geometry.aim`.
+    - `draw` int64[n] is the sample whose key the draws of a sample's view have: by default the first of its view.
+    - `block` int64[n] is the block that each sample was planned with.
+    - `group` int64[n] numbers the samples that exchange views; None if views are drawn again instead.
     - `views` are those of an earlier dataset, if the plan takes them over.
 
     `variants` consecutive samples share a view. They have the same variables, stratum, site and aim at every try.
@@ -81,6 +84,9 @@ class Plan:
     individual: NDArray[np.int32]
     light: NDArray[np.int64]
     paired: NDArray[np.bool_]
+    draw: NDArray[np.int64]
+    block: NDArray[np.int64]
+    group: NDArray[np.int64] | None = None
     aim: NDArray[np.uint8] | None = None
     views: EarlierViews | None = None
     variants: int = 1
@@ -103,6 +109,13 @@ class Plan:
         """Return the first of the samples that share a sample's view; the draws of the view have its key."""
         return index - index % self.variants
 
+    def members(self, index: int) -> list[int]:
+        """Return the first samples of the views that a sample's view may be exchanged with, itself included."""
+        if self.group is None:
+            return [self.first_of_view(index)]
+        near = range(max(0, index - exchange.MOST), min(len(self), index + exchange.MOST))
+        return [k for k in near if k % self.variants == 0 and self.group[k] == self.group[index]]
+
     def commanded_in_view(self, index: int) -> tuple[str, ...]:
         """Return the faults that the samples of a view are commanded to carry, in the order of `faults`."""
         first = self.first_of_view(index)
@@ -119,15 +132,31 @@ class Plan:
         if self.views is not None:
             return self.views.plan.view(self.views.scene, index // self.views.repeats, attempt)
         row = slice(index, index + 1)
-        key = np.array([self.first_of_view(index)])
+        key = self.draw[row]
+        first = {name: float(values[index]) for name, values in self.variables.items()}
         if attempt == 0:
-            drawn = {name: values[row] for name, values in self.variables.items()}
-        elif self.aim is not None:
+            return first if self.aim is None else aims.of_aim(first, self.aim_of(index))
+        if self.aim is not None:
             drawn = aims.draw(scene, key, self.aim[row], attempt)
-        else:
-            drawn = _views(scene, key, self.stratum[row], self.light[row], self.paired[row], attempt=attempt)
-        values = {name: float(column[0]) for name, column in drawn.items()}
-        return values if self.aim is None else aims.of_aim(values, self.aim_of(index))
+            return aims.of_aim({name: float(column[0]) for name, column in drawn.items()}, self.aim_of(index))
+        members = self.members(index)
+        kept: tuple[str, ...] = ()
+        if self.group is not None:
+            facing = self.stratum[index] == SUN_FACING
+            if attempt < len(members):
+                other = members[(members.index(self.first_of_view(index)) + attempt) % len(members)]
+                taken = _POSITION if facing else VARIABLES
+                return {name: float(self.variables[name][other if name in taken else index]) for name in VARIABLES}
+            if attempt < len(members) + exchange.KEPT_TRIES:
+                kept = (*_SUN, *_ATTITUDE) if facing else _SUN if self.paired[index] else ()
+        light = self.light[row] if self.group is None else key  # a Sun that cannot be kept is drawn again
+        drawn = _views(scene, key, self.stratum[row], light, self.paired[row], attempt=attempt)
+        return {name: first[name] if name in kept else float(column[0]) for name, column in drawn.items()}
+
+    def suns_of_site(self, site: int) -> NDArray[np.int64]:
+        """Return the Sun-facing samples for whose Suns a site is chosen: those of the first block that has any."""
+        here = np.flatnonzero((self.site == site) & (self.stratum == SUN_FACING))
+        return here[self.block[here] == self.block[here[:1]]] if len(here) else here
 
     def aim_of(self, index: int) -> str:
         """Return the name of a sample's aim; "" without `geometry.aim`."""
@@ -163,14 +192,23 @@ def make_plan(
         parts.append(_block(scene, (tuple(faults), frozenset(need_sun)), (b, start), shard[rows], split[rows]))
     injected = np.concatenate([p[0] for p in parts])
     stratum = np.concatenate([p[1] for p in parts])
-    light, paired = _pairs(scene, samples, stratum, shard)
-    views, light = samples - samples % variants, light - light % variants
+    block = np.repeat(np.arange(len(sizes)), sizes)
+    together = shard if scene.plan.order == "shuffled" else block * scene.dataset.sites + site
+    light, paired = _pairs(scene, samples, stratum, together)
+    draw, light = samples - samples % variants, light - light % variants
+    group = None
+    if scene.exchanges_views:
+        group = np.unique(np.column_stack([block, shard, stratum]), axis=0, return_inverse=True)[1].ravel()
+        draw = exchange.by_azimuth(scene.dataset.seed, draw, block, stratum, site)
+        light = draw[light]
     aim = np.concatenate([p[2] for p in parts]) if scene.is_aimed else None
+    if aim is None:
+        variables = _views(scene, draw, stratum, light, paired, block=block)
+    else:
+        variables = aims.draw(scene, draw, aim, 0)
     return Plan(
         faults=tuple(faults),
-        variables=(
-            _views(scene, views, stratum, light, paired) if aim is None else aims.draw(scene, views, aim, 0)
-        ),
+        variables=variables,
         injected=injected,
         stratum=stratum,
         site=site,
@@ -180,6 +218,9 @@ def make_plan(
         individual=individuals(scene, samples, split),
         light=light,
         paired=paired,
+        draw=draw,
+        block=block,
+        group=group,
         aim=aim,
         variants=variants,
     )
@@ -251,22 +292,29 @@ def _views(
     paired: NDArray[np.bool_],
     *,
     attempt: int = 0,
+    block: NDArray[np.int64] | None = None,
 ) -> dict[str, NDArray[np.float64]]:
     """Return uniform draws of all variables within the bounds of each sample's stratum, float64[n] each.
 
     `attempt` counts from 0; later attempts are redraws. Paired samples draw the Sun within the bounds of both
-    strata, with the key of one of the two. They keep this Sun at every attempt.
+    strata, with the key of one of the two. They keep this Sun at every attempt, unless views are exchanged. If so,
+    and `block` is given, Sun-averted samples of a block exchange pitches until the Sun is out of view.
     """
+    sun_attempt = attempt if scene.exchanges_views else 0
     drawn = {}
     for name in VARIABLES:
         low, high = bounds(scene, name)
         lo, hi = low[stratum], high[stratum]
         if name in _SUN and scene.plan.pair_strata:
             lo, hi = np.where(paired, low.max(), lo), np.where(paired, high.min(), hi)
-            u = keyed_random.keyed_uniform(scene.dataset.seed, light, "plan", f"{name}/0")
+            u = keyed_random.keyed_uniform(scene.dataset.seed, light, "plan", f"{name}/{sun_attempt}")
         else:
             u = keyed_random.keyed_uniform(scene.dataset.seed, samples, "plan", f"{name}/{attempt}")
         drawn[name] = lo + u * (hi - lo)
+    if scene.exchanges_views and block is not None and strata(scene)[SUN_AVERTED].reference == "sun":
+        averted = np.where(stratum == SUN_AVERTED, block, -1)
+        pitch = drawn["pitch_deg"]
+        exchange.pitches(samples, averted, drawn["roll_deg"], pitch, least_sun_angle_deg(scene))
     _keep_sun_out_of_view(scene, samples, stratum, drawn, attempt)
     return drawn
 
@@ -310,12 +358,12 @@ def _pair(low: NDArray[np.float64], high: NDArray[np.float64], stratum: int) -> 
 
 
 def _pairs(
-    scene: Scene, samples: NDArray[np.int64], stratum: NDArray[np.uint8], shard: NDArray[np.int64]
+    scene: Scene, samples: NDArray[np.int64], stratum: NDArray[np.uint8], together: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Return the sample whose Sun each sample has, int64[n], and whether the sample is paired, bool[n].
 
-    The k-th Sun-facing and the k-th Sun-averted sample of a shard are a pair. They share the site, so the same Sun
-    in L means the same attitude of the target.
+    The k-th Sun-facing and the k-th Sun-averted sample with the same number `together` are a pair. They share the
+    site, so the same Sun in L means the same attitude of the target.
     """
     light, paired = samples.copy(), np.zeros(len(samples), dtype=bool)
     if not scene.plan.pair_strata:
@@ -327,13 +375,12 @@ def _pairs(
                 f"plan.pair_strata = true: geometry.sun_facing.{name} = {_pair(low, high, SUN_FACING)} and "
                 f"geometry.sun_averted.{name} = {_pair(low, high, SUN_AVERTED)} must overlap"
             )
-    by_group = np.lexsort((samples, stratum, shard))
-    group = shard[by_group] * 2 + stratum[by_group]
+    by_group = np.lexsort((samples, stratum, together))
+    group = together[by_group] * 2 + stratum[by_group]
     first = np.searchsorted(group, group, side="left")
     rank = np.arange(len(samples)) - first
-    # match the Sun-facing and the Sun-averted samples by (shard, rank)
-    width = scene.dataset.shard_samples
-    key = shard[by_group] * width + rank
+    # match the Sun-facing and the Sun-averted samples by (together, rank)
+    key = together[by_group] * len(samples) + rank
     facing = stratum[by_group] == SUN_FACING
     _, in_facing, in_averted = np.intersect1d(key[facing], key[~facing], assume_unique=True, return_indices=True)
     leads, follows = by_group[facing][in_facing], by_group[~facing][in_averted]
@@ -383,7 +430,13 @@ def _block(
     stratum[:facing] = SUN_FACING
     views = np.arange(n)[:, None] if variants == 1 else _views_of_rows(injected, stratum, variants, rng)
     traits: NDArray[np.bool_] = np.any(_traits(injected, stratum)[views], axis=1)
-    views = views[_dealt(traits, shard[::variants], split[::variants], rng)]
+    first = facing // variants if scene.plan.order == "sun_first" else 0
+    places = [
+        start + _dealt(traits[start:end], shard[::variants][start:end], split[::variants][start:end], rng)
+        for start, end in ((0, first), (first, len(views)))
+        if end > start
+    ]
+    views = views[np.concatenate(places)]
     order = views.ravel()
     stratum = stratum[order]
     aim = stratum[:0]

@@ -76,6 +76,7 @@ def make_retaken_plan(
         paired=np.repeat(earlier.paired, repeats),
         aim=None if earlier.aim is None else np.repeat(earlier.aim, repeats),
         views=views,
+        group=None,
     )
 
 

@@ -242,8 +242,19 @@ class PlanTable(Table):
         "fault is recorded as not injected; where SPICE places the camera there is no other view",
     )
     max_views: int = Field(16, ge=1, le=1000, description="views rendered for a sample; it fails after them")
+    order: Literal["shuffled", "sun_first"] = Field(
+        "shuffled",
+        description="of the samples: shuffled over the shards; or, as in the paper, those that face the Sun first",
+    )
+    unusable_views: Literal["redraw", "exchange"] = Field(
+        "redraw",
+        description="where a drawn view cannot be used: redraw all its values, which bends their distribution; or "
+        "keep what was drawn: sites are chosen for the Suns drawn there, the samples of a shard exchange positions "
+        "(Sun-facing) or views (Sun-averted), and only where this fails is a value drawn again",
+    )
     pair_strata: bool = Field(
         False,
         description="Sun-facing and Sun-averted samples share a target attitude in pairs, as in the paper; needs "
-        "geometry.sun_visibility = 'as_drawn', since the Sun of a pair is not drawn again",
+        "geometry.sun_visibility = 'as_drawn' or unusable_views = 'exchange', since the Sun of a pair is not drawn "
+        "again",
     )

@@ -278,6 +278,14 @@ EFFECT_RULE = (
     "and the others are kept"
 )
 MASK_ANY_RULE = "union of the masks of the classes in the attribute faults, which dataset.mask_any chose"
+# Description of `mask_any` in stores with `StoreSpec.mask_any_joint`, which those of version 0.2 lack.
+JOINT_ATTRIBUTES = {
+    "long_name": "pixels that the faults named here mark or change",
+    "description": "True where at least one of the classes in the attribute faults has its mask, or where all of "
+    "them together change the image.",
+    "rule": f"{MASK_ANY_RULE}; and the pixels where a channel of the noise-free 8 bit image changes by {EFFECT_DN} "
+    "DN or more when all of these faults are switched off together and the others are kept",
+}
 # The layer of each kind of mask that a reader may ask for.
 MASK_RULES = {"footprint": "mask", "effect": "mask_effect"}
 REQUIRED_LAYERS = ("image", "mask", "mask_any", "clean")

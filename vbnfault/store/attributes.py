@@ -28,13 +28,19 @@ _TABLES = (
     *(f"scene.{table}" for table in ("camera", "dataset", "geometry", "plan", "sky", "spice")),
 )
 # Names of the elements of a tuple in the type of a field of `StoreSpec` → the types that they have in JSON.
-_ELEMENTS: dict[str, tuple[type, ...]] = {"str": (str,), "int": (int,), "float": (int, float)}
+_ELEMENTS: dict[str, tuple[type, ...]] = {
+    "str": (str,),
+    "int": (int,),
+    "float": (int, float),
+    "bool": (bool,),
+}
 _WORDS = {
     "tuple": "a list of ",
     "Mapping": "a table",
     "str": "a text",
     "int": "a whole number",
     "float": "a number",
+    "bool": "true or false",
 }
 _WORDS_OF_ELEMENTS = {"str": "texts", "int": "whole numbers", "float": "numbers"}
 # Fields of `StoreSpec` whose lists have this many elements.

@@ -388,8 +388,12 @@ def _check_labels(
         # by definition, an injected fault changes the noise-free image somewhere
         effect = _array(spec, "mask_effect", layers)
         yield from _check_masks(i, spec.faults, "mask_effect", effect, injected, spec.faults)
-    if not np.array_equal(_array(spec, "mask_any", layers), mask_union(spec, mask)):
-        members = ", ".join(spec.mask_any_faults) or "no class"
+    mask_any, union = _array(spec, "mask_any", layers), mask_union(spec, mask)
+    members = ", ".join(spec.mask_any_faults) or "no class"
+    is_joint = spec.mask_any_joint and injected[[name in spec.mask_any_faults for name in spec.faults]].any()
+    if is_joint and (union & ~mask_any).any():
+        yield f"sample {i}: mask_any does not hold the masks of {members}"
+    if not is_joint and not np.array_equal(mask_any, union):
         yield f"sample {i}: mask_any is not the union of the masks of {members}"
     for fault, name, is_in in zip(spec.faults, spec.soft_layers, injected, strict=False):
         if name in layers and not is_in and (_array(spec, name, layers) != soft_kind(name).neutral).any():

@@ -19,6 +19,7 @@ from ..scene.names import SPLITS, STRATA
 from .arrays import (
     EFFECT_DN,
     EFFECT_RULE,
+    JOINT_ATTRIBUTES,
     LAYERS,
     MASK_ANY_RULE,
     RADIANCE_LAYERS,
@@ -99,6 +100,8 @@ class StoreSpec:
         Nodes of the bands of `radiance` and `scene_radiance`.
     layers
         Optional layers: names in `LAYERS` or `soft_layers`, or `without_<fault>`.
+    mask_any_joint
+        Whether `mask_any` also holds the pixels that these classes change together.
     localised_faults
         The classes whose mask is never empty if they are injected; `mask_any_faults` by default.
     mask_kinds, mask_rules
@@ -144,6 +147,7 @@ class StoreSpec:
     mask_any_faults: tuple[str, ...]
     wavelength_nm: tuple[float, ...] = ()
     layers: tuple[str, ...] = ()
+    mask_any_joint: bool = False
     localised_faults: tuple[str, ...] | None = None
     mask_kinds: tuple[str, ...] = ()
     mask_rules: tuple[str, ...] = ()
@@ -254,7 +258,11 @@ class StoreSpec:
         extra: dict[str, dict[str, Any]] = {
             "mask": {"kinds": list(self.mask_kinds), "rules": list(self.mask_rules)} if self.mask_kinds else {},
             "mask_effect": {"threshold_dn": EFFECT_DN, "rule": EFFECT_RULE},
-            "mask_any": {"faults": list(self.mask_any_faults), "rule": MASK_ANY_RULE},
+            "mask_any": {
+                "faults": list(self.mask_any_faults),
+                "rule": MASK_ANY_RULE,
+                **(JOINT_ATTRIBUTES if self.mask_any_joint else {}),
+            },
             "site": {"names": list(self.site_names)},
             "lens": {"names": list(self.lens_names)},
             "distortion": {
@@ -349,6 +357,8 @@ class StoreSpec:
             del plain["sample_names"]  # stores without names stay as they were
         if not self.rendered_shape:
             del plain["rendered_shape"]
+        if not self.mask_any_joint:
+            del plain["mask_any_joint"]
         if self.format_version == 2:
             del plain["codecs"]
         return plain

@@ -89,16 +89,13 @@ def ground_details(scene: Scene, body: Body, poses: Sequence[FlownPose]) -> list
             group.clear()
             seen.clear()
 
-    from .. import render
-
     model: TerrainMesh | None = None
     budget = _SHARED_FRACTION * scene.patch.max_triangles
     for k, pose in enumerate(poses):
         if whole[k] is not None:
             continue
         if model is None:
-            smooth = np.zeros(len(body.faces), dtype=bool)
-            model = render.TerrainMesh(body.vertices_m.astype(np.float32), body.faces, smooth)
+            model = shape_model(body)
         here = _seen(scene, body, pose, model)
         enough = max(budget, _MORE * _even_triangles(_around(scene, [here])))
         if group and _even_triangles(_around(scene, [*seen, here])) > enough:
@@ -107,6 +104,14 @@ def ground_details(scene: Scene, body: Body, poses: Sequence[FlownPose]) -> list
         seen.append(here)
     close()
     return [detail for detail in details if detail is not None]
+
+
+def shape_model(body: Body) -> TerrainMesh:
+    """Return the shape model of a body for the renderer, in T."""
+    from .. import render
+
+    smooth = np.zeros(len(body.faces), dtype=bool)
+    return render.TerrainMesh(body.vertices_m.astype(np.float32), body.faces, smooth)
 
 
 def pixel_rad(scene: Scene) -> float:
