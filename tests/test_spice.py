@@ -12,6 +12,8 @@ import pytest
 
 from vbnfault.core import frames, spice
 from vbnfault.core.errors import InputError
+from vbnfault.scene import config
+from vbnfault.world import assemble
 
 spiceypy: Any = pytest.importorskip("spiceypy", reason="spiceypy (the extra 'spice') is not installed")
 
@@ -157,6 +159,46 @@ def test_rotation_is_that_of_a_text_pck(folder: Path, julian_date: float) -> Non
     # 6000 days of 12 rad hold W to 7e4 rad · 2⁻⁵³ ≈ 1e-11 rad.
     between = frames.quaternion(ours @ theirs.T)
     assert 2 * np.linalg.norm(between[1:]) < 1e-9
+
+
+# NAIF number, right ascension and declination of the pole, and the three constants of the prime meridian, in the frame
+# of the body's shape model. The kernels are copies in public repositories (DOI-USGS/ale, layoutit/css.earth).
+SHAPE_FRAMES = {
+    "67P": (1000012, 69.54, 64.11, 114.69, 696.543884683, 0.0),  # Scholten, Cheops frame document
+    "Bennu": (2101955, 85.45864, -60.36468, 150.48977, 2011.143058731885, 2e-6),  # bennu_v17.tpc
+    "Ryugu": (2162173, 96.43112, -66.38741, 274.16225, 1131.98280286, 0.0),  # ryugu_v10.tpc
+    "Itokawa": (2025143, 90.02564, -67.02704, 129.73, 712.14376110, 0.0),  # itokawa_gaskell_n3.tpc
+    "Eros": (2000433, 11.363, 17.232, 326.08, 1639.38928, 0.0),  # eros_alex.tpc
+    "Moon": (301, 269.9949, 66.5392, 38.3213, 13.17635815, -1.4e-12),  # pck00011.tpc, without its periodic terms
+    "Ceres": (2000001, 291.42763, 66.76033, 170.309, 952.1532635, 0.0),  # CERES18D, dawn_ceres_v06.tpc
+    "Phobos": (401, 317.67071657, 52.88627266, 35.1877444, 1128.84475928, 9.536137031212154e-9),  # pck00011.tpc, too
+}
+
+
+@pytest.mark.parametrize("name", SHAPE_FRAMES)
+def test_a_named_body_turns_as_the_kernel_of_its_shape_says(tmp_path: Path, name: str) -> None:
+    """That of 67P has six digits: in 10,000 days of 697° it is off by 3e-6°, the others, with 13 digits, by 1e-7°."""
+    number, right_ascension, declination, *meridian = SHAPE_FRAMES[name]
+    kernel = tmp_path / "shape.tpc"
+    kernel.write_text(f"""KPL/PCK
+\\begindata
+BODY{number}_POLE_RA = ( {right_ascension} 0. 0. )
+BODY{number}_POLE_DEC = ( {declination} 0. 0. )
+BODY{number}_PM = ( {meridian[0]} {meridian[1]} {meridian[2]} )
+FRAME_OF_SHAPE = 1400012
+FRAME_1400012_NAME = 'OF_SHAPE'
+FRAME_1400012_CLASS = 2
+FRAME_1400012_CLASS_ID = {number}
+FRAME_1400012_CENTER = {number}
+\\begintext
+""")
+    for julian_date in (2451545.0, 2456948.25, 2461372.0):  # to 2026
+        table = {"title": "t", "body": {"name": name}, "sun": {"julian_date": julian_date}}
+        ours = assemble.ephemeris(config.parse_scene(table, source="t.toml"))[1]
+        with spice.kernels(kernel):
+            theirs = spice.J_from_T("OF_SHAPE", spice.et_s_from_julian_date(julian_date)).T
+        between = frames.quaternion(ours @ theirs.T)
+        assert 2 * np.linalg.norm(between[1:]) < 2e-7
 
 
 @pytest.mark.parametrize("days", [-540.0, -200.0, -1.0, 0.0, 3.0, 77.7, 540.0])
