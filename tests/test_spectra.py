@@ -43,7 +43,7 @@ def band_electrons(reflectance_at_nodes: np.ndarray, nodes: np.ndarray = NODES) 
 
 
 def test_the_solar_spectrum_has_the_total_of_the_solar_constant() -> None:
-    """Kopp & Lean 2011: 1360.8 ± 0.5 W/m². Below 280 nm lie 6.5 W/m² of TSIS-1 HSRS, beyond 4000 nm a black body."""
+    """Kopp & Lean 2011: 1360.8 ± 0.5 W/m². Below 280 nm lie 6.5 W/m² of TSIS-1 HSRS, from 4000 nm a black body."""
     beyond_nm = np.geomspace(4000, 1e6, 20_000)
     photon_J = spectra.PLANCK_J_S * spectra.LIGHT_SPEED_M_S / (beyond_nm * 1e-9)
     radius = np.sin(spectra.sun_angular_radius_rad(1.0))

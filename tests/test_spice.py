@@ -161,8 +161,8 @@ def test_rotation_is_that_of_a_text_pck(folder: Path, julian_date: float) -> Non
     assert 2 * np.linalg.norm(between[1:]) < 1e-9
 
 
-# NAIF number, right ascension and declination of the pole, and the three constants of the prime meridian, in the frame
-# of the body's shape model. The kernels are copies in public repositories (DOI-USGS/ale, layoutit/css.earth).
+# NAIF number, right ascension and declination of the pole, and the three constants of the prime meridian, in the
+# frame of the body's shape model. The kernels are copies in public repositories (DOI-USGS/ale, layoutit/css.earth).
 SHAPE_FRAMES = {
     "67P": (1000012, 69.54, 64.11, 114.69, 696.543884683, 0.0),  # Scholten, Cheops frame document
     "Bennu": (2101955, 85.45864, -60.36468, 150.48977, 2011.143058731885, 2e-6),  # bennu_v17.tpc
@@ -184,7 +184,7 @@ SHAPE_FRAMES = {
 
 @pytest.mark.parametrize("name", SHAPE_FRAMES)
 def test_a_named_body_turns_as_the_kernel_of_its_shape_says(tmp_path: Path, name: str) -> None:
-    """That of 67P has six digits: in 10,000 days of 697° it is off by 3e-6°, the others, with 13 digits, by 1e-7°."""
+    """The period of 67P has six digits: 3e-6° in 10,000 days of 697°. The others have 13: 1e-7°."""
     number, right_ascension, declination, *meridian = SHAPE_FRAMES[name]
     kernel = tmp_path / "shape.tpc"
     kernel.write_text(f"""KPL/PCK

@@ -273,8 +273,8 @@ def _clouds(up: Any, footprint: Any) -> Any:
 def _step(value: Any, middle: float, half_width: float, unseen: Any = 0.0) -> Any:
     """Return 0 below, 1 above, and a smooth step within `half_width` of the middle.
 
-    Details of the variance `unseen`, which a wide footprint leaves out of the value, widen the step: it is then near
-    the mean of the steps of all points in the footprint. The slope of a step has the variance half_width² / 5.
+    Details of the variance `unseen`, which a wide footprint leaves out of the value, widen the step: it is then
+    near the mean of the steps of all points in the footprint. The slope of a step has the variance half_width² / 5.
     """
     half_width = dr.sqrt(half_width**2 + 5 * unseen)
     t = dr.clip((value - (middle - half_width)) / (2 * half_width), 0, 1)
@@ -288,9 +288,7 @@ def _shown(footprint: Any) -> Any:
 
 def _variance_left_out(footprint: Any, gain: float, octaves: int) -> Any:
     """Return the variance of what `_fractal` with the same arguments leaves out, with 0.19² for noise."""
-    return sum(
-        (0.19 * gain**k) ** 2 * (1 - dr.square(_shown(footprint * _LACUNARITY**k))) for k in range(octaves)
-    )
+    return sum((0.19 * gain**k) ** 2 * (1 - dr.square(_shown(footprint * _LACUNARITY**k))) for k in range(octaves))
 
 
 def _fractal(point: Any, footprint: Any, seed: int, gain: float, octaves: int) -> Any:
