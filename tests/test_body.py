@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import warnings
 from pathlib import Path
 
@@ -159,13 +160,115 @@ def test_sound_mesh_passes_in_silence_and_input_is_untouched() -> None:
 
 def test_flat_and_branching_meshes_are_refused() -> None:
     vertices, faces = box()
-    with pytest.raises(InputError, match=r"more than two faces|no volume|orientable"):
-        check_mesh(vertices, np.vstack([faces, faces[:, ::-1]]), "double")
+    fin = np.vstack([vertices, [[9.0, 9, 9], [9, 0, 9]]])  # a tetrahedron on an edge
+    with pytest.raises(InputError, match="branching: mesh has 1 edges shared by more than two faces"):
+        check_mesh(fin, np.vstack([faces, [[0, 1, 8], [1, 0, 9], [0, 8, 9], [1, 9, 8]]]), "branching")
     triangle = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
     with pytest.raises(InputError, match="no volume"):
         check_mesh(triangle, np.array([[0, 1, 2], [0, 2, 1]]), "sheet")
     with pytest.raises(InputError, match=r"outside 0\.\.7"):
         check_mesh(vertices, faces + 1, "shifted")
+
+
+def joined(*parts: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Return meshes as one, each with vertices of its own."""
+    first = np.cumsum([0, *(len(vertices) for vertices, _ in parts)])
+    return np.vstack([v for v, _ in parts]), np.vstack([f + n for (_, f), n in zip(parts, first, strict=False)])
+
+
+def ball(radius: float, x: float = 0.0, *, inwards: bool = False) -> tuple[np.ndarray, np.ndarray]:
+    mesh = trimesh.creation.icosphere(subdivisions=2, radius=radius)
+    return mesh.vertices + np.array([x, 0, 0]), mesh.faces[:, ::-1] if inwards else mesh.faces
+
+
+def test_no_place_counts_twice() -> None:
+    """Shells in one another, overlapping and touching: the volume is that of the place that they bound.
+
+    The overlap of two boxes is known; that of balls of the same facets from the shells alone.
+    """
+    unit = signed_volume(*ball(1.0))
+    with pytest.warns(UserWarning, match=r"united 2 closed shells, which bound 12\.50% of the volume twice"):
+        nested = check_mesh(*joined(ball(2.0), ball(1.0)), "nested")
+    assert signed_volume(*nested) == pytest.approx(8 * unit, rel=1e-12)
+    one, whole = (Body(name="", vertices_m=v, faces=f) for v, f in (nested, ball(2.0)))
+    assert one.area_m2 == pytest.approx(whole.area_m2, rel=1e-12)
+    for point in ([5.0, 1, 2], [0, 0, 1.9]):
+        np.testing.assert_allclose(
+            one.gravity.evaluate(point)[1], whole.gravity.evaluate(point)[1], rtol=1e-9, atol=1e-16
+        )
+    vertices, faces = box()
+    with pytest.warns(UserWarning, match="united 2 closed shells"):
+        lobes = check_mesh(
+            *joined((vertices, faces), (vertices * [1, 0.5, 0.5] + [0.25, 0.1, 0.1], faces)), "lobes"
+        )
+    size = np.ptp(vertices, axis=0)
+    assert signed_volume(*lobes) == pytest.approx(6.0 + 0.25 * size[1] / 2 * size[2] / 2, rel=1e-12)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # these are as they shall be, bit for bit
+        for parts, volume in (
+            ((ball(2.0), ball(1.0, inwards=True)), 7 * unit),  # a cavity
+            ((ball(3.0), ball(2.0, inwards=True), ball(1.0)), (27 - 8 + 1) * unit),  # and a body in it
+            ((ball(2.0), ball(1.0, 4.0)), 9 * unit),  # apart
+            (((vertices, faces), (vertices + size * [1, 0, 0], faces)), 12.0),  # with a common side
+        ):
+            given = joined(*parts)
+            np.testing.assert_array_equal(check_mesh(*given, "sound")[0], given[0])
+            assert signed_volume(*check_mesh(*given, "sound")) == pytest.approx(volume, rel=1e-12)
+    with pytest.warns(UserWarning, match="turned a shell outwards"):
+        apart = check_mesh(*joined(ball(2.0), ball(1.0, 4.0, inwards=True)), "one inside out")
+    assert signed_volume(*apart) == pytest.approx(9 * unit, rel=1e-12)
+
+
+def test_a_shell_that_crosses_itself_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    import manifold3d
+
+    monkeypatch.setattr(manifold3d.Manifold, "status", lambda self: manifold3d.Error.NotManifold)
+    with pytest.warns(
+        UserWarning, match=r"nested: its 2 closed shells, [\d.]+ in volume, cannot be united \(NotMan"
+    ):
+        vertices, _ = check_mesh(*joined(ball(2.0), ball(1.0)), "nested")
+    assert len(vertices) == 2 * 162
+
+
+@pytest.mark.parametrize("doubles", ["one", "all", "both sides", "sheet"])
+def test_double_faces_count_once(doubles: str) -> None:
+    vertices, faces = box()
+    sheet = [faces[0], faces[0][::-1]] if doubles == "both sides" else [[0, 3, 7], [7, 3, 0]]
+    added = {"one": faces[:1], "all": faces, "both sides": faces[:, ::-1], "sheet": np.array(sheet)}[doubles]
+    with pytest.warns(UserWarning, match=f"dropped {len(added)} double faces"):
+        mended = check_mesh(vertices, np.vstack([faces, added]), "doubles")
+    assert signed_volume(*mended) == pytest.approx(6.0, rel=1e-12)
+    assert len(mended[1]) == 12
+
+
+@pytest.mark.parametrize("filled", [False, True])
+@pytest.mark.parametrize("points", [1, 3, 12])
+@pytest.mark.parametrize("suffix", ["obj", "ply", "stl"])
+def test_points_on_an_edge_with_and_without_slivers(tmp_path: Path, points: int, filled: bool, suffix: str) -> None:
+    """Faces end at points on edges of their neighbours (T-junctions), with slivers of no area between, or without.
+
+    The points are whole multiples of 2⁻¹⁰ on edges of a box, so they lie on it exactly in every kind of file, in
+    single precision, too.
+    """
+    box_mesh = trimesh.creation.box(extents=(1024, 2048, 4096))
+    vertices, faces = [tuple(v) for v in box_mesh.vertices], [tuple(map(int, f)) for f in box_mesh.faces]
+    rng = np.random.default_rng(points)
+    for a, b, c in (faces[0], faces[1], faces[5], faces[8]):
+        faces.remove((a, b, c))
+        start, end = (np.array(vertices[k]) for k in (a, b))
+        way = np.sort(rng.choice(np.arange(1, 1024), points, replace=False)) / 1024
+        chain = [a, *range(len(vertices), len(vertices) + points), b]
+        vertices += [tuple(start + (end - start) * t) for t in way]
+        faces += [(u, v, c) for u, v in itertools.pairwise(chain)]
+        if filled:
+            faces += [(a, v, u) for u, v in itertools.pairwise(chain[1:])]
+    path = tmp_path / f"split.{suffix}"
+    trimesh.Trimesh(np.array(vertices), np.array(faces), process=False).export(path)
+    with pytest.warns(UserWarning, match=r"split\.\w+: mended the mesh: .*filled holes with "):
+        mended_vertices, mended = load_shape(path)
+    assert signed_volume(mended_vertices, mended) == pytest.approx(1024 * 2048 * 4096, rel=1e-12)
+    assert trimesh.Trimesh(mended_vertices, mended, process=False).is_watertight
+    assert len(mended_vertices) == 8 + 4 * points
 
 
 # --- the embedded nucleus -----------------------------------------------------------------------------------

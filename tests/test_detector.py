@@ -380,7 +380,8 @@ def test_intensity_is_the_luminance() -> None:
     raw = np.random.default_rng(4).integers(0, 4096, (50, 60, 3), dtype=np.uint16)
     image = detector.rgbi(RawDN(array=raw), SHORT_S).array
     luminance = image[..., :3].astype(np.float64) @ [0.2126, 0.7152, 0.0722]  # Rec. 709
-    assert np.abs(image[..., 3] - luminance).max() <= 0.5 + 1e-5
+    # rounding of the result, and of three weights to whole 65536ths
+    assert np.abs(image[..., 3] - luminance).max() <= 0.5 + 3 * 255 * 0.5 / 65536
     assert len(np.unique(image[..., 3])) > 200
 
 
@@ -526,4 +527,4 @@ def test_the_paper_worlds_detector_is_what_it_was() -> None:
     np.testing.assert_allclose(blocks[0, :, 0], [36.34, 114.18, 191.83, 251.25], atol=0.02)
     np.testing.assert_allclose(blocks[:, 1, 1], [36.38, 114.29, 191.95, 251.06], atol=0.02)
     np.testing.assert_allclose(blocks[2, 2], [191.71, 191.56, 12.82, 178.70], atol=0.02)
-    np.testing.assert_allclose(d.white_balance, [1.4293662, 1.0, 1.3485727], rtol=1e-6)
+    np.testing.assert_allclose(d.white_balance, [1.4455802, 1.0, 1.3421254], rtol=1e-6)  # under TSIS-1 HSRS

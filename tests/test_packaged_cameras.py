@@ -164,7 +164,7 @@ def test_the_navigation_camera_sees_to_1000_nm() -> None:
     efficiency = detector.sensor.efficiency.at(np.array([400.0, 450.0, 650.0, 900.0, 1000.0]))[0]
     assert (efficiency > 0.03).all()
     assert efficiency[4] < 0.1 < efficiency[3] < 0.4 < efficiency[2] < 0.8
-    # 67P's own light in all of it: sunlight of ASTM G173 at 1000 nm is 0.74 W/m²/nm at 1 au
+    # 67P's own light in all of it: sunlight at 1000 nm is 0.74 W/m²/nm at 1 au
     assert spectra.solar_irradiance_W_m2_nm(np.array([1000.0]))[0] == pytest.approx(0.74, rel=0.03)
     sun = spectra.solar_band_irradiance_W_m2_nm(nodes, 1.0)
     ground = assemble.ground_reflectance(scene)

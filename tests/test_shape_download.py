@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import http.server
+import itertools
 import json
 import socket
 import sys
@@ -135,6 +136,47 @@ def test_what_is_no_shape_is_not_kept(server: Server, tmp_path: Path, monkeypatc
     assert names(tmp_path) == set()
 
 
+def test_a_file_that_lies_there_must_be_a_shape(server: Server, tmp_path: Path) -> None:
+    for name, data, reason in (
+        ("mine.obj", b"x\n", "mesh has 0 faces"),
+        ("mine.bds", b"x\n", r"it begins with b'x\\n', a DSK with b'DAS/DSK '"),
+    ):
+        (tmp_path / name).write_bytes(data)
+        with pytest.raises(
+            InputError, match=rf"{name}: is not a shape: {reason}; move the file away to download it"
+        ):
+            fetch_shape(f"{server.url}/a/{name}", tmp_path)
+    assert not server.requests
+    assert names(tmp_path) == {"mine.obj", "mine.bds"}
+    (tmp_path / "mine.obj").write_bytes(TETRAHEDRON)
+    assert not fetched(server, tmp_path).is_new
+
+
+@pytest.mark.parametrize("address", ["/komet_é.obj", "/komet_%C3%A9.obj", "/a b/komet_é.obj?x=ü"])
+def test_addresses_beyond_ascii_are_encoded(server: Server, tmp_path: Path, address: str) -> None:
+    sent = {"/a": "/a%20b/komet_%C3%A9.obj?x=%C3%BC"}.get(address[:2], "/komet_%C3%A9.obj")
+    server.files[sent] = TETRAHEDRON
+    assert fetch_shape(server.url + address, tmp_path).path == tmp_path / "komet_é.obj"
+    assert server.requests == [sent]
+
+
+@pytest.mark.parametrize("is_slow", [True, False])
+def test_a_download_that_would_never_end_is_given_up(
+    server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_slow: bool
+) -> None:
+    """The clock goes 61 s or 1 s a look, with no wait: 5000 bytes a second are asked for after a minute."""
+    clock = itertools.count(0, 61 if is_slow else 1)
+    monkeypatch.setattr("vbnfault.body.download.time.monotonic", lambda: float(next(clock)))
+    if not is_slow:
+        assert fetched(server, tmp_path).is_new
+        return
+    with pytest.raises(
+        VbnfaultError, match=r"mine\.obj: sent 70 bytes in 61 s, fewer than 5000 a second; try again"
+    ):
+        fetched(server, tmp_path)
+    assert names(tmp_path) == set()
+
+
 def test_without_a_network_a_sentence_says_so(tmp_path: Path) -> None:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -152,11 +194,18 @@ def test_without_a_network_a_sentence_says_so(tmp_path: Path) -> None:
         ("https://example.org/a.zip", r"must end with the name of a shape file: \.obj, \.ply"),
         ("https://example.org/", "must end with the name of a shape file"),
         ("https://[a/b.obj", "Invalid IPv6 URL"),
+        ("https://example.org:99999/a.obj", "Port out of range 0-65535"),
+        ("https://example.org:x/a.obj", "Port could not be cast"),
+        ("https://:80/a.obj", "must begin with http:// or https:// and a host"),
+        ("https://a..é/a.obj", "label empty or too long"),
+        ("https://example.org/a%0ab.obj", "must end with the name of a shape file"),
     ],
 )
 def test_a_wrong_address_is_refused(tmp_path: Path, url: str, sentence: str) -> None:
     with pytest.raises(InputError, match=rf"url = '.*': .*{sentence}"):
         fetch_shape(url, tmp_path)
+    with pytest.raises(InputError, match="file to download = .*: must be a path of at most"):
+        fetch_shape(f"https://example.org/{'a' * 300}.obj", tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -161,7 +161,7 @@ def test_magnitude_zero_is_the_zero_point(colour: float) -> None:
 
 
 def test_the_sun_as_a_star() -> None:
-    # V = -26.76, B-V = 0.65 (Bessell 1998; Ramírez 2012): the black body against ASTM G173; lines apart, which
+    # V = -26.76, B-V = 0.65 (Bessell 1998; Ramírez 2012): the black body against TSIS-1 HSRS; lines apart, which
     # take up to a tenth at 400 nm
     star = sky.star_irradiance_W_m2_nm(-26.76, 0.653, NODES_NM)[0]
     sun = spectra.solar_band_irradiance_W_m2_nm(NODES_NM, 1.0)

@@ -12,6 +12,8 @@ import pytest
 
 from vbnfault.core import frames, spice
 from vbnfault.core.errors import InputError
+from vbnfault.scene import config
+from vbnfault.world import assemble
 
 spiceypy: Any = pytest.importorskip("spiceypy", reason="spiceypy (the extra 'spice') is not installed")
 
@@ -159,6 +161,53 @@ def test_rotation_is_that_of_a_text_pck(folder: Path, julian_date: float) -> Non
     assert 2 * np.linalg.norm(between[1:]) < 1e-9
 
 
+# NAIF number, right ascension and declination of the pole, and the three constants of the prime meridian, in the
+# frame of the body's shape model. The kernels are copies in public repositories (DOI-USGS/ale, layoutit/css.earth).
+SHAPE_FRAMES = {
+    "67P": (1000012, 69.54, 64.11, 114.69, 696.543884683, 0.0),  # Scholten, Cheops frame document
+    "Bennu": (2101955, 85.45864, -60.36468, 150.48977, 2011.143058731885, 2e-6),  # bennu_v17.tpc
+    "Ryugu": (2162173, 96.43112, -66.38741, 274.16225, 1131.98280286, 0.0),  # ryugu_v10.tpc
+    "Itokawa": (2025143, 90.02564, -67.02704, 129.73, 712.14376110, 0.0),  # itokawa_gaskell_n3.tpc
+    "Eros": (2000433, 11.363, 17.232, 326.08, 1639.38928, 0.0),  # eros_alex.tpc
+    "Moon": (301, 269.9949, 66.5392, 38.3213, 13.17635815, -1.4e-12),  # pck00011.tpc, without its periodic terms
+    "Ceres": (2000001, 291.42763, 66.76033, 170.309, 952.1532635, 0.0),  # CERES18D, dawn_ceres_v06.tpc
+    "Phobos": (
+        401,
+        317.67071657,
+        52.88627266,
+        35.1877444,
+        1128.84475928,
+        9.536137031212154e-9,
+    ),  # pck00011.tpc, too
+}
+
+
+@pytest.mark.parametrize("name", SHAPE_FRAMES)
+def test_a_named_body_turns_as_the_kernel_of_its_shape_says(tmp_path: Path, name: str) -> None:
+    """The period of 67P has six digits: 3e-6° in 10,000 days of 697°. The others have 13: 1e-7°."""
+    number, right_ascension, declination, *meridian = SHAPE_FRAMES[name]
+    kernel = tmp_path / "shape.tpc"
+    kernel.write_text(f"""KPL/PCK
+\\begindata
+BODY{number}_POLE_RA = ( {right_ascension} 0. 0. )
+BODY{number}_POLE_DEC = ( {declination} 0. 0. )
+BODY{number}_PM = ( {meridian[0]} {meridian[1]} {meridian[2]} )
+FRAME_OF_SHAPE = 1400012
+FRAME_1400012_NAME = 'OF_SHAPE'
+FRAME_1400012_CLASS = 2
+FRAME_1400012_CLASS_ID = {number}
+FRAME_1400012_CENTER = {number}
+\\begintext
+""")
+    for julian_date in (2451545.0, 2456948.25, 2461372.0):  # to 2026
+        table = {"title": "t", "body": {"name": name}, "sun": {"julian_date": julian_date}}
+        ours = assemble.ephemeris(config.parse_scene(table, source="t.toml"))[1]
+        with spice.kernels(kernel):
+            theirs = spice.J_from_T("OF_SHAPE", spice.et_s_from_julian_date(julian_date)).T
+        between = frames.quaternion(ours @ theirs.T)
+        assert 2 * np.linalg.norm(between[1:]) < 2e-7
+
+
 @pytest.mark.parametrize("days", [-540.0, -200.0, -1.0, 0.0, 3.0, 77.7, 540.0])
 def test_two_body_ephemeris_is_that_of_spice(days: float) -> None:
     julian_date = frames.ORBIT_67P.perihelion_jd + days
@@ -240,9 +289,65 @@ def test_meta_kernels(folder: Path, tmp_path: Path) -> None:
         assert np.linalg.norm(spice.sun_position_J_au(str(COMET), ET_S)) > 1
     assert spice.loaded() == 0
     meta.write_text(text.format(listed + " '$K/lost.bsp'"))
-    with pytest.raises(InputError, match=r"all\.tm: SPICE says: .*lost\.bsp"), spice.kernels(meta):
+    sentence = (
+        rf"all\.tm: KERNELS_TO_LOAD names '\$K/lost\.bsp', which is missing; looked for {folder}/lost\.bsp\.$"
+    )
+    with pytest.raises(InputError, match=sentence), spice.kernels(meta):
         pass
     assert spice.loaded() == 0
+
+
+@pytest.mark.parametrize("kind", ["relative", "working folder", "long", "continued", "crlf", "nested", "defining"])
+def test_meta_kernels_as_agencies_and_users_write_them(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    """Paths relative to the meta-kernel or to the working folder, of more than 80 characters, and the rest."""
+    place = tmp_path / ("x" * 90) / "kernels"
+    place.mkdir(parents=True)
+    for path in all_of(folder):
+        (place / path.name).symlink_to(path)
+    own = place.parent / "mk"
+    own.mkdir()
+    value = {
+        "relative": "'../kernels'",
+        "working folder": "'kernels'",
+        "continued": ", ".join(f"'{str(place)[k : k + 50]}+'" for k in range(0, len(str(place)), 50))[:-2] + "'",
+    }.get(kind, f"'{place}'")
+    names = [path.name for path in all_of(folder)]
+    extra = ""
+    if kind == "defining":
+        names.remove("a.tf")
+        extra = FK.partition("\\begindata")[2].partition("\\begintext")[0]
+    listed = ", ".join(f"'$K/{name}'" for name in names)
+    text = (
+        f"KPL/MK\n\\begindata\nPATH_VALUES = ( {value} )\nPATH_SYMBOLS = ( 'K' )\n{extra}"
+        f"KERNELS_TO_LOAD = ( {listed} )\n\\begintext\n"
+    )
+    meta = own / "all.tm"
+    meta.write_bytes(text.replace("\n", "\r\n" if kind == "crlf" else "\n").encode())
+    if kind == "nested":
+        (own / "outer.tm").write_text("KPL/MK\n\\begindata\nKERNELS_TO_LOAD = 'all.tm'\n\\begintext\n")
+        meta = own / "outer.tm"
+    monkeypatch.chdir(place.parent if kind == "working folder" else tmp_path)
+    with spice.kernels(meta):
+        assert np.linalg.norm(spice.sun_position_J_au(str(COMET), ET_S)) > 1
+        assert spice.J_from_T("COMET_FIXED", ET_S).shape == (3, 3)  # the frame kernel too
+    assert spice.loaded() == 0
+
+
+def test_meta_kernels_in_a_circle_and_paths_too_long_for_spice(tmp_path: Path) -> None:
+    meta = tmp_path / "circle.tm"
+    meta.write_text("KPL/MK\n\\begindata\nKERNELS_TO_LOAD = ( 'circle.tm', 'circle.tm' )\n")
+    with (
+        pytest.raises(InputError, match=r"circle\.tm: names meta-kernels more than 3 deep\.$"),
+        spice.kernels(meta),
+    ):
+        pass
+    deep = tmp_path / ("y" * 200) / ("z" * 100)
+    deep.mkdir(parents=True)
+    (deep / "a.tls").write_text(LSK)
+    with pytest.raises(InputError, match="SPICE takes paths of at most 255 bytes"), spice.kernels(deep / "a.tls"):
+        pass
 
 
 def test_threads_take_turns(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,12 +11,14 @@ import hashlib
 import json
 import os
 import tempfile
+import time
 import warnings
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote, urlsplit
+from urllib.parse import quote, unquote, urlsplit, urlunsplit
 
+from ..core import path_checks
 from ..core.errors import InputError, VbnfaultError, shown
 from ..core.user_files import LIMIT_BYTES, MIB, head_of_input, read_input, sha256_of_input
 from .shape import FILE_TYPES, load_shape
@@ -25,6 +27,8 @@ LOCK = "shapes.lock"
 _LONGEST_LOCK = 4 * MIB
 _READ_BYTES = 1 << 20
 _TIMEOUT_S = 60.0
+# Slower downloads are given up after `_TIMEOUT_S`: a modem of 56 kbit/s is faster.
+_LEAST_BYTES_PER_S = 5000
 _DSK_ID = b"DAS/DSK "  # the first bytes of a NAIF digital shape kernel
 
 
@@ -65,7 +69,7 @@ def fetch_shape(url: str, folder: str | Path, *, sha256: str = "") -> Fetched:
     Parameters
     ----------
     url
-        Address, http or https. The last part of its path names the file.
+        Address, http or https. The last part of its path names the file. Characters beyond ASCII are encoded.
     folder
         Folder of the file and of the lock file; it is made if it is missing.
     sha256
@@ -75,12 +79,13 @@ def fetch_shape(url: str, folder: str | Path, *, sha256: str = "") -> Fetched:
     ------
     InputError
         The address names no shape file, the lock file is damaged or says otherwise than `sha256`, or a file of this
-        name lies there with another checksum.
+        name lies there with another checksum, or without a known one and is no shape.
     VbnfaultError
-        The download fails, is too large, has another checksum, or is no shape.
+        The download fails, is too large or too slow, has another checksum, or is no shape.
     """
     folder = Path(folder)
     name = _file_name(url)
+    path_checks.check_path(str(folder / name), "file to download")
     pins = _read_lock(folder / LOCK)
     pinned = pins.get(name)
     if pinned is not None and sha256 and pinned.sha256 != sha256:
@@ -99,6 +104,9 @@ def fetch_shape(url: str, folder: str | Path, *, sha256: str = "") -> Fetched:
             raise InputError(
                 f"{path}: SHA-256 {pin.sha256}: must be {known}; move the file away to download it again"
             )
+        reason = "" if known else _why_no_shape(path)
+        if reason:
+            raise InputError(f"{path}: is not a shape: {reason}; move the file away to download it")
     if pinned != pin:
         _write_lock(folder / LOCK, {**pins, name: pin})
     return Fetched(path=path, pin=pin, is_new=is_new, was_known=bool(known))
@@ -107,15 +115,24 @@ def fetch_shape(url: str, folder: str | Path, *, sha256: str = "") -> Fetched:
 def _file_name(url: str) -> str:
     """Return the name of the file at an address. Raises InputError."""
     try:
-        parts = urlsplit(url)
+        parts = urlsplit(_encoded(url))
     except ValueError as error:
         raise InputError(f"url = {shown(url)}: {error}") from None
-    if parts.scheme not in ("http", "https") or not parts.netloc:
+    if parts.scheme not in ("http", "https") or not parts.hostname:
         raise InputError(f"url = {shown(url)}: must begin with http:// or https:// and a host")
     name = Path(unquote(parts.path)).name
-    if Path(name).suffix.lower() not in FILE_TYPES or "\x00" in name:
+    if Path(name).suffix.lower() not in FILE_TYPES or not name.isprintable():
         raise InputError(f"url = {shown(url)}: must end with the name of a shape file: {', '.join(FILE_TYPES)}")
     return name
+
+
+def _encoded(url: str) -> str:
+    """Return an address in ASCII: its host by IDNA, the rest in per cent. Raises ValueError for a wrong host."""
+    parts = urlsplit(url)
+    parts.port  # noqa: B018  (it is checked when it is read)
+    host = parts.netloc if parts.netloc.isascii() else parts.netloc.encode("idna").decode()
+    path, query = (quote(text, safe="/%:@!$&'()*+,;=~?") for text in (parts.path, parts.query))
+    return urlunsplit((parts.scheme, host, path, query, ""))
 
 
 def _download(url: str, path: Path, known: str) -> Pin:
@@ -132,7 +149,8 @@ def _download(url: str, path: Path, known: str) -> Pin:
             raise VbnfaultError(
                 f"{url}: has SHA-256 {pin.sha256} ({pin.size_bytes} bytes): must be {known}; the file was not kept"
             )
-        _check_shape(url, Path(part))
+        if reason := _why_no_shape(Path(part)):
+            raise VbnfaultError(f"{url}: is not a shape: {reason}; the file was not kept")
         os.chmod(part, 0o644)  # mkstemp lets nobody else read it
         os.replace(part, path)
     except OSError as error:
@@ -150,10 +168,17 @@ def _received(url: str, file: Any) -> Pin:
 
     limit, size, digest = LIMIT_BYTES["shape"], 0, hashlib.sha256()
     try:
-        with urlopen(Request(url, headers={"User-Agent": "vbnfault"}), timeout=_TIMEOUT_S) as reply:
+        started = time.monotonic()
+        with urlopen(Request(_encoded(url), headers={"User-Agent": "vbnfault"}), timeout=_TIMEOUT_S) as reply:
             expected = reply.headers.get("Content-Length", "")
-            while data := reply.read(_READ_BYTES):
+            while data := reply.read1(_READ_BYTES):  # what has come, however little
                 size += len(data)
+                waited_s = time.monotonic() - started
+                if waited_s > _TIMEOUT_S and size < waited_s * _LEAST_BYTES_PER_S:
+                    raise VbnfaultError(
+                        f"{url}: sent {size} bytes in {waited_s:.0f} s, fewer than {_LEAST_BYTES_PER_S} a second; "
+                        "try again, or download the file elsewhere and put it into the folder"
+                    )
                 if size > limit:
                     raise VbnfaultError(f"{url}: has more than {limit / MIB:g} MiB, the most of a shape file")
                 digest.update(data)
@@ -171,23 +196,18 @@ def _received(url: str, file: Any) -> Pin:
     return Pin(sha256=digest.hexdigest(), size_bytes=size, url=url)
 
 
-def _check_shape(url: str, path: Path) -> None:
-    """Check that a file is a shape; of a DSK only its first bytes. Raises VbnfaultError."""
-    if path.suffix == ".bds":
+def _why_no_shape(path: Path) -> str:
+    """Return as a clause why a file is no shape, or "" if it is one; of a DSK only its first bytes are checked."""
+    if path.suffix.lower() == ".bds":
         head = head_of_input(path, "shape", len(_DSK_ID))
-        if head != _DSK_ID:
-            raise VbnfaultError(
-                f"{url}: is not a shape: it begins with {shown(head)}, a DSK with {shown(_DSK_ID)}; the file was "
-                "not kept"
-            )
-        return
+        return "" if head == _DSK_ID else f"it begins with {shown(head)}, a DSK with {shown(_DSK_ID)}"
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # whoever uses the shape is warned of what was mended
             load_shape(path)
     except InputError as error:
-        reason = str(error).removeprefix(f"{path}: ")
-        raise VbnfaultError(f"{url}: is not a shape: {reason.rstrip('.')}; the file was not kept") from None
+        return str(error).removeprefix(f"{path}: ").rstrip(".")
+    return ""
 
 
 def _read_lock(path: Path) -> dict[str, Pin]:

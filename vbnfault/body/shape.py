@@ -5,6 +5,8 @@ from __future__ import annotations
 import io
 import logging
 import warnings
+from collections import deque
+from itertools import pairwise
 from pathlib import Path
 from typing import Literal
 
@@ -29,10 +31,13 @@ FILE_TYPES = (".obj", ".ply", ".stl", ".glb", ".gltf", *formats.SUFFIXES)
 # of an ICQ). Merging such vertices is normal and deserves no warning.
 _SPLIT_VERTEX_TYPES = (".stl", ".glb", ".gltf", *formats.SUFFIXES)
 _LARGEST_HOLE_EDGES = 8
+_MOST_FLIPS = 30  # of a sliver: several times what chains of tens of slivers take
 # In the file's unit: larger than any body, and small enough that areas and volumes do not overflow.
 _FARTHEST = 1e12
 # Relative to the squared extent. The normal of a smaller facet is rounding noise in float64.
 _DEGENERATE_AREA_FRACTION = 1e-16
+# Volumes that differ by less are the same, to the rounding of a union.
+_SAME_VOLUME = 1e-9
 
 
 def load_shape(path: str | Path, unit: Unit = "auto") -> tuple[Float64, Int32]:
@@ -111,9 +116,11 @@ def _read_with_trimesh(path: Path, data: bytes) -> tuple[Float64, NDArray[np.int
 def check_mesh(vertices: NDArray, faces: NDArray, source: str) -> tuple[Float64, Int32]:
     """Check that a mesh bounds a solid, and repair what can be repaired without guessing.
 
-    Coincident vertices are merged, degenerate and loose faces dropped, holes of up to eight edges filled, and the
-    winding is made consistent and turned outwards. One `UserWarning` reports these repairs. Unreferenced vertices
-    are dropped silently.
+    Coincident vertices are merged, degenerate, double and loose faces dropped, holes of up to eight edges or
+    without area filled, and the winding is made consistent and turned outwards. Closed shells that overlap, or that
+    lie within one another and are wound outwards, become their union, so that no part counts twice in volume and
+    gravity; a shell within another one and wound inwards is a cavity and stays. One `UserWarning` reports these
+    repairs. Unreferenced vertices are dropped silently.
 
     Parameters
     ----------
@@ -137,12 +144,17 @@ def check_mesh(vertices: NDArray, faces: NDArray, source: str) -> tuple[Float64,
     vertices = np.array(vertices, dtype=np.float64)
     faces = np.array(faces, dtype=np.int64)
     _check_arrays(vertices, faces, source)
-    vertices, faces, merged = _weld(vertices, faces)
+    welded, welded_faces, merged = _weld(vertices, faces)
+    if (_undirected_counts(welded_faces) > 2).any() and (_undirected_counts(faces) == 2).all():
+        merged = 0  # closed shells that touch along an edge stay apart
+    else:
+        vertices, faces = welded, welded_faces
     repairs = [f"merged {merged} duplicate vertices"] if merged else []
     faces, dropped = _without_useless_faces(vertices, faces, source)
     faces, filled = _closed(vertices, faces, source)
     faces, turned = _wound_outwards(vertices, faces, source)
-    repairs += dropped + filled + turned
+    vertices, faces, united = _united(vertices, faces, source)
+    repairs += dropped + filled + turned + united
     if repairs:
         warnings.warn(f"{source}: mended the mesh: {', '.join(repairs)}.", UserWarning, stacklevel=2)
 
@@ -151,7 +163,11 @@ def check_mesh(vertices: NDArray, faces: NDArray, source: str) -> tuple[Float64,
 
 
 def _without_useless_faces(vertices: Float64, faces: NDArray, source: str) -> tuple[NDArray, list[str]]:
-    """Drop degenerate and loose faces, and return also the list of repairs. Raises InputError if none remains."""
+    """Drop degenerate, double and loose faces, and return also the list of repairs.
+
+    Of faces with the same corners one stays, or none where the others are closed without them, as on both sides of
+    a sheet within a body. Raises InputError if no face remains.
+    """
     repairs = []
     sound = _sound_faces(vertices, faces)
     if not sound.all():
@@ -159,6 +175,14 @@ def _without_useless_faces(vertices: Float64, faces: NDArray, source: str) -> tu
         faces = faces[sound]
     if len(faces) == 0:
         raise InputError(f"{source}: mesh has only degenerate faces.")
+    _, first, inverse, copies = np.unique(
+        np.sort(faces, axis=1), axis=0, return_index=True, return_inverse=True, return_counts=True
+    )
+    if len(first) < len(faces):
+        alone = faces[copies[inverse.ravel()] == 1]
+        once = alone if len(alone) and (_undirected_counts(alone) == 2).all() else faces[np.sort(first)]
+        repairs.append(f"dropped {len(faces) - len(once)} double faces")
+        faces = once
     loose = _loose_faces(faces)
     if loose.any() and not loose.all():
         repairs.append(f"dropped {int(loose.sum())} loose faces")
@@ -171,7 +195,7 @@ def _closed(vertices: Float64, faces: NDArray, source: str) -> tuple[NDArray, li
     repairs = []
     counts = _undirected_counts(faces)
     if (counts == 1).any():
-        filled = _fill_holes(faces)
+        filled = _without_slivers(vertices, _fill_holes(vertices, faces))
         if len(filled) > len(faces) and _sound_faces(vertices, filled).all():
             repairs.append(f"filled holes with {len(filled) - len(faces)} faces")
             faces = filled
@@ -332,23 +356,120 @@ def _consistent(faces: NDArray) -> bool:
     return bool((forward[1:] != forward[:-1]).all() and (forward == backward).all())
 
 
-def _fill_holes(faces: NDArray) -> NDArray:
-    """Close simple boundary loops of up to eight edges with a fan, and leave larger holes open."""
+def _fill_holes(vertices: Float64, faces: NDArray) -> NDArray:
+    """Close simple boundary loops with a fan: those of up to eight edges, and those without area."""
     edges = _directed_edges(faces)
     count = int(faces.max()) + 1
     key = edges.min(axis=1) * count + edges.max(axis=1)
     _, inverse, counts = np.unique(key, return_inverse=True, return_counts=True)
-    boundary = edges[counts[inverse.ravel()] == 1]
-    follow = {int(b): int(a) for a, b in boundary}  # reversed, as a filling face needs
-    if len(follow) != len(boundary):
-        return faces  # loops touch in a vertex, or the winding is mixed: no simple loop exists
-    fans: list[tuple[int, int, int]] = []
+    follow: dict[int, list[int]] = {}
+    for a, b in edges[counts[inverse.ravel()] == 1]:
+        follow.setdefault(int(b), []).append(int(a))  # reversed, as a filling face needs
+    fans = [np.empty((0, 3), dtype=faces.dtype)]
     while follow:
-        start, step = follow.popitem()
-        loop = [start]
-        while step != start and step in follow:
-            loop.append(step)
-            step = follow.pop(step)
-        if step == start and 3 <= len(loop) <= _LARGEST_HOLE_EDGES:
-            fans += [(loop[0], loop[k], loop[k + 1]) for k in range(1, len(loop) - 1)]
-    return np.vstack([faces, np.array(fans, dtype=faces.dtype).reshape(-1, 3)])
+        path = [next(iter(follow))]
+        while follow.get(path[-1]):
+            step = follow[path[-1]].pop()
+            if (
+                step in path
+            ):  # a loop; the path goes on from where the loop began, since loops may touch in a vertex
+                loop = path[path.index(step) :]
+                del path[path.index(step) + 1 :]
+                fan = np.array(
+                    [(loop[0], loop[k], loop[k + 1]) for k in range(1, len(loop) - 1)], dtype=faces.dtype
+                )
+                if len(fan) and (len(loop) <= _LARGEST_HOLE_EDGES or not _sound_faces(vertices, fan).any()):
+                    fans.append(fan)
+            else:
+                path.append(step)
+        follow.pop(path[-1], None)
+    return np.vstack([faces, *fans])
+
+
+def _without_slivers(vertices: Float64, faces: NDArray) -> NDArray:
+    """Return the faces with those without area removed: each flips its longest edge with the face beyond it.
+
+    A sliver (a, b, c), whose corner c lies on the edge ab, and its neighbour (b, a, d) become (c, a, d) and
+    (d, b, c): the same surface, with the same outline. Of two slivers side by side, the one with the longer edge
+    comes first, so every flip makes the edges shorter. The faces must be closed.
+    """
+    slivers = deque(map(int, np.flatnonzero(~_sound_faces(vertices, faces))))
+    if not slivers:
+        return faces
+    least_area = _DEGENERATE_AREA_FRACTION * float(np.ptp(vertices, axis=0).max()) ** 2
+    table = [tuple(face) for face in faces.tolist()]
+    owner = {edge: k for k, face in enumerate(table) for edge in pairwise((*face, face[0]))}
+
+    def longest(k: int) -> tuple[float, int, int, int]:
+        """Return the length of a face's longest edge, its two corners, and the third corner."""
+        a, b, c = table[k]
+        turns = ((a, b, c), (b, c, a), (c, a, b))
+        return max((float(np.linalg.norm(vertices[u] - vertices[v])), u, v, w) for u, v, w in turns)
+
+    for _ in range(_MOST_FLIPS * len(slivers)):
+        if not slivers:
+            break
+        k = slivers.popleft()
+        length, a, b, c = longest(k)
+        beyond = owner.get((b, a))
+        if beyond is None or (beyond in slivers and longest(beyond)[0] > length):
+            slivers.append(k)
+            continue
+        (d,) = set(table[beyond]) - {a, b}
+        table[k], table[beyond] = (c, a, d), (d, b, c)
+        slivers = deque(face for face in slivers if face != beyond)
+        for face in (k, beyond):
+            owner.update(dict.fromkeys(pairwise((*table[face], table[face][0])), face))
+            u, v, w = (vertices[corner] for corner in table[face])
+            if 0.5 * np.linalg.norm(np.cross(v - u, w - u)) <= least_area:
+                slivers.append(face)
+    return np.array(table, dtype=faces.dtype)
+
+
+def _united(vertices: Float64, faces: NDArray, source: str) -> tuple[Float64, NDArray, list[str]]:
+    """Return closed shells as one surface that bounds no place twice, and also the list of repairs.
+
+    The shells come by falling volume, so that an outer one comes before what lies within: one wound outwards is
+    added, one wound inwards is cut out. One wound inwards that cuts nothing lies outside of all others, so it is
+    turned. Shells that neither overlap nor contain one another stay as they are, bit for bit.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    edges = np.sort(_directed_edges(faces), axis=1)
+    order = np.argsort(edges[:, 0] * (int(faces.max()) + 1) + edges[:, 1], kind="stable") % len(faces)
+    one, other = order.reshape(-1, 2).T  # the two faces of each edge
+    graph = coo_array((np.ones(len(one), dtype=bool), (one, other)), shape=(len(faces), len(faces)))
+    shells_n, label = connected_components(graph, directed=False)
+    if shells_n == 1:
+        return vertices, faces, []
+    import manifold3d
+
+    volumes = [signed_volume(vertices, faces[label == k]) for k in range(shells_n)]
+    solid, total, faces = manifold3d.Manifold(), 0.0, faces.copy()
+    for k in sorted(range(shells_n), key=lambda k: -abs(volumes[k])):
+        outwards = faces[label == k][:, :: 1 if volumes[k] > 0 else -1]
+        used, index = np.unique(outwards, return_inverse=True)
+        shell = manifold3d.Manifold(manifold3d.Mesh64(vertices[used], index.reshape(-1, 3).astype(np.uint64)))
+        if shell.status() != manifold3d.Error.NoError:
+            warnings.warn(
+                f"{source}: its {shells_n} closed shells, {sum(volumes):.6g} in volume, cannot be united "
+                f"({shell.status().name} in one of them), so what lies in several counts as often.",
+                UserWarning,
+                stacklevel=3,
+            )
+            return vertices, faces, []
+        if volumes[k] < 0 and (cut := solid - shell).volume() < solid.volume() * (1 - _SAME_VOLUME):
+            solid, total = cut, total + volumes[k]
+        else:
+            solid, total = solid + shell, total + abs(volumes[k])
+            faces[label == k] = outwards
+    turned = sum(volumes) < total * (1 - _SAME_VOLUME)
+    said = ["turned a shell outwards"] if turned else []
+    if abs(solid.volume() / total - 1) <= _SAME_VOLUME:
+        return vertices, faces, said
+    mesh = solid.to_mesh64()
+    said.append(
+        f"united {shells_n} closed shells, which bound {total / solid.volume() - 1:.2%} of the volume twice"
+    )
+    return np.array(mesh.vert_properties[:, :3]), np.array(mesh.tri_verts, dtype=np.int64), said

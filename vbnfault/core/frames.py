@@ -213,16 +213,22 @@ ORBIT_67P = Orbit(
 
 @dataclass(frozen=True, kw_only=True)
 class Rotation:
-    """Describe a uniform rotation about a fixed pole (ICRF). `prime_meridian_deg` is W at J2000."""
+    """Describe a rotation about a fixed pole (ICRF).
+
+    The angle of the prime meridian d days after J2000 is W0 + W1 d + W2 d², as in a SPICE PCK: `prime_meridian_deg`
+    is W0, `period_h` gives W1 = 24 · 360 / period, and `prime_meridian_deg_day2` is W2, half the acceleration.
+    """
 
     pole_ra_deg: float
     pole_dec_deg: float
     prime_meridian_deg: float
     period_h: float
+    prime_meridian_deg_day2: float = 0.0
 
     def J_from_T(self, julian_date: float) -> F64:
         """Return Rz(90° + α) · Rx(90° − δ) · Rz(W), which takes body-fixed vectors to ICRF axes."""
-        w = self.prime_meridian_deg + 360.0 * 24.0 / self.period_h * (julian_date - J2000_JD)
+        days = julian_date - J2000_JD
+        w = self.prime_meridian_deg + 360.0 * 24.0 / self.period_h * days + self.prime_meridian_deg_day2 * days**2
         return (
             rz(np.radians(90 + self.pole_ra_deg)) @ rx(np.radians(90 - self.pole_dec_deg)) @ rz(np.radians(w % 360))
         )

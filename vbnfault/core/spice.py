@@ -27,6 +27,7 @@ import re
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -91,8 +92,8 @@ def kernels(*paths: str | Path) -> Iterator[None]:
     Parameters
     ----------
     paths
-        Kernels of any type, including meta-kernels. SPICE takes relative paths in a meta-kernel as relative to the
-        working folder, unless PATH_VALUES in the meta-kernel name another folder.
+        Kernels of any type, including meta-kernels, which may name further ones. A relative path in a meta-kernel,
+        also one of PATH_VALUES, is looked for from the meta-kernel's own folder, then from the working folder.
 
     Raises
     ------
@@ -103,15 +104,14 @@ def kernels(*paths: str | Path) -> Iterator[None]:
     if not paths:
         raise InputError("SPICE kernels: at least one path is needed.")
     _check_installed("SPICE kernels")
-    for path in paths:
-        _check_kernel(Path(path))
-    with _pool:
+    with tempfile.TemporaryDirectory(prefix="vbnfault-") as scratch, _pool:
+        listed = [(path, kernel) for path in paths for kernel in _kernels_of(Path(path), Path(scratch))]
         before = int(_ask("SPICE kernels", "loaded"))
         reader = _reader
         try:
             try:
-                for path in paths:
-                    _ask(str(path), "load", str(path), os.getcwd())
+                for path, kernel in listed:
+                    _ask(str(path), "load", str(kernel), os.getcwd())
             except InputError:
                 if before == 0:  # SPICE keeps records of a refused file, so end its process
                     _end()
@@ -272,7 +272,10 @@ _BINARY = (b"DAF/", b"DAS/", b"NAIF/")
 _DATA = re.compile(rb"\\begindata(.*?)(?:\\begintext|\Z)", re.DOTALL)
 _ASSIGNED = re.compile(rb"([A-Za-z0-9_/$.-]+)[ \t]*\+?=\s*(\((?:'(?:[^'\n]|'')*'|[^()'])*\)|'(?:[^'\n]|'')*')")
 _TEXT = re.compile(rb"'((?:[^'\n]|'')*)'")
-_DEEPEST_META_KERNEL = 8
+_LISTING = (b"PATH_VALUES", b"PATH_SYMBOLS", b"KERNELS_TO_LOAD")
+_DEEPEST_META_KERNEL = 3
+_LONGEST_SPICE_PATH = 255
+_MOST_KERNELS = 5000  # of a meta-kernel: about what SPICE holds
 
 
 def _check_installed(purpose: str) -> None:
@@ -281,35 +284,54 @@ def _check_installed(purpose: str) -> None:
         raise InputError(f"{purpose}: needs spiceypy: pip install 'vbnfault[spice]'.")
 
 
-def _check_kernel(path: Path, depth: int = 0) -> None:
-    """Check that a kernel is a regular file, because a pipe would block SPICE.
+def _kernels_of(path: Path, scratch: Path, depth: int = 0) -> list[Path]:
+    """Return the kernels to load for a path: itself, or what it names and defines if it is a meta-kernel.
 
-    If the kernel is a meta-kernel, the kernels that it names are checked too.
+    Each is a regular file, because a pipe would block SPICE. Meta-kernels are not left to SPICE, which cuts a path
+    after 80 characters, takes it as relative to the working folder, and refuses a meta-kernel in another one. What
+    a meta-kernel defines beside its list goes to a file in the folder `scratch`. Raises InputError.
     """
     path_checks.check_path(str(path), "SPICE kernel")
+    if len(os.fsencode(path)) > _LONGEST_SPICE_PATH:
+        raise InputError(f"{path}: SPICE takes paths of at most {_LONGEST_SPICE_PATH} bytes; name it relatively.")
     if user_files.head_of_input(path, "SPICE kernel", 8).startswith(_BINARY):
         user_files.check_input(path, "SPICE kernel")
-        return
+        return [path]
     text = user_files.read_input(path, "SPICE text kernel")
     values: dict[bytes, list[str]] = {}
+    defined = b""
     for data in _DATA.findall(text):
         for name, value in _ASSIGNED.findall(data):
-            texts = (os.fsdecode(t.replace(b"''", b"'")) for t in _TEXT.findall(value))
+            texts = [os.fsdecode(t.replace(b"''", b"'")) for t in _TEXT.findall(value)]
             values.setdefault(name.upper(), []).extend(texts)
-    symbols = dict(zip(values.get(b"PATH_SYMBOLS", ()), values.get(b"PATH_VALUES", ()), strict=False))
-    named = ""
-    for piece in values.get(b"KERNELS_TO_LOAD", ()):
-        named += piece.removesuffix("+")
-        if piece.endswith("+"):  # the name continues in the next text
-            continue
-        for symbol in sorted(symbols, key=len, reverse=True):
-            named = named.replace(f"${symbol}", symbols[symbol])
-        status = path_checks.file_status(named)
-        if status is not None:  # if the file is missing, SPICE's message is better
-            if depth == _DEEPEST_META_KERNEL:
-                raise InputError(f"{path}: names meta-kernels more than {_DEEPEST_META_KERNEL} deep.")
-            _check_kernel(Path(named), depth + 1)
-        named = ""
+        defined += _ASSIGNED.sub(lambda match: b"" if match[1].upper() in _LISTING else match[0], data)
+    if b"KERNELS_TO_LOAD" not in values:
+        return [path]
+    if depth == _DEEPEST_META_KERNEL:
+        raise InputError(f"{path}: names meta-kernels more than {_DEEPEST_META_KERNEL} deep.")
+    folders, symbols, listed = (_continued(values.get(name, [])) for name in _LISTING)
+    kernels = []
+    if b"=" in defined:
+        kernels.append(scratch / f"{len(list(scratch.iterdir()))}{path.suffix}")
+        kernels[0].write_bytes(b"KPL/MK\n\\begindata\n" + defined.replace(b"\r", b"") + b"\n\\begintext\n")
+    for named in listed:
+        full = named
+        for symbol, folder in sorted(zip(symbols, folders, strict=False), key=lambda pair: -len(pair[0])):
+            full = full.replace(f"${symbol}", folder)
+        places = dict.fromkeys([path.parent / full, Path(full)])
+        place = next((place for place in places if path_checks.file_status(place) is not None), None)
+        if place is None:
+            looked = " and ".join(os.path.abspath(place) for place in places)
+            raise InputError(f"{path}: KERNELS_TO_LOAD names {named!r}, which is missing; looked for {looked}.")
+        kernels += _kernels_of(place, scratch, depth + 1)
+        if len(kernels) > _MOST_KERNELS:
+            raise InputError(f"{path}: names more than {_MOST_KERNELS} kernels.")
+    return kernels
+
+
+def _continued(pieces: list[str]) -> list[str]:
+    """Return texts of a kernel's list with each that ends in "+" joined to the next."""
+    return "\0".join(pieces).replace("+\0", "").removesuffix("+").split("\0") if pieces else []
 
 
 # --- the process that SPICE runs in ---------------------------------------------------------------------------
@@ -453,7 +475,7 @@ def serve() -> None:
 
 
 def _load(spiceypy: Any, path: str, folder: str) -> None:
-    """Load a kernel; relative paths in a meta-kernel are relative to `folder`."""
+    """Load a kernel; a relative path is relative to `folder`."""
     os.chdir(folder)
     spiceypy.furnsh(path)
 

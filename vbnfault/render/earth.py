@@ -216,8 +216,9 @@ def height_at(up: Any, footprint: Any) -> Any:
 def _ground(up: Any, footprint: Any) -> tuple[Any, Any]:
     """Return the albedo of land, ice and water, and the fraction of open water."""
     height = height_at(up, footprint)
-    land = _step(height, SEA_LEVEL, 0.004)
-    shelf = _step(height, SEA_LEVEL - 0.02, 0.02)
+    unseen = _variance_left_out(footprint * 1.15, 0.54, 14)
+    land = _step(height, SEA_LEVEL, 0.004, unseen)
+    shelf = _step(height, SEA_LEVEL - 0.02, 0.02, unseen)
     latitude = dr.abs(up.z)
     footprint = dr.select((land > 0) | (latitude > _NO_ICE), footprint, _NO_DETAIL)  # the sea needs no more noise
     rough = _fractal(9.0 * up, footprint * 9.0, 5, 0.63, 13)
@@ -257,17 +258,37 @@ def _clouds(up: Any, footprint: Any) -> Any:
     latitude = dr.abs(up.z)
     belts = 0.10 * dr.exp(-dr.square(up.z / 0.10)) + 0.13 * dr.exp(-dr.square((latitude - 0.80) / 0.16))
     belts -= 0.09 * dr.exp(-dr.square((latitude - 0.40) / 0.14))
-    cover = 0.8 * large + 0.40 * small + 0.16 * cells + belts
-    thick = _step(cover, 0.24, 0.20)
-    wisps = 0.4 * _step(0.5 * large + 0.5 * small + 0.2 * cells + belts, 0.10, 0.14)
+    unseen = [
+        _variance_left_out(footprint * scale, gain, octaves)
+        for scale, gain, octaves in ((2.4, 0.55, 14), (26.0, 0.66, 12), (170.0, 0.70, 9))
+    ]
+    parts, thin = (0.8, 0.40, 0.16), (0.5, 0.5, 0.2)
+    cover, wisp = (sum(w * f for w, f in zip(p, (large, small, cells), strict=True)) + belts for p in (parts, thin))
+    thick = _step(cover, 0.24, 0.20, sum(w * w * v for w, v in zip(parts, unseen, strict=True)))
+    wisps = 0.4 * _step(wisp, 0.10, 0.14, sum(w * w * v for w, v in zip(thin, unseen, strict=True)))
     albedo = dr.clip(_CLOUD * (0.72 + 0.45 * cover + 0.35 * small + 0.25 * cells), 0.3, 0.85)
     return dr.clip(thick + wisps * (1 - thick), 0, 1), albedo
 
 
-def _step(value: Any, middle: float, half_width: float) -> Any:
-    """Return 0 below, 1 above, and a smooth step within `half_width` of the middle."""
+def _step(value: Any, middle: float, half_width: float, unseen: Any = 0.0) -> Any:
+    """Return 0 below, 1 above, and a smooth step within `half_width` of the middle.
+
+    Details of the variance `unseen`, which a wide footprint leaves out of the value, widen the step: it is then
+    near the mean of the steps of all points in the footprint. The slope of a step has the variance half_width² / 5.
+    """
+    half_width = dr.sqrt(half_width**2 + 5 * unseen)
     t = dr.clip((value - (middle - half_width)) / (2 * half_width), 0, 1)
     return t * t * (3 - 2 * t)
+
+
+def _shown(footprint: Any) -> Any:
+    """Return the fraction of an octave of unit wavelength that points at the distance `footprint` show."""
+    return dr.clip((1 / footprint - 1) * 0.5, 0, 1)
+
+
+def _variance_left_out(footprint: Any, gain: float, octaves: int) -> Any:
+    """Return the variance of what `_fractal` with the same arguments leaves out, with 0.19² for noise."""
+    return sum((0.19 * gain**k) ** 2 * (1 - dr.square(_shown(footprint * _LACUNARITY**k))) for k in range(octaves))
 
 
 def _fractal(point: Any, footprint: Any, seed: int, gain: float, octaves: int) -> Any:
@@ -277,8 +298,7 @@ def _fractal(point: Any, footprint: Any, seed: int, gain: float, octaves: int) -
         return (octave < min(octaves, _MOST_OCTAVES)) & (footprint < 1)
 
     def add(octave: Any, point: Any, footprint: Any, amplitude: Any, total: Any) -> Any:
-        shown = dr.clip((1 / footprint - 1) * 0.5, 0, 1)
-        total = total + amplitude * shown * _noise(point, mi.UInt32(seed) + 101 * octave)
+        total = total + amplitude * _shown(footprint) * _noise(point, mi.UInt32(seed) + 101 * octave)
         # a turn keeps the axes of the lattices apart
         turned = mi.Vector3f(
             0.36 * point.x + 0.48 * point.y - 0.8 * point.z,

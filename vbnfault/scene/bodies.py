@@ -18,7 +18,7 @@ from ..core.tables import Table
 DEFAULT = "67p"
 # The keys of [body] that describe a body of the user's own, beside its name.
 _OWN_KEYS = {"shape", "semi_axes_m", "density_kg_m3", "rotation_period_h", "reflectance", "photometry"}
-_OWN_KEYS |= {"pole_ra_deg", "pole_dec_deg", "prime_meridian_deg", "albedo_map"}
+_OWN_KEYS |= {"pole_ra_deg", "pole_dec_deg", "prime_meridian_deg", "prime_meridian_deg_day2", "albedo_map"}
 # Ratio of `difflib` from which an unknown name counts as a misspelling.
 _CLOSE = 0.75
 

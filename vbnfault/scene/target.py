@@ -138,6 +138,9 @@ class BodyTable(Table):
     pole_ra_deg: float = Field(69.54, ge=0, le=360, description="right ascension of the north pole, ICRF")
     pole_dec_deg: float = Field(64.11, ge=-90, le=90, description="declination of the north pole, ICRF")
     prime_meridian_deg: float = Field(114.69, ge=-360, le=360, description="W at J2000.0")
+    prime_meridian_deg_day2: float = Field(
+        0.0, ge=-0.01, le=0.01, description="coefficient of d² in W, d in days from J2000.0: half the acceleration"
+    )
     reflectance: str | Annotated[float, Field(ge=0, le=1)] | SpectrumTable = Field(
         "67p", description="a named reflectance, a grey value, or a table of values at wavelengths"
     )

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import csv
 import io
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -279,9 +280,9 @@ def _check_names(names: Sequence[str], source: str) -> None:
     """Raise InputError unless each column of a table of poses is there once, and no other."""
     if names and not any(name in COLUMNS for name in names) and any(tables.is_number(name) for name in names):
         raise InputError(f"{source}: its first line is one of numbers; must name the columns: {', '.join(COLUMNS)}")
-    twice = next((name for k, name in enumerate(names) if name in names[:k]), None)
-    if twice is not None:
-        raise InputError(f"{source}: column {shown(twice)} stands twice; must stand once")
+    for name, times in Counter(names).items():
+        if times > 1:
+            raise InputError(f"{source}: column {shown(name)} stands twice; must stand once")
     missing = [name for name in COLUMNS if name not in names]
     unknown = [name for name in names if name not in COLUMNS]
     if missing or unknown:

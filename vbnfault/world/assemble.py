@@ -72,6 +72,7 @@ def _ephemeris(
         pole_dec_deg=body.pole_dec_deg,
         prime_meridian_deg=body.prime_meridian_deg,
         period_h=body.rotation_period_h,
+        prime_meridian_deg_day2=body.prime_meridian_deg_day2,
     ).J_from_T(date)
     sun_J_au = -_orbit(orbit).position_J_au(date)
     if kernels.kernels:
