@@ -72,6 +72,13 @@ def tiff(image: Any, **options: Any) -> bytes:
     return file.getvalue()
 
 
+def patched(data: bytes, tag: int, value: int) -> bytes:
+    """Return a TIFF file with another value of a tag."""
+    with tifffile.TiffFile(io.BytesIO(data)) as file:
+        place = file.pages[0].tags[tag].valueoffset
+    return data[:place] + value.to_bytes(2, "little") + data[place + 2 :]
+
+
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.uint32, np.float16, np.float32, np.float64])
 @pytest.mark.parametrize("planes", ["contig", "separate"])
 def test_tiff_of_every_layout_is_read_right(dtype: type, planes: str) -> None:
@@ -101,19 +108,18 @@ def test_compressions_beyond_those_of_tifffile_are_unpacked() -> None:
         )
         assert done
         np.testing.assert_array_equal(decoded_image(lzw.tobytes(), 351)[0], np.atleast_3d(few) / np.float32(65535))
-    with tifffile.TiffFile(io.BytesIO(lzw.tobytes())) as opened:  # a block that ends too early
-        counts = opened.pages[0].tags[279]
-    short = bytearray(lzw.tobytes())
-    short[counts.valueoffset : counts.valueoffset + 2] = (counts.value[0] // 2).to_bytes(2, "little")
+    short = patched(lzw.tobytes(), 279, len(lzw) // 3)  # a block that ends too early
     with pytest.raises(InputError, match="is a damaged TIFF file"):
-        decoded_image(bytes(short), 351)
+        decoded_image(short, 351)
 
     # PackBits: n - 1 and n bytes as they are, or 257 - n and one byte n times
     runs = [bytes([69]) + image[row].tobytes()[:70] + bytes([7]) + image[row].tobytes()[70:] for row in range(9)]
-    packed = tiff(iter([b"".join(runs)]), shape=image.shape, dtype="u2", photometric="rgb", compression=32773)
-    np.testing.assert_array_equal(decoded_image(packed, 351)[0], expected)
-    packed = tiff(iter([bytes([257 - 60, 9, 257 - 31, 8])]), shape=(7, 13), dtype="u1", compression=32773)
-    np.testing.assert_array_equal(decoded_image(packed, 91)[0].ravel() * 255, [9] * 60 + [8] * 31)
+    packed = tiff(iter([b"".join(runs)]), shape=image.shape, dtype="u2", photometric="rgb", compression=8)
+    np.testing.assert_array_equal(decoded_image(patched(packed, 259, 32773), 351)[0], expected)
+    packed = tiff(iter([bytes([257 - 60, 9, 257 - 31, 8])]), shape=(7, 13), dtype="u1", compression=8)
+    np.testing.assert_array_equal(
+        decoded_image(patched(packed, 259, 32773), 91)[0].ravel() * 255, [9] * 60 + [8] * 31
+    )
 
     # TIFF Technical Note 3: of each row the first bytes of all numbers, then the second ones, …, and differences
     values = np.random.default_rng(2).random((8, 12)).astype(">f4")

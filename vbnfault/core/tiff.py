@@ -1,8 +1,8 @@
 """Read the pixels of a TIFF file of any layout: strips or tiles, colours together or by plane, TIFF or BigTIFF.
 
 `tifffile` reads the tags. It cannot unpack LZW and the floating-point predictor without `imagecodecs`, a package of
-80 MB. So blocks are unpacked here, by libraries that vbnfault needs anyway, and never to more bytes than a block has
-pixels for. What would have to be guessed is refused in a sentence.
+80 MB. So blocks are unpacked here, by libraries that vbnfault needs anyway, and never to more bytes than a block
+has pixels for. What would have to be guessed is refused in a sentence.
 """
 
 from __future__ import annotations
