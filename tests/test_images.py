@@ -125,7 +125,13 @@ def test_compressions_beyond_those_of_tifffile_are_unpacked() -> None:
     values = np.random.default_rng(2).random((8, 12)).astype(">f4")
     planes = values.view(np.uint8).reshape(8, 12, 4).transpose(0, 2, 1).reshape(8, 48)
     steps = np.diff(planes, axis=1, prepend=np.zeros((8, 1), np.uint8))
-    whole = tiff(iter([zlib.compress(steps.tobytes())]), shape=(8, 12), dtype="f4", compression=8, predictor=3)
+    whole = tiff(
+        iter([zlib.compress(steps.tobytes())]),
+        shape=(8, 12),
+        dtype="f4",
+        compression=8,
+        extratags=[(317, "H", 1, 3, True)],
+    )
     np.testing.assert_array_equal(decoded_image(whole, 96)[0][..., 0], values)
 
 
