@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import itertools
 import re
+import struct
 import zlib
 from pathlib import Path
 from types import SimpleNamespace
@@ -125,14 +126,10 @@ def test_compressions_beyond_those_of_tifffile_are_unpacked() -> None:
     values = np.random.default_rng(2).random((8, 12)).astype(">f4")
     planes = values.view(np.uint8).reshape(8, 12, 4).transpose(0, 2, 1).reshape(8, 48)
     steps = np.diff(planes, axis=1, prepend=np.zeros((8, 1), np.uint8))
-    whole = tiff(
-        iter([zlib.compress(steps.tobytes())]),
-        shape=(8, 12),
-        dtype="f4",
-        compression=8,
-        extratags=[(317, "H", 1, 3, True)],
-    )
-    np.testing.assert_array_equal(decoded_image(whole, 96)[0][..., 0], values)
+    blocks = iter([zlib.compress(steps.tobytes())])
+    whole = tiff(blocks, shape=(8, 12), dtype="f4", compression=8, extratags=[(65000, "H", 1, 3, True)])
+    own, predictor = (struct.pack("<HHIH", tag, 3, 1, 3) for tag in (65000, 317))
+    np.testing.assert_array_equal(decoded_image(whole.replace(own, predictor), 96)[0][..., 0], values)
 
 
 def test_grey_of_tiff_means_what_its_tags_say() -> None:
