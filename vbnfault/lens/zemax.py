@@ -373,8 +373,12 @@ def _with_rims(
     """Give a rim to the surfaces without one, from the paraxial beams of the file; return a note of it.
 
     `surfaces` begins with the object. A rim lets two beams pass that fill the stop, one on the axis and one from
-    the edge of the field: its radius is the height of the marginal ray plus that of the chief ray. Raises InputError
-    where the file does not say how wide the stop is.
+    the edge of the field: its radius is the height of the marginal ray plus that of the chief ray.
+
+    Raises
+    ------
+    InputError
+        The file does not say how wide the stop is.
     """
     matrix, before, missing, rows = np.eye(2), dict[str, Any](), list[int](), []
     for k, surface in enumerate(surfaces[1:]):
