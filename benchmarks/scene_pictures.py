@@ -138,10 +138,10 @@ def sheet(scene: str) -> U8:
         path = Path(folder) / f"{scene}.zarr"
         dataset.build_scene(config.load_scene(scene, small), path, source=scene)
         contact_sheet.preview(path, path.with_suffix(".png"))
-        whole = decoded_image(path.with_suffix(".png").read_bytes())
+        whole, _ = decoded_image(path.with_suffix(".png").read_bytes(), 2**28)
     width_px = NARROW_PX.get(scene, SHEET_WIDTH_PX)
     size = (width_px, round(width_px * whole.shape[0] / whole.shape[1]))
-    return np.asarray(cv2.resize(whole, size, interpolation=cv2.INTER_AREA))
+    return np.rint(255 * cv2.resize(whole, size, interpolation=cv2.INTER_AREA)).astype(np.uint8)
 
 
 def main() -> None:

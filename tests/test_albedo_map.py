@@ -266,7 +266,8 @@ def test_the_mean_is_over_the_area_of_the_body(tmp_path: Path) -> None:
         (np.zeros((2, 4), np.uint8), "and at least 4 rows"),
         (np.zeros((8, 16), np.uint8), r"is black; give body\.albedo_map\.neutral"),
         (np.full((8, 16), -1, np.float32), "has values that are negative or not finite"),
-        (b"II*\0 no image", "not a readable PNG or TIFF image"),
+        (b"no image", "is not a PNG or TIFF image"),
+        (b"II*\0 no image", "is a damaged TIFF file"),
         # the header alone of 65536 x 32768 pixels: refused before anything is decoded
         (
             b"\x89PNG\r\n\x1a\n" + struct.pack(">I4sII", 13, b"IHDR", 65536, 32768),

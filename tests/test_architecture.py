@@ -70,6 +70,7 @@ ONLY = {  # distribution → the packages or modules that import it
     "SALib": {"study"},
     "spiceypy": {"core.spice"},
     "OpenEXR": {"core.images"},
+    "tifffile": {"core.tiff"},
 }
 
 

@@ -227,10 +227,28 @@ def test_counts_of_hot_pixels(growth: HotPixelGrowth, pitch: float) -> None:
     assert stats.kstest(hot.column, "uniform", (-0.5, 400)).pvalue > 1e-3
 
 
+@pytest.mark.parametrize("iso", [100.0, 6400.0])
+def test_the_iso_setting_shows_more_of_the_same_hot_pixels(iso: float) -> None:
+    """A gain makes no defects: above a rate are as many hot pixels at any ISO, with as many offsets."""
+    growth = replace(APS_GROWTH, log10_scale=1.5)
+    spec = IndividualSpec(years=50.0, hot_growth=growth)
+    few, many = (sensor(replace(spec, iso=v), 5, (500, 400), 5.5).hot for v in sorted((iso, 400.0)))
+    limit = 100 * 400 / min(iso, 400.0)  # the smallest rate at the lower setting, in e/s
+    ratio = (max(iso, 400.0) / min(iso, 400.0)) ** growth.iso_power
+    assert len(few) > 300
+    assert abs(len(many) - ratio * len(few)) < 4 * math.sqrt((ratio + ratio**2) * len(few))
+    assert few.rate_e_s.min() == pytest.approx(limit, rel=0.05)
+    assert many.rate_e_s.min() == pytest.approx(100 * 400 / max(iso, 400.0), rel=0.05)
+    above = many.rate_e_s >= limit
+    for one, other in ((len(few), above.sum()), ((few.offset_e > 0).sum(), (many.offset_e[above] > 0).sum())):
+        assert abs(one - other) < 4 * math.sqrt(one + other)  # both counts are Poisson's
+    assert stats.ks_2samp(few.rate_e_s, many.rate_e_s[above]).pvalue > 1e-3
+
+
 def many_hot(**changes: Any) -> Individual:
     """About 6000 hot pixels and nothing else dark."""
     spec = IndividualSpec(
-        years=100.0, iso=1e6, dark_current_e_s=0.0, dsnu_e=0.0, hot_growth=replace(APS_GROWTH, log10_scale=0.5)
+        years=100.0, dark_current_e_s=0.0, dsnu_e=0.0, hot_growth=replace(APS_GROWTH, log10_scale=2.2)
     )
     return sensor(replace(spec, **changes), seed=8, shape=(1200, 600), pitch=5.5)
 

@@ -8,14 +8,16 @@ import cv2
 import numpy as np
 import pytest
 from conftest import small_scene
-from lens_kit import LENSES, SIDE_PX, camera, chief_px, real
+from lens_kit import LENSES, PITCH_UM, SIDE_PX, camera, chief_px, real
 
-from vbnfault import pipeline
+from vbnfault import navigation, pipeline
 from vbnfault.core import resources
 from vbnfault.core.errors import InputError
 from vbnfault.lens import (
     RealLens,
     imaging,
+    load_lens,
+    scaled_to_field,
 )
 from vbnfault.lens.glass import C_NM, D_NM, F_NM
 from vbnfault.scene import config
@@ -71,6 +73,34 @@ def test_opencv_reproduces_the_map(name: str) -> None:
     rms, most = c.lens.distortion_residual_px
     assert 0 < rms < 0.1
     assert rms < most
+
+
+@pytest.mark.parametrize(("name", "fov_deg"), [("biotar_100_f1p4", 12.0), ("tessar_50_f2p8", 40.0)])
+def test_no_direction_from_afar_lands_in_the_frame(name: str, fov_deg: float) -> None:
+    """OpenCV's model folds back behind the field: for the first lens from 45 degrees off the axis on."""
+    c = camera(real(name, prescription=scaled_to_field(load_lens(name), fov_deg, SIDE_PX * PITCH_UM * 1e-3)))
+    angle = np.radians(np.arange(0.01, 89.9, 0.05))
+    directions = np.column_stack([np.sin(angle), 0 * angle, np.cos(angle)])
+    matrix = np.array([[c.intrinsics[0], 0, c.intrinsics[2]], [0, c.intrinsics[1], c.intrinsics[3]], [0, 0, 1]])
+    seen, _ = cv2.projectPoints(directions, np.zeros(3), np.zeros(3), matrix, c.lens.distortion)
+    in_frame = np.abs(seen[:, 0, 0] - SIDE_PX / 2) < SIDE_PX / 2
+    assert (in_frame & (np.degrees(angle) > fov_deg)).any()
+    corner = np.degrees(np.arctan(np.sqrt(2) * np.tan(np.radians(fov_deg / 2))))
+    for limit in (c.lens.distortion_valid_to_deg, None):  # as a store has it, and as it follows from the model
+        view = navigation.CameraView(
+            intrinsics=c.intrinsics,
+            distortion=c.lens.distortion,
+            camera_from_T=np.eye(3),
+            camera_position_T_m=np.zeros(3),
+            valid_to_deg=limit,
+        )
+        pixels = view.project(directions)
+        known = np.isfinite(pixels[:, 0])
+        assert known[np.degrees(angle) < corner].all()
+        np.testing.assert_allclose(pixels[known], seen[known, 0], atol=1e-6)
+        assert np.degrees(angle[np.abs(pixels[:, 0] - SIDE_PX / 2) < SIDE_PX / 2]).max() < corner
+        assert (np.diff(pixels[known, 0]) > 0).all()
+        assert np.isfinite(view.slopes(np.array([[0.0, 0.0], [SIDE_PX, SIDE_PX]]))).all()
 
 
 def test_a_lens_that_sees_more_than_the_render_is_told(monkeypatch: pytest.MonkeyPatch) -> None:

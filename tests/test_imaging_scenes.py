@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import shutil
 from pathlib import Path
@@ -29,6 +30,7 @@ from vbnfault.pipeline.spec import SceneExposure, SceneLight
 from vbnfault.pipeline.stars import _rate_with
 from vbnfault.render.description import View
 from vbnfault.scene import config, plan
+from vbnfault.store.schema import spec_from_plain
 from vbnfault.world import assemble, sky
 
 
@@ -185,7 +187,14 @@ def test_samples_of_a_scene_with_a_lens() -> None:
     spec = dataset.store_spec(session, [16])
     assert spec.lens_names == ("AF Nikkor 28 mm f/2.8D",)
     members = spec.members(16)
-    assert members["distortion"].attributes["residual_px_max"] == c.lens.distortion_residual_px[1] > 0
+    attributes = members["distortion"].attributes
+    assert attributes["residual_px_max"] == c.lens.distortion_residual_px[1] > 0
+    assert attributes["valid_to_deg"] == c.lens.distortion_valid_to_deg < 90
+    # stores of earlier versions have no such angle, and count as the same data
+    older = dataclasses.replace(spec, distortion_valid_to_deg=None)
+    assert older.data == spec.data
+    assert "valid_to_deg" not in older.members(16)["distortion"].attributes
+    assert spec_from_plain(spec.plain(), {}) == dataclasses.replace(spec, attributes={})
     # Sun and ground in one frame
     frames_ = (session.frame(int(i)) for i in np.flatnonzero(session.plan.stratum == plan.SUN_FACING))
     frame = next(

@@ -27,6 +27,7 @@ from vbnfault.body import load_shape
 from vbnfault.body.shape import signed_volume
 from vbnfault.core import html_page, images, path_checks, resources, spice, user_files
 from vbnfault.core.errors import InputError, VbnfaultError, shown
+from vbnfault.core.toml_files import read_toml
 from vbnfault.core.whole_files import write_whole
 from vbnfault.dataset.lock import locked
 from vbnfault.detector.sensor import load_sensor
@@ -153,6 +154,42 @@ def test_odd_toml_is_refused_in_one_short_sentence(kind: str, text: str, tmp_pat
     assert refused(READERS[kind][0], path).startswith(f"{path}: ")
 
 
+OTHER_KINDS: dict[str, tuple[bytes, str]] = {
+    "a.seq": (b'RDM\nLEN NEW\nTITLE "x"\nS 50 3 N-BK7_SCHOTT\nGO\n', "a CODE V sequence file"),
+    "b.seq": (b'! from CODE V\nRDM;LEN "VERSION: 10"\n', "a CODE V sequence file"),
+    "no_suffix": (b'rdm; len "VERSION: 10"\n', "a CODE V sequence file"),
+    "a.len": (b'// OSLO 6.1\nLEN NEW "x" 50 4\nEBR 5\n', "an OSLO lens file"),
+    "b.len": (b"\0\1binary\xff", "an OSLO or CODE V lens file"),
+    "a.zar": (b"\xea\0\0\0", "a Zemax archive"),
+    "a.zos": (b"PK\3\4", "a ZIP archive"),
+    "a.otx": (b"BEGIN OPTIX\n", "an OpTaliX lens file"),
+    "a.csv": (b"a,b\n1,2\n", "a CSV table"),
+    "named.toml": (b'{"a": 1}', "a JSON file"),
+    "a.yml": (b"a: 1\n", "a YAML file"),
+    "a.txt": ("VERS 1 2\nMODE SEQ\n".encode("utf-16"), "a Zemax lens file"),
+    "a.tif": (b"II+\0", "an image"),
+}
+
+
+@pytest.mark.parametrize("kind", ["scene", "lens", "detector", "study"])
+def test_a_file_of_another_kind_is_named(kind: str, tmp_path: Path) -> None:
+    """The lens files of other programs are no broken TOML, whatever they are handed as."""
+    for name, (data, what) in OTHER_KINDS.items():
+        path = tmp_path / name
+        path.write_bytes(data)
+        with pytest.raises(InputError) as caught:
+            read_toml(path, kind)
+        lens_too = " or a Zemax lens file (.zmx)" if kind == "lens" else ""
+        assert str(caught.value) == f"{path}: is {what}, which is not read; a {kind} is a TOML file{lens_too}"
+    path = tmp_path / "broken.toml"
+    path.write_text("a = [1, 2\n")
+    with pytest.raises(InputError, match="not a TOML file: "):
+        read_toml(path, kind)
+    path = tmp_path / "good.len"  # a suffix alone says nothing
+    path.write_text("a = 1")
+    assert read_toml(path, kind) == {"a": 1}
+
+
 @pytest.mark.parametrize("key", ["body.shape", "spacecraft.model", "camera.lens", "camera.detector"])
 @pytest.mark.parametrize("name", ["a\0b.obj", "n" * 300 + ".obj", "n" * 1_000_000 + ".obj"])
 def test_impossible_paths_name_their_key(key: str, name: str, tmp_path: Path) -> None:
@@ -203,7 +240,7 @@ def tiff(width: int, height: int) -> bytes:
 def test_vast_textures_are_refused_unread(data: bytes, tmp_path: Path) -> None:
     path = tmp_path / "bomb.png"
     path.write_bytes(data)
-    assert "30000 × 30000 pixels" in refused(texture, path)
+    assert "30000 x 30000 pixels" in refused(texture, path)
 
 
 # ------------------------------------------------------------------------------------ meshes

@@ -248,6 +248,25 @@ def test_pixels_follow_the_stored_camera_model() -> None:
     assert quaternion.camera_from_T == pytest.approx(view.camera_from_T, abs=1e-12)
 
 
+def test_directions_behind_the_fold_of_the_distortion_have_no_pixel() -> None:
+    """With k1 = -0.2, t - 0.2 t³ rises up to t = √(1 / 0.6), 52.24°; the limit is a multiple of 0.02°."""
+    view = navigation.CameraView(
+        intrinsics=INTRINSICS,
+        distortion=np.array([-0.2, 0, 0, 0]),
+        camera_from_T=np.eye(3),
+        camera_position_T_m=np.zeros(3),
+    )
+    angle = np.radians([10.0, 52.2, 52.3, 66.0])  # at 66 degrees the model is back at the axis
+    pixels = view.project(np.column_stack([np.sin(angle), 0 * angle, np.cos(angle)]))
+    np.testing.assert_array_equal(np.isfinite(pixels[:, 0]), [True, True, False, False])
+    beyond = INTRINSICS[2:] + INTRINSICS[:2] * [0.9, 0]  # t - 0.2 t³ is at most 0.861
+    assert np.isnan(view.slopes(beyond[None])).all()
+    with pytest.raises(InputError, match=r"view\.valid_to_deg = 0: must be above 0"):
+        navigation.CameraView(
+            intrinsics=INTRINSICS, camera_from_T=np.eye(3), camera_position_T_m=np.zeros(3), valid_to_deg=0
+        )
+
+
 def test_a_camera_that_turns_only_has_no_direction_of_translation() -> None:
     _, first = ground(*STILL, relief_m=3)
     _, second = ground(MOTIONS["turning"][0], np.zeros(3), relief_m=3)

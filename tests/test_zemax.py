@@ -192,11 +192,10 @@ def test_a_stop_on_a_refracting_surface_is_a_row_of_its_shape(tmp_path: Path) ->
             "SURF 7: GLAS SF66: unknown; known are the glasses of",
         ),
         ("DISZ 2.75", "DISZ -2.75", "SURF 6: DISZ -2.75: the distance to the next surface comes to -2.75 mm"),
-        ("DIAM 4 0", "DIAM 0 0", "SURF 6: DIAM 0: the semi-diameter must be above 0"),
         ("STOP", "HIDE", "STOP: must stand at exactly one surface from SURF 1 to SURF 8; it stands nowhere"),
         ("SURF 2\n", "SURF 2\n  STOP\n", "SURF 1 to SURF 8; it stands at SURF 2, 6"),
         ("SURF 9\n", "SURF 9\n  STOP\n", "SURF 1 to SURF 8; it stands at SURF 6, 9"),
-        ("CLAP 0 7.5", "CLAP 0 -7.5", "SURF 3: CLAP or FLAP -7.5: the radius of the aperture must be above 0"),
+        ("CLAP 0 7.5", "CLAP 0 -7.5", "SURF 3: CLAP -7.5: the radius of the aperture must be above 0"),
         # what only the prescription knows is said with the file's own numbers
         ("1 0 1.62 36.37", "1 0 9 36.37", "SURF 4: nd = 9.0: must be a number from 1 to 5"),
         (
@@ -218,6 +217,79 @@ def test_what_cannot_be_read_is_named(tmp_path: Path, old: str, new: str, said: 
     assert str(error.value).startswith(str(path))
     assert said in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def without(text: str, *starts: str) -> str:
+    """The text without the lines that begin so."""
+    return "\n".join(line for line in text.splitlines() if not line.strip().startswith(starts)) + "\n"
+
+
+FIELDS = "FTYP 0 0 3 1 0 0 0 1\nXFLN 0 0 6 0 0 0 0 0 0 0 0 0\nYFLN 0 7 8 0 0 0 0 0 0 0 0 0\n"
+
+
+@pytest.mark.parametrize("named", ["ENPD", "FNUM", "stop", "others"])
+@pytest.mark.parametrize("distance_mm", [math.inf, 200.0])
+def test_missing_rims_let_the_beams_of_the_file_pass(tmp_path: Path, named: str, distance_mm: float) -> None:
+    """They are the heights of the marginal and the chief ray, here traced surface by surface with y and n u."""
+    whole = load_lens(written(tmp_path, TRIPLET, "whole.zmx"))
+    curvatures = [1 / s.radius_mm for s in whole.surfaces]
+    media = [1.0, *(s.medium.nd for s in whole.surfaces)]
+    gaps = [s.thickness_mm for s in whole.surfaces]
+
+    def heights(y: float, nu: float) -> list[float]:
+        out = []
+        for k, curvature in enumerate(curvatures):
+            out.append(y)
+            nu -= y * curvature * (media[k + 1] - media[k])
+            y += gaps[k] * nu / media[k + 1]
+        return out
+
+    # the entrance pupil, of radius 5, is where a ray through the middle of the stop meets the axis in front
+    a, b = heights(1, 0)[4], heights(0, 1)[4]
+    behind = b / a
+    slope = 0 if math.isinf(distance_mm) else 5 / (distance_mm + 5 + behind)  # SURF 1 is 5 mm before the lens
+    axial = heights(5 - slope * behind, slope)
+    tangent = math.tan(math.radians(10))  # the third field, of 6 and 8 degrees
+    chief = heights(-behind * tangent, tangent)
+    expected = np.abs(axial) + np.abs(chief)
+    assert abs(chief[4]) < 1e-12
+
+    place = "INFINITY" if math.isinf(distance_mm) else f"{distance_mm}"
+    text = TRIPLET.replace("UNIT", FIELDS + "UNIT").replace(OBJECT, OBJECT.replace("INFINITY", place))
+    if named == "FNUM":
+        text = text.replace("ENPD 10", f"FNUM {paraxial_properties(whole).efl_mm / 10} 0")
+    elif named in ("stop", "others"):
+        text = text.replace("ENPD 10\n", "")
+    if named == "others":  # the axial beam is as wide as the narrowest rim lets it be, here that of SURF 5
+        rims = [7, 7, abs(axial[2]) * 1.2, abs(axial[3]), 0, 7, 7]
+        text = without(text, "CLAP")
+        for number, rim in zip((2, 3, 4, 5, 6, 7, 8), rims, strict=True):
+            start, end = text.index(f"SURF {number}\n"), text.index(f"SURF {number + 1}\n")
+            text = text[:start] + without(text[start:end], "DIAM") + (f"  DIAM {rim}\n" if rim else "") + text[end:]
+        lens = load_lens(written(tmp_path, text))
+        assert lens.surfaces[4].semi_diameter_mm == pytest.approx(abs(axial[4]))
+        assert lens.source.endswith("DIAM of SURF 6 from the paraxial beams of the other rims")
+        return
+    text = without(text, "DIAM", "CLAP")
+    if named == "stop":
+        text = text.replace("SURF 6\n", f"SURF 6\n  DIAM {abs(axial[4])}\n")
+    lens = load_lens(written(tmp_path, text))
+    np.testing.assert_allclose([s.semi_diameter_mm for s in lens.surfaces], expected, rtol=1e-9)
+    listed = "2, 3, 4, 5, 7, 8" if named == "stop" else "2, 3, 4, 5, 6, 7, 8"
+    assert f"DIAM of SURF {listed} from the paraxial beams of " in lens.source
+
+
+def test_a_stop_of_no_known_width_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="SURF 2: DIAM: the semi-diameter is missing, and neither ENPD, FNUM nor"):
+        load_lens(written(tmp_path, without(TRIPLET, "DIAM", "CLAP", "ENPD")))
+
+
+def test_names_of_glasses_are_found_in_any_case(tmp_path: Path) -> None:
+    lens = load_lens(
+        written(tmp_path, TRIPLET.replace("GLAS SF6", "GLAS SILICA").replace("GLAS N-BK7", "GLAS n-bk7"))
+    )
+    assert lens.surfaces[5].medium == GLASSES["silica"]
+    assert lens.surfaces[0].medium == GLASSES["N-BK7"]
 
 
 def test_glasses_are_those_beside_the_lens_file(tmp_path: Path) -> None:
@@ -269,6 +341,20 @@ def test_catalogues_give_the_index_that_they_print(tmp_path: Path) -> None:
         assert glass is not None
         assert glass.nd == pytest.approx(float(records[0][4]), abs=5e-6)  # printed with five or six decimals
     assert catalogue.glass("unknown") is None
+
+
+def test_a_glass_that_contradicts_itself_is_refused(tmp_path: Path) -> None:
+    """A public catalogue has liquids with B₁ 0 C₁ 0 0 0 where the formula takes B₁ C₁ B₂ C₂ B₃ C₃."""
+    text = "NM GLYCEROL 2 0 1.47096 61.17 0 1 -\nCD 1.1306E+00 0.0 9.8E-03 0.0 0.0 0.0\n"
+    text += "NM MENDED 2 0 1.47096 61.17 0 1 -\nCD 1.1306E+00 9.8E-03 0 0 0 0\n"
+    text += "NM INFRARED 2 0 1.0 0.0 0 1 -\nCD 1.1306E+00 9.8E-03 0 0 0 0\n"  # no index printed at the d line
+    catalogue = read_catalogue(written(tmp_path, text, "liquids.agf"))
+    with pytest.raises(InputError, match=r"GLYCEROL: CD: formula 2 has the index 1\.46301 .* but NM says 1\.47096"):
+        catalogue.glass("glycerol")
+    for name in ("mended", "infrared"):
+        glass = catalogue.glass(name)
+        assert glass is not None
+        assert glass.nd == pytest.approx(1.47096, abs=2e-4)  # Liebetraut et al. 2013 print four digits of B
 
 
 def test_every_formula_of_catalogues_is_registered() -> None:

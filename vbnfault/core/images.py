@@ -15,59 +15,70 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .errors import VbnfaultError
+from .errors import InputError, VbnfaultError
+from .tiff import HEADS as TIFF_HEADS
+from .tiff import check_values, tiff_pixels
 from .whole_files import write_whole
 
+F32 = NDArray[np.float32]
+
 _PNG = b"\x89PNG\r\n\x1a\n"
+_PNG_CHANNELS = {b"\0": 1, b"\2": 3, b"\3": 3, b"\4": 2, b"\6": 4}  # by the type of colour in the header
 # Channels of OpenCV's order B, G, R, alpha in the order R, G, B, alpha, and back.
 _SWAPPED = {3: [2, 1, 0], 4: [2, 1, 0, 3]}
 
 
-def decoded_image(data: bytes) -> NDArray[Any] | None:
-    """Return the pixels of a PNG or TIFF file as stored, [y, x] or [y, x, channel]; None for any other data.
+def decoded_image(data: bytes, most_values: int) -> tuple[F32, F32 | None]:
+    """Return the colours of a PNG or TIFF file, float32[y, x, 1 or 3], and its alpha, float32[y, x], or None.
 
-    A small file can hold a huge image: compare `image_size_px` with a limit first.
+    Whole numbers are divided by the largest of their width, so 1 is white; floating-point numbers stay as they are.
+
+    Parameters
+    ----------
+    data
+        The contents of the file.
+    most_values
+        The most pixels times channels that are decoded: a small file can hold a huge image.
+
+    Raises
+    ------
+    InputError
+        The file is damaged or of another kind, or has too many values. The message goes on from the file's name.
     """
-    # OpenCV allocates what a chunk of a PNG claims to hold, up to 2 GiB, before it finds the file shorter
-    if not data or (data.startswith(_PNG) and not _holds_its_chunks(data)):
-        return None
-    try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error:  # more pixels than OpenCV accepts
-        return None
-    return None if image is None else _swapped(np.asarray(image))
+    if data.startswith(TIFF_HEADS):
+        return tiff_pixels(data, most_values)
+    if not data.startswith(_PNG):
+        raise InputError("is not a PNG or TIFF image")
+    if len(data) >= 24:
+        columns, rows = struct.unpack(">II", data[16:24])
+        check_values(rows, columns, _PNG_CHANNELS.get(data[25:26], 1), most_values)
+    chunks = _chunks(data)
+    image = cv2.imdecode(np.frombuffer(chunks, np.uint8), cv2.IMREAD_UNCHANGED) if chunks else None
+    if image is None:
+        raise InputError("is a damaged PNG file")
+    values = np.atleast_3d(_swapped(image)).astype(np.float32) / np.float32(np.iinfo(image.dtype).max)
+    colours = values.shape[2] - (values.shape[2] in (2, 4))
+    return values[..., :colours], values[..., -1] if values.shape[2] > colours else None
 
 
-def image_size_px(data: bytes) -> tuple[int, int]:
-    """Return the width and height in the header of a PNG or TIFF file; (0, 0) if the file is neither."""
-    if data.startswith(_PNG) and len(data) >= 24:
-        width_px, height_px = struct.unpack(">II", data[16:24])
-        return width_px, height_px
-    if data[:4] not in (b"II*\0", b"MM\0*"):
-        return 0, 0
-    order = "<" if data[:1] == b"I" else ">"
-    try:
-        (start,) = struct.unpack_from(f"{order}I", data, 4)
-        (count,) = struct.unpack_from(f"{order}H", data, start)
-        sides: dict[int, int] = {}
-        for k in range(count):
-            tag, kind, _ = struct.unpack_from(f"{order}HHI", data, start + 2 + 12 * k)
-            (value,) = struct.unpack_from(f"{order}{'H' if kind == 3 else 'I'}", data, start + 10 + 12 * k)
-            sides[tag] = value
-    except struct.error:  # truncated file
-        return 0, 0
-    return sides.get(256, 0), sides.get(257, 0)
+def _chunks(png: bytes) -> bytes:
+    """Return a PNG file with only the chunks that its pixels need; b"" if it is damaged.
 
-
-def _holds_its_chunks(png: bytes) -> bool:
-    """Return whether a PNG file has the length that the headers of its chunks claim, as far as its last chunk."""
-    start = len(_PNG)
+    OpenCV allocates what a chunk claims to hold, up to 2 GiB, before it finds the file shorter, and libpng writes
+    to standard error what it thinks of the other chunks.
+    """
+    parts, start = [_PNG], len(_PNG)
     while start + 12 <= len(png):
         length, kind = struct.unpack_from(">I4s", png, start)
+        chunk = png[start : start + 12 + length]
         start += 12 + length
+        if start > len(png) or zlib.crc32(chunk[4:-4]).to_bytes(4, "big") != chunk[-4:]:
+            return b""
+        if kind in (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND"):
+            parts.append(chunk)
         if kind == b"IEND":
-            return start <= len(png)
-    return False
+            return b"".join(parts) if parts[1].startswith(b"\0\0\0\rIHDR") else b""
+    return b""
 
 
 def write_png(path: Path, image: NDArray[Any], *, smallest: bool = False) -> Path:

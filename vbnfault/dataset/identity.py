@@ -252,6 +252,7 @@ def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
         site_names=tuple(f"site_{k:05d}" for k in range(dataset.sites)),
         lens_names=(camera.lens.name,),
         distortion_residual_px=camera.lens.distortion_residual_px,
+        distortion_valid_to_deg=camera.lens.distortion_valid_to_deg,
         attitude_references=references,
         centre_of_mass_T_m=tuple(session.body.centre_of_mass_T_m.tolist()) if "centre" in references else None,
         detector_names=tuple(f"{camera.detector.name} {k}" for k in range(individuals))

@@ -48,6 +48,8 @@ _MOST_DEFECTS = 2e8  # limit for defects of one kind: drawing them takes seconds
 _RTS_TIME_EV = 0.9
 _RTS_REFERENCE_K = 294.15
 
+_RATES_ISO = 400.0  # ISO setting for which `hot_rate_e_s` holds
+
 
 @table_class()
 class IndividualSpec:
@@ -94,12 +96,20 @@ class IndividualSpec:
     hot_growth: HotPixelGrowth | None = Field(
         default=APS_GROWTH, description="growth law of hot pixels; default: that of the architecture"
     )
-    iso: float = Field(default=400.0, ge=1, le=1e7, description="ISO setting")
-    # The threshold at which a camera sees a hot pixel falls as 1/ISO; with this power the number above it grows
-    # with ISO as in the growth law.
+    # A camera sees a hot pixel above a threshold that falls as 1/ISO; with this power the number above it grows
+    # with ISO as in the growth law. So the setting decides which of the same hot pixels there are. How bright each
+    # is in the image follows from the gain.
+    iso: float = Field(
+        default=_RATES_ISO,
+        ge=1,
+        le=1e7,
+        description="ISO setting at which hot pixels are counted: more and fainter ones the higher it is; how "
+        "bright they are follows from the converter's gain",
+    )
     hot_rate_e_s: pair_within(1e-9, 1e8) = Field(  # type: ignore[valid-type]
         default=(100.0, 1e5),
-        description="smallest and largest rate* of a hot pixel; the fraction above a rate R falls as R^-iso_power",
+        description=f"smallest, at ISO {_RATES_ISO:g}, and largest rate* of a hot pixel; the smallest falls as "
+        "1/iso, and the number above a rate R as R^-iso_power",
     )
     hot_offset_share: Fraction = Field(
         default=0.45, description="fraction of hot pixels with an offset; over 0.4: Chapman et al. 2013"
@@ -491,10 +501,12 @@ def _hot(
     fraction = np.where(np.arange(count) < earlier[0], earlier[1], spec.hot_clustered_share)
     row, column = _clustered(*_places(seed, "hot", count, shape), fraction, shape, seed)
     # inverse distribution function of a power law between two limits
-    least, most = spec.hot_rate_e_s
+    seen, most = spec.hot_rate_e_s
+    least = min(seen * _RATES_ISO / spec.iso, most)
     power = 1.0 if growth is None else growth.iso_power
     rate = least * (1 - _uniform(seed, "hot rate", count) * (1 - (least / most) ** power)) ** (-1 / power)
-    sticks = _uniform(seed, "hot sticks", count) < spec.hot_offset_share
+    # those that only a higher ISO shows are faint, so they have no offset either
+    sticks = (_uniform(seed, "hot sticks", count) < spec.hot_offset_share) & (rate >= min(seen, most))
     offset = -np.log1p(-_uniform(seed, "hot offset", count)) * spec.hot_offset_e
     return HotPixelTable(
         row=row,

@@ -1,6 +1,6 @@
 """Overwrite pixels of the image with a user's own texture, the general operation behind the paper's faults.
 
-The texture file (PNG or TIFF, 8 or 16 bit, grey or RGB, with or without alpha) is stretched to the frame and
+The texture file (PNG or TIFF, grey or RGB, with or without alpha) is stretched to the frame and
 blended with the chosen channels. With t the texture and v the image, both 0-255:
 
     replace   v' = t              add       v' = v + t
@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from ..core import user_files
 from ..core.errors import InputError, shown
-from ..core.images import decoded_image, image_size_px
+from ..core.images import decoded_image
 from ..core.quantities import CHANNELS, LUMINANCE
 from .context import FaultContext, Params
 from .contract import Fault
@@ -152,7 +152,7 @@ def load(path: str, sha256: str | None = None) -> tuple[NDArray[np.float32], NDA
     Raises
     ------
     InputError
-        The file is missing, is not such an image, has too many pixels, or its content does not match `sha256`.
+        The file is missing, is no PNG or TIFF image, has too many pixels, or its content does not match `sha256`.
     """
     where = f"faults.pixel_overwriting.texture_file = {shown(path)}"
     try:
@@ -161,19 +161,19 @@ def load(path: str, sha256: str | None = None) -> tuple[NDArray[np.float32], NDA
         raise InputError(f"{where}: {str(error).removeprefix(f'{path}: ')}") from None
     if sha256 and user_files.sha256(data) != sha256:
         raise InputError(f"{where}: its content has changed since the parameters were drawn")
-    width_px, height_px = image_size_px(data)
-    if width_px * height_px > LARGEST_TEXTURE_PIXELS:  # check before decoding: a small file can hold a huge image
+    try:
+        colours, alpha = decoded_image(data, 4 * LARGEST_TEXTURE_PIXELS)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
+    height, width = colours.shape[:2]
+    if height * width > LARGEST_TEXTURE_PIXELS:
         raise InputError(
-            f"{where}: has {width_px} × {height_px} pixels; must have at most {LARGEST_TEXTURE_PIXELS} in all"
+            f"{where}: has {width} x {height} pixels; must have at most {LARGEST_TEXTURE_PIXELS} in all"
         )
-    image = decoded_image(data) if width_px else None
-    if image is None or image.dtype not in (np.uint8, np.uint16):
-        raise InputError(f"{where}: must be a PNG or TIFF image of 8 or 16 bits")
-    full = 255 if image.dtype == np.uint8 else 65535
-    plain = np.atleast_3d(image).astype(np.float32) / np.float32(full)
-    alpha = np.ones(plain.shape[:2], np.float32)
-    if plain.shape[2] in (2, 4):
-        alpha = np.ascontiguousarray(plain[..., -1])
-    rgb = plain[..., :3] if plain.shape[2] >= 3 else np.repeat(plain[..., :1], 3, axis=2)
-    intensity = rgb @ LUMINANCE if plain.shape[2] >= 3 else plain[..., 0]
-    return np.concatenate([rgb, intensity[..., None]], axis=2) * np.float32(255), alpha
+    if not (colours.min() >= 0 and colours.max() <= 1):  # NaN is neither
+        raise InputError(f"{where}: has values that are negative or above white")
+    if alpha is None:
+        alpha = np.ones((height, width), np.float32)
+    rgb = np.broadcast_to(colours, (height, width, 3))
+    intensity = rgb @ LUMINANCE if colours.shape[2] == 3 else colours[..., 0]
+    return np.concatenate([rgb, intensity[..., None]], axis=2) * np.float32(255), np.ascontiguousarray(alpha)

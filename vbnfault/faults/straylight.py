@@ -38,7 +38,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core import buffers
-from ..core.errors import VbnfaultError
+from ..core.errors import InputError, VbnfaultError
 from ..core.file_contents import cached_with_contents
 from ..core.images import decoded_image
 from ..core.quantities import LUMINANCE
@@ -55,6 +55,7 @@ CLOSE = (1, 2, 3, 4, 5)
 FAR = (6, 7, 8, 9, 10)
 GLARES = (1, 2)
 MAX_DRAWS = 256
+LARGEST_VALUES = 2**26  # of a texture, 256 MiB while it is decoded
 
 Window = tuple[slice, slice]
 
@@ -329,10 +330,11 @@ def pyramid(name: str) -> tuple[NDArray[np.float32], ...]:
         The texture's file is damaged.
     """
     path = data_dir("textures") / f"{name}.png"
-    image = decoded_image(read_input(path, "texture"))
-    if image is None or image.dtype != np.uint16 or image.ndim != 3:
-        raise VbnfaultError(f"{path}: missing or damaged; install vbnfault again")
-    levels = [np.ascontiguousarray(image, dtype=np.float32) / np.float32(65535)]
+    try:
+        colours, _ = decoded_image(read_input(path, "texture"), LARGEST_VALUES)
+    except InputError as error:
+        raise VbnfaultError(f"{path}: {error}; install vbnfault again") from None
+    levels = [np.ascontiguousarray(colours)]
     while levels[-1].shape[0] % 2 == 0 and levels[-1].shape[0] > 6:
         half = levels[-1].shape[0] // 2
         levels.append(levels[-1].reshape(half, 2, half, 2, 3).mean(axis=(1, 3), dtype=np.float32))

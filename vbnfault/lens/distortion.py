@@ -47,6 +47,11 @@ class RadialModel:
     coefficients: F64
     end: float
 
+    @property
+    def valid_to_deg(self) -> float:
+        """Return the field angle up to which distances are known to rise; farther light may land in the frame."""
+        return float(np.degrees(np.arctan(_BEYOND * self.end)))
+
     def distance(self, slope: F64) -> F64:
         """Return distances from the axis in focal lengths for tangents of field angles, float64 like `slope`."""
         above, below = self._parts

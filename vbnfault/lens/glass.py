@@ -195,6 +195,13 @@ def register(glass: Glass) -> Glass:
     return glass
 
 
+def registered(name: str) -> Glass | None:
+    """Return a registered glass by its name in any case, since Zemax writes capitals; None for an unknown name."""
+    if name in GLASSES:
+        return GLASSES[name]
+    return next((glass for key, glass in GLASSES.items() if key.upper() == name.upper()), None)
+
+
 def check_index(glass: Glass, where: str) -> None:
     """Raise InputError, which begins with `where`, unless the index is from 1 to 5 between 400 and 1000 nm."""
     with np.errstate(all="ignore"):  # a formula may divide by 0 or take the root of a negative number

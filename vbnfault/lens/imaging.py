@@ -209,6 +209,11 @@ class RealLens:
         """
         return np.array(self._model.coefficients)
 
+    @property
+    def distortion_valid_to_deg(self) -> float:
+        """Return the field angle up to which `distortion` takes one direction to one place."""
+        return self._model.valid_to_deg
+
     @cached_property
     def distortion_residual_px(self) -> tuple[float, float]:
         """Return the rms and the largest difference between `distortion` and the chief rays, in pixels.

@@ -100,6 +100,10 @@ class Lens(Protocol):
         """Return OpenCV's k1, k2, p1, p2, k3, k4, k5, k6, float64[8]."""
 
     @property
+    def distortion_valid_to_deg(self) -> float:
+        """Return the angle from the axis up to which `distortion` holds; farther directions may fold back."""
+
+    @property
     def distortion_residual_px(self) -> tuple[float, float]:
         """Return the RMS and the largest distance of `distortion` from the lens's chief rays, in pixels."""
 

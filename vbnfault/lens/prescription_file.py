@@ -20,7 +20,18 @@ from ..core.errors import InputError, in_file
 from ..core.tables import Fraction, Table
 from ..core.whole_files import write_whole
 from .coating import Layer
-from .glass import AIR, CLEAR, D_NM, GLASSES, Glass, Transmittance, check_index, from_abbe, from_coefficients
+from .glass import (
+    AIR,
+    CLEAR,
+    D_NM,
+    GLASSES,
+    Glass,
+    Transmittance,
+    check_index,
+    from_abbe,
+    from_coefficients,
+    registered,
+)
 from .paraxial import paraxial_properties
 from .prescription import Hood, Prescription, Surface, facing_air
 from .zemax import LENS_SUFFIX, GlassCatalogue, read_catalogue, read_lens
@@ -304,8 +315,8 @@ def _named(name: str, catalogues: Sequence[GlassCatalogue]) -> Glass:
     for catalogue in catalogues:
         if (glass := catalogue.glass(name)) is not None:
             return glass
-    if name in GLASSES:
-        return GLASSES[name]
+    if (glass := registered(name)) is not None:
+        return glass
     read = "".join(f" {catalogue.path}," for catalogue in catalogues)
     raise InputError(
         f"glass = {name!r}: unknown; known are{read and f' those of{read} and'} {', '.join(GLASSES)}; "

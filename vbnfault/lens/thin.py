@@ -52,6 +52,7 @@ class ThinLens:
     falls_off: ClassVar[bool] = False
     guard_px: ClassVar[tuple[int, int]] = (0, 0)
     border_px: ClassVar[int] = 0
+    distortion_valid_to_deg: ClassVar[float] = 90.0
     distortion_residual_px: ClassVar[tuple[float, float]] = (0.0, 0.0)
 
     @property

@@ -12,6 +12,8 @@ are read:
 MODE        must be SEQ
 NAME, NOTE  name of the lens; notes, which become its `source`
 UNIT        MM, CM, IN or METER: the unit of all lengths
+ENPD, FNUM  entrance pupil's diameter, and f-number, for rims that are missing
+FTYP, XFLN, YFLN  fields, for the same
 GCAT        names of catalogues: NAME.agf is read if it lies beside the lens file, and so is the .agf file with the
             name of the lens file
 TYPE        STANDARD or EVENASPH
@@ -41,16 +43,20 @@ temperature. The formulas are those of Zemax, OpticStudio user guide, "Using gla
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ..core import user_files
 from ..core.errors import InputError, shown
 from ..core.tables import is_number
-from .glass import CLEAR, GLASSES, Glass, Transmittance
+from .glass import CLEAR, D_NM, GLASSES, Glass, Transmittance, registered
+from .paraxial import gap, refraction
 
 LENS_SUFFIX, CATALOGUE_SUFFIX = ".zmx", ".agf"
 
@@ -66,8 +72,12 @@ _REFUSED = {
     "USOB": "an obscuration of the user's shape",
     "OBDC": "an aperture off the axis",
 }
+_OF_BEAMS = ("ENPD", "FNUM", "FTYP", "XFLN", "YFLN")
 _FAR_MM = 1e7  # distance of the object from which on it counts as infinite; some files write 1e10 for infinity
 _NOT_RECORDED = (1.5, 40.0)  # nd and vd that older files have for every glass of a catalogue
+
+# Makers print four decimals or more, some those of another melt: at most 5e-5 apart in the catalogues of 17 makers.
+_SAME_INDEX = 1e-3
 
 _PARAMETERS = range(1, 9)  # of an EVENASPH: coefficients of r², r⁴, …
 
@@ -137,7 +147,7 @@ class GlassCatalogue:
         records = self.records.get(name.upper())
         if records is None:
             return None
-        where = f"{self.path}: {name}"
+        where = f"{self.path}: {records[0][1]}"
         number = _number(records[0], 2, where)
         if number not in _FORMULAS:
             raise InputError(f"{where}: dispersion formula {number:g}: must be from 1 to {len(_FORMULAS)}")
@@ -146,12 +156,22 @@ class GlassCatalogue:
         c = [_number(coefficients, k, where) if k < len(coefficients) else 0.0 for k in range(1, count + 1)]
         if not any(c):
             raise InputError(f"{where}: CD: the coefficients of the dispersion formula are missing")
-        return Glass(
+        glass = Glass(
             name=records[0][1],
             formula=formula,
             coefficients=tuple(c[::2] + c[1::2] if alternate else c),
             internal_transmittance_10mm=_transmittance(records, where),
         )
+        printed = float(records[0][4]) if len(records[0]) > 4 and is_number(records[0][4]) else 1.0
+        with np.errstate(all="ignore"):
+            apart = abs(glass.nd - printed)
+        if printed > 1 and not apart <= _SAME_INDEX:  # of an infrared glass, files print 1 or 0
+            raise InputError(
+                f"{where}: CD: formula {number:g} has the index {glass.nd:.6g} at {D_NM:.1f} nm with these "
+                f"coefficients, but NM says {printed:g}; put them in the order of the formula, or give nd and vd "
+                "in the lens file"
+            )
+        return glass
 
 
 def _transmittance(records: Sequence[Sequence[str]], where: str) -> Transmittance:
@@ -235,6 +255,8 @@ class _Surface:
             if _number(words, 1, self.where) != 0:
                 raise InputError(f"{self.where}: {key} {words[1]}: the inner radius of the aperture must be 0")
             self.aperture = _number(words, 2, self.where)
+            if self.aperture <= 0:
+                raise InputError(f"{self.where}: {key} {words[2]}: the radius of the aperture must be above 0")
         elif key == "PARM":
             self.parameters[_number(words, 1, self.where)] = _number(words, 2, self.where)
         elif key == "GLAS":
@@ -242,19 +264,16 @@ class _Surface:
                 raise InputError(f"{self.where}: GLAS MIRROR: lenses with mirrors cannot be read")
             self.glass = words
 
+    @property
+    def rim(self) -> float:
+        """Return the radius of the rim; 0 where the file gives none."""
+        return self.semi_diameter if self.aperture is None else self.aperture
+
     def row(self, unit_mm: float) -> dict[str, Any]:
         """Return the surface's shape and rim as keys of a row of a prescription. Raises InputError."""
-        rim = self.semi_diameter if self.aperture is None else self.aperture
-        if self.aperture is not None and rim <= 0:
-            raise InputError(f"{self.where}: CLAP or FLAP {rim:g}: the radius of the aperture must be above 0")
-        if rim <= 0:
-            raise InputError(
-                f"{self.where}: DIAM {self.semi_diameter:g}: the semi-diameter must be above 0; let Zemax compute "
-                "it and save the file again"
-            )
         row: dict[str, Any] = {
             "radius_mm": unit_mm / self.curvature if self.curvature else math.inf,
-            "diameter_mm": 2 * unit_mm * rim,
+            "diameter_mm": 2 * unit_mm * self.rim,
         }
         if self.conic:
             row["conic"] = self.conic
@@ -293,6 +312,7 @@ def read_lens(path: Path) -> tuple[dict[str, Any], tuple[GlassCatalogue, ...], t
         The file is not a lens in sequential mode, or has a record that cannot be read; the message names it.
     """
     name, notes, unit_mm, names = path.stem, list[str](), 1.0, list[str]()
+    head: dict[str, list[str]] = {}
     surfaces: list[_Surface] = []
     for words in _lines(path, "lens", LENS_SUFFIX):
         key, *values = words
@@ -310,6 +330,8 @@ def read_lens(path: Path) -> tuple[dict[str, Any], tuple[GlassCatalogue, ...], t
             unit_mm = _MM[values[0]]
         elif key == "GCAT":
             names = values
+        elif key in _OF_BEAMS:
+            head[key] = words
         elif surfaces:
             surfaces[-1].take(words)
     if len(surfaces) < 3:
@@ -330,6 +352,7 @@ def read_lens(path: Path) -> tuple[dict[str, Any], tuple[GlassCatalogue, ...], t
     object_mm = surfaces[0].thickness * unit_mm
     if math.isfinite(object_mm) and object_mm < _FAR_MM:
         source += f"; the file has its object at {object_mm:g} mm; camera.focus_distance_m is used instead"
+    source += _with_rims(surfaces[:-1], head, catalogues, f"{path}: SURF {stops[0]}")
     rows, numbers = _rows(surfaces[1:-1], unit_mm, catalogues)
     return {"name": name, "source": source, "surface": rows}, catalogues, numbers
 
@@ -339,6 +362,86 @@ def _beside(path: Path, names: Sequence[str]) -> tuple[GlassCatalogue, ...]:
     files = {p.name.lower(): p for p in sorted(path.parent.iterdir()) if p.suffix.lower() == CATALOGUE_SUFFIX}
     wanted = dict.fromkeys(f"{name}{CATALOGUE_SUFFIX}".lower() for name in [path.stem, *names])
     return tuple(read_catalogue(files[name]) for name in wanted if name in files)
+
+
+def _with_rims(
+    surfaces: Sequence[_Surface],
+    head: Mapping[str, Sequence[str]],
+    catalogues: Sequence[GlassCatalogue],
+    where: str,
+) -> str:
+    """Give a rim to the surfaces without one, from the paraxial beams of the file; return a note of it.
+
+    `surfaces` begins with the object. A rim lets two beams pass that fill the stop, one on the axis and one from
+    the edge of the field: its radius is the height of the marginal ray plus that of the chief ray.
+
+    Raises
+    ------
+    InputError
+        The file does not say how wide the stop is.
+    """
+    matrix, before, missing, rows = np.eye(2), dict[str, Any](), list[int](), []
+    for k, surface in enumerate(surfaces[1:]):
+        after = _medium(surface, catalogues)
+        if surface.rim <= 0 and (surface.stop or after != before):
+            missing.append(k)
+        rows.append(matrix[0])
+        indices = _index(before, catalogues), _index(after, catalogues)
+        matrix = gap(surface.thickness) @ refraction(*indices, surface.curvature) @ matrix
+        before = after
+    if not missing:
+        return ""
+    # a ray's height at each surface is `height` · its height at the first one + `slope` · its slope before that
+    height, slope = np.array(rows).T
+    stop = next(k for k, surface in enumerate(surfaces[1:]) if surface.stop)
+    rims, far = np.array([surface.rim for surface in surfaces[1:]]), surfaces[0].thickness
+    with np.errstate(divide="ignore", invalid="ignore"):
+        efl = abs(1 / matrix[1, 0])
+        pupil = slope[stop] / height[stop]  # place of the entrance pupil behind the first vertex
+        marginal = height if math.isinf(far) else (height * far + slope) / (far + pupil)  # of a pupil of radius 1
+        given = {key: _number(head[key], 1, where) if key in head else 0.0 for key in ("ENPD", "FNUM")}
+        if rims[stop] > 0:
+            radius, cause = rims[stop] / abs(marginal[stop]), "the stop"
+        elif given["ENPD"] > 0:
+            radius, cause = given["ENPD"] / 2, "ENPD"
+        elif given["FNUM"] > 0:
+            radius, cause = efl / given["FNUM"] / 2, "FNUM"
+        else:
+            radius, cause = np.min((rims / abs(marginal))[rims > 0], initial=math.inf), "the other rims"
+        chief = _field_slope(head, far, efl) * (slope - pupil * height)
+    chief[stop] = 0
+    for k in missing:
+        surface, rim = surfaces[1 + k], abs(radius * marginal[k]) + abs(chief[k])
+        if not 0 < rim < math.inf:
+            raise InputError(
+                f"{surface.where}: DIAM: the semi-diameter is missing, and neither ENPD, FNUM nor other surfaces "
+                "give it; write it into the file"
+            )
+        surface.semi_diameter = float(rim)
+    names = ", ".join(str(surfaces[1 + k].number) for k in missing)
+    return f"; DIAM of SURF {names} from the paraxial beams of {cause}"
+
+
+def _index(keys: Mapping[str, Any], catalogues: Sequence[GlassCatalogue]) -> float:
+    """Return the index at the d line of the medium that keys of a row describe."""
+    glass = _named(keys["glass"], catalogues) if "glass" in keys else None
+    return float(keys.get("nd", 1.0) if glass is None else glass.nd)
+
+
+def _field_slope(head: Mapping[str, Sequence[str]], far: float, efl: float) -> float:
+    """Return the tangent of the largest field angle of a file; 0 where it names no field."""
+    numbers = {key: [float(w) for w in words[1:] if is_number(w)] for key, words in head.items()}
+    kind, _, count = (int(v) for v in ([*numbers.get("FTYP", []), 0, 0, 12])[:3])
+    most = max(
+        itertools.starmap(
+            math.hypot,
+            itertools.zip_longest(numbers.get("XFLN", [])[:count], numbers.get("YFLN", [])[:count], fillvalue=0.0),
+        ),
+        default=0.0,
+    )
+    if kind == 0:
+        return math.tan(math.radians(min(most, 89.0)))
+    return most / (efl if kind > 1 else far)  # of an image's height, or of the object's
 
 
 def _rows(
@@ -371,6 +474,11 @@ def _rows(
     return rows, tuple(numbers)
 
 
+def _named(name: str, catalogues: Sequence[GlassCatalogue]) -> Glass | None:
+    """Return a glass of the catalogues, the first that has it, or a registered one, or None."""
+    return next((glass for catalogue in catalogues if (glass := catalogue.glass(name))), None) or registered(name)
+
+
 def _medium(surface: _Surface, catalogues: Sequence[GlassCatalogue]) -> dict[str, Any]:
     """Return the keys of a row that describe the medium behind a surface; none for air. Raises InputError."""
     words = surface.glass
@@ -381,7 +489,7 @@ def _medium(surface: _Surface, catalogues: Sequence[GlassCatalogue]) -> dict[str
     by_index = {"nd": nd} | ({"vd": vd} if vd else {})
     if words[2:3] == ["1"]:  # a model glass
         return by_index
-    if any(catalogue.glass(name) for catalogue in catalogues) or name in GLASSES:
+    if _named(name, catalogues):
         return {"glass": name}
     if nd > 1 and (nd, vd) != _NOT_RECORDED:
         return by_index

@@ -18,6 +18,7 @@ from ..core.errors import InputError
 F64 = NDArray[np.float64]
 
 _NEWTON_STEPS = 12
+_FOLD_STEP_DEG = 0.02
 _DIFFERENCE = 1e-6  # step of the numeric derivative, in focal lengths
 
 
@@ -38,6 +39,9 @@ class CameraView:
         float64[3]: position of the camera in T, in m. Any frame that is fixed in the ground serves as T.
     distortion
         OpenCV's k1, k2, p1, p2, k3, k4, k5, k6, float64[8], or the first 4 or 5 of them.
+    valid_to_deg
+        Angle from the boresight up to which `distortion` holds, the attribute `valid_to_deg` of the array
+        `distortion`. None: up to where the model first folds, which is computed. Farther directions have no pixel.
     depth_m
         float[y, x]: true depth along the boresight at the pixel centres in m, inf on the sky; None where it is not
         needed.
@@ -52,6 +56,7 @@ class CameraView:
     camera_from_T: F64
     camera_position_T_m: F64
     distortion: F64 = field(default_factory=lambda: np.zeros(8))
+    valid_to_deg: float | None = None
     depth_m: NDArray[Any] | None = None
 
     def __post_init__(self) -> None:
@@ -68,6 +73,8 @@ class CameraView:
         if np.abs(matrix @ matrix.T - np.eye(3)).max() > 1e-6:
             raise InputError("view.camera_from_T: is no rotation; give a rotation matrix or a unit quaternion")
         object.__setattr__(self, "camera_from_T", matrix)
+        if self.valid_to_deg is not None and not 0 < self.valid_to_deg <= 90:
+            raise InputError(f"view.valid_to_deg = {self.valid_to_deg}: must be above 0 and at most 90")
 
     @property
     def matrix(self) -> F64:
@@ -76,7 +83,10 @@ class CameraView:
         return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
 
     def slopes(self, xy: F64) -> F64:
-        """Return the tangents x/z and y/z in C that the pixels `xy` float64[n, 2] see, float64[n, 2]."""
+        """Return the tangents x/z and y/z in C that the pixels `xy` float64[n, 2] see, float64[n, 2].
+
+        NaN for pixels so far outside the frame that no direction up to `valid_to_deg` reaches them.
+        """
         fx, fy, cx, cy = self.intrinsics
         target = (np.asarray(xy, dtype=np.float64) - (cx, cy)) / (fx, fy)
         k = self.distortion
@@ -92,7 +102,13 @@ class CameraView:
             determinant = along_x[:, 0] * along_y[:, 1] - along_y[:, 0] * along_x[:, 1]
             slopes[:, 0] -= (off[:, 0] * along_y[:, 1] - off[:, 1] * along_y[:, 0]) / determinant
             slopes[:, 1] -= (off[:, 1] * along_x[:, 0] - off[:, 0] * along_x[:, 1]) / determinant
-        return slopes
+        found = (np.abs(_distorted(slopes, k) - target) < _DIFFERENCE).all(axis=1, keepdims=True)
+        return np.where(found & self._is_valid(slopes), slopes, np.nan)
+
+    def _is_valid(self, slopes: F64) -> NDArray[np.bool_]:
+        """Return whether the distortion holds for tangents float64[n, 2], bool[n, 1]."""
+        limit_deg = _fold_deg(self.distortion) if self.valid_to_deg is None else self.valid_to_deg
+        return np.asarray(np.degrees(np.arctan(np.hypot(slopes[:, :1], slopes[:, 1:]))) <= limit_deg)
 
     def points_T_m(self, xy: F64) -> F64:
         """Return the points of the ground that pixels see, float64[n, 3] in T; NaN where they see the sky.
@@ -129,11 +145,17 @@ class CameraView:
         return np.where(inside & np.isfinite(own), own, np.nan)
 
     def project(self, points_T_m: F64) -> F64:
-        """Return the pixels of points float64[n, 3] in T, float64[n, 2]; NaN where they lie behind the camera."""
+        """Return the pixels of points float64[n, 3] in T, float64[n, 2].
+
+        NaN where they lie behind the camera, or farther off its boresight than `valid_to_deg`: there the distortion
+        may fold back into the frame.
+        """
         in_C = (np.asarray(points_T_m, dtype=np.float64) - self.camera_position_T_m) @ self.camera_from_T.T
         z = np.where(in_C[:, 2] > 0, in_C[:, 2], np.nan)
         fx, fy, cx, cy = self.intrinsics
-        return np.asarray(_distorted(in_C[:, :2] / z[:, None], self.distortion) * (fx, fy) + (cx, cy))
+        slopes = in_C[:, :2] / z[:, None]
+        pixels = _distorted(slopes, self.distortion) * (fx, fy) + (cx, cy)
+        return np.where(self._is_valid(slopes), pixels, np.nan)
 
 
 _SHAPES: dict[str, tuple[tuple[int, ...], ...]] = {
@@ -155,8 +177,8 @@ def reprojected(xy: F64, from_view: CameraView, to_view: CameraView) -> F64:
     Returns
     -------
     float64[n, 2]
-        Pixels of `to_view`, whether or not something hides the ground there; NaN where `from_view` sees the sky and
-        where the ground lies behind `to_view`.
+        Pixels of `to_view`, whether or not something hides the ground there; NaN where `from_view` sees the sky,
+        and where the ground lies behind `to_view` or farther off its boresight than `valid_to_deg`.
 
     Raises
     ------
@@ -191,6 +213,18 @@ def _matrix(quaternion: F64) -> F64:
             [2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z],
         ]
     )
+
+
+def _fold_deg(coefficients: F64) -> float:
+    """Return the angle up to which the radial distortion rises without a pole; 90 where it always does."""
+    slope = np.tan(np.radians(np.arange(0, 90, _FOLD_STEP_DEG)))
+    k = np.zeros(8)
+    k[: len(coefficients)] = coefficients
+    k[2:4] = 0
+    with np.errstate(all="ignore"):
+        distance = _distorted(np.column_stack([slope, 0 * slope]), k)[:, 0]
+        wrong = ~(np.diff(distance) > 0)
+    return float(_FOLD_STEP_DEG * np.argmax(wrong)) if wrong.any() else 90.0
 
 
 def _distorted(slopes: F64, coefficients: F64) -> F64:

@@ -44,6 +44,8 @@ MAX_HELD_BYTES = 2**31  # all layers of a shard, uncompressed: a task may have t
 _SCALARS = "scalars"  # the entry of the `layer` axis that stands for all scalars of a sample
 
 
+# Fields that alter no decoded value: neither digests nor comparisons know them.
+_NO_DATA = ("shard_samples", "codecs", "distortion_valid_to_deg")
 _LABELS = {  # coordinates of the short axes
     "channel": CHANNELS,
     "xyz": ("x", "y", "z"),
@@ -116,6 +118,8 @@ class StoreSpec:
     distortion_residual_px
         Root mean square and maximum deviation of the stored distortion coefficients from the lens's chief rays,
         over the lit frame.
+    distortion_valid_to_deg
+        Angle from the boresight up to which the stored distortion coefficients hold; None in older stores.
     attitude_references
         For each of `STRATA`, the direction from which roll, pitch and yaw are measured: "sun", "nadir" or "centre".
     centre_of_mass_T_m
@@ -155,6 +159,7 @@ class StoreSpec:
     site_names: tuple[str, ...] = ()
     lens_names: tuple[str, ...] = ()
     distortion_residual_px: tuple[float, float] = (0.0, 0.0)
+    distortion_valid_to_deg: float | None = None
     attitude_references: tuple[str, ...] = ("sun", "sun")
     centre_of_mass_T_m: tuple[float, float, float] | None = None
     detector_names: tuple[str, ...] = ()
@@ -255,6 +260,7 @@ class StoreSpec:
         attitude: dict[str, Any] = {"reference": dict(zip(STRATA, self.attitude_references, strict=True))}
         if "centre" in self.attitude_references:
             attitude["centre_of_mass_T_m"] = self.centre_of_mass_T_m and list(self.centre_of_mass_T_m)
+        valid_to_deg = self.distortion_valid_to_deg
         extra: dict[str, dict[str, Any]] = {
             "mask": {"kinds": list(self.mask_kinds), "rules": list(self.mask_rules)} if self.mask_kinds else {},
             "mask_effect": {"threshold_dn": EFFECT_DN, "rule": EFFECT_RULE},
@@ -268,6 +274,7 @@ class StoreSpec:
             "distortion": {
                 "residual_px_rms": self.distortion_residual_px[0],
                 "residual_px_max": self.distortion_residual_px[1],
+                **({} if valid_to_deg is None else {"valid_to_deg": valid_to_deg}),
             },
             **dict.fromkeys(("roll_deg", "pitch_deg", "yaw_deg"), attitude),
             "detector_individual": {"names": list(self.detector_names)},
@@ -359,6 +366,8 @@ class StoreSpec:
             del plain["rendered_shape"]
         if not self.mask_any_joint:
             del plain["mask_any_joint"]
+        if self.distortion_valid_to_deg is None:
+            del plain["distortion_valid_to_deg"]
         if self.format_version == 2:
             del plain["codecs"]
         return plain
@@ -366,7 +375,7 @@ class StoreSpec:
     @property
     def data(self) -> dict[str, Any]:
         """Return `plain` without what does not alter a decoded value, for digests and comparisons."""
-        return {key: value for key, value in self.plain().items() if key not in ("shard_samples", "codecs")}
+        return {key: value for key, value in self.plain().items() if key not in _NO_DATA}
 
     @property
     def extra_coordinates(self) -> str:

@@ -179,6 +179,7 @@ def _view(camera: Camera, pose: Pose, truth: Truth) -> navigation.CameraView:
     return navigation.CameraView(
         intrinsics=camera.intrinsics,
         distortion=camera.lens.distortion,
+        valid_to_deg=camera.lens.distortion_valid_to_deg,
         camera_from_T=pose.L_from_C.T,
         camera_position_T_m=pose.position_L_m,
         depth_m=np.where(truth.semantic == BODY, truth.depth_m, np.inf),

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..core import file_contents, user_files
 from ..core.errors import InputError, under_key
-from ..core.images import decoded_image, image_size_px
+from ..core.images import decoded_image
 from ..scene.target import AlbedoMapTable
 
 Float32 = NDArray[np.float32]
@@ -54,14 +54,11 @@ def _factors(table: AlbedoMapTable) -> Float32:
     path = table.file
     with under_key("body.albedo_map.file"):
         data = user_files.read_input(path, "texture", types=TYPES)
-    columns, rows = image_size_px(data)
-    _check_values(path, rows, columns, 1)  # before decoding: a small file can hold a huge image
-    image = decoded_image(data) if columns else None
-    if image is None:
-        raise InputError(f"body.albedo_map.file = {path!r}: not a readable PNG or TIFF image")
-    values = image[:, :, None] if image.ndim == 2 else image[:, :, :3]
+    try:
+        values, _ = decoded_image(data, _MOST_VALUES)
+    except InputError as error:
+        raise InputError(f"body.albedo_map.file = {path!r}: {error}") from None
     rows, columns, channels = values.shape
-    _check_values(path, rows, columns, channels)
     is_equal_area = table.projection == "cylindrical_equal_area"
     if is_equal_area and (columns % 2 or columns < 2 * _LEAST_ROWS or rows < _LEAST_ROWS):
         raise InputError(
@@ -74,9 +71,6 @@ def _factors(table: AlbedoMapTable) -> Float32:
             f"body.albedo_map.file = {path!r}: has {columns} x {rows} pixels; a map of the whole body has twice as "
             f"many columns as rows, and at least {_LEAST_ROWS} rows"
         )
-    if values.dtype.kind in "iu":
-        values = values.astype(np.float32) / np.float32(np.iinfo(values.dtype).max)
-    values = values.astype(np.float32)
     if not np.isfinite(values).all() or values.min() < 0:
         raise InputError(f"body.albedo_map.file = {path!r}: has values that are negative or not finite")
     if (
