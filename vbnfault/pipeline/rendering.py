@@ -99,7 +99,7 @@ def render_view(spec: SampleSpec, pose: Pose) -> Rendering:
     if has_air and guide is not None and body is None:
         rendered = add_atmosphere(spec, scene, guide, rendered)
     if has_coma and guide is not None:
-        rendered = add_coma(spec, pose, scene, guide, rendered)
+        rendered = add_coma(spec, pose, scene, surface, guide, rendered, None if body is None else body.near)
     return Rendering(
         scene=scene,
         light=SceneLight(lens=camera.lens, rendered=rendered),
@@ -161,7 +161,7 @@ def body_of_few_pixels(spec: SampleSpec, pose: Pose, scene: RenderInput) -> FewP
     if air is not None:
         light = add_atmosphere(spec, seen, truth, light)
     if spec.scene.coma is not None:
-        light = add_coma(spec, pose, seen, truth, light)
+        light = add_coma(spec, pose, seen, near.ground, truth, light)
     return FewPixels(near=near, light=near.light(light), error=error, truth=truth)
 
 

@@ -78,6 +78,11 @@ class CloseUp:
         """Return by how much its camera stands nearer along the boresight."""
         return float((self.view.position_L_m - self.frame.position_L_m) @ self.frame.L_from_C[:, 2])
 
+    @property
+    def corners_px(self) -> tuple[F64, F64]:
+        """Return x and y of its first and its last corner in the frame, float64[2] each."""
+        return self.first / self.per_px, (self.first + _ACROSS) / self.per_px
+
     @cached_property
     def slopes(self) -> F64:
         """Return the tangents x/z and y/z in C of its pixels from the frame's camera, float64[y, x, 2]."""
