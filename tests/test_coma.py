@@ -496,7 +496,11 @@ def test_pixels_that_the_limb_crosses_have_the_light_of_both_sides(distance_m: f
     def dust(finer: int, **keys: Any) -> np.ndarray:
         of = [small_scene(**more) for more in ({"afrho_cm": 5000.0, "affects_ground": False}, {})]
         for table in of:
-            table["camera"] |= {"width_px": finer * pixels, "height_px": finer * pixels, "fov_deg": 2.0 * pixels / 64}
+            table["camera"] |= {
+                "width_px": finer * pixels,
+                "height_px": finer * pixels,
+                "fov_deg": 2.0 * pixels / 64,
+            }
             table["render"] = {"samples_per_pixel": 4, "bounces": 0}
         first, second = (simulated(table, row)[0].layers["radiance"][1].astype(np.float64) for table in of)
         return first - second

@@ -51,16 +51,15 @@ class FineLight:
         column, row = np.floor(pixels).astype(np.int64).T
         inside = (column >= 0) & (column < shape[1]) & (row >= 0) & (row < shape[0])
         column, row, values = column[inside], row[inside], radiance[:, inside]
-        top, left = (int(v.min(initial=0)) if not len(v) else int(v.min()) for v in (row, column))
-        bottom, right = (int(v.max()) + 1 if len(v) else 0 for v in (row, column))
-        height, width = bottom - top, right - left
-        index = (row - top) * width + column - left
+        rows, columns = ((int(v.min()), int(v.max()) + 1) if len(v) else (0, 1) for v in (row, column))
+        height, width = rows[1] - rows[0], columns[1] - columns[0]
+        index = (row - rows[0]) * width + column - columns[0]
         mean = np.stack([np.bincount(index, band, height * width) for band in values])
         return cls(
             slopes=slopes,
             power=power,
-            rows=slice(top, bottom),
-            columns=slice(left, right),
+            rows=slice(*rows),
+            columns=slice(*columns),
             mean=(mean.reshape(-1, height, width) * area_px).astype(np.float32),
         )
 
