@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,8 @@ from trimesh.visual.material import PBRMaterial
 
 from vbnfault.core import spectra
 from vbnfault.core.errors import InputError
+from vbnfault.pipeline import Session
+from vbnfault.scene.config import parse_scene
 from vbnfault.world import spacecraft
 from vbnfault.world.spacecraft import HingePose, Material, ModelPlacement, Part, Spacecraft, load_spacecraft
 
@@ -414,6 +417,65 @@ def test_default_poses() -> None:
     }
     assert moved == {f"solar_array_left/{n}" for n in ("yoke", "panel", "cells")}
     assert set(vehicle.hinges) <= set(vehicle.names)
+
+
+def write_box(path: Path, low: tuple[float, ...], high: tuple[float, ...]) -> str:
+    """Write a closed box as an OBJ file and return its path."""
+    box = trimesh.creation.box(bounds=[low, high])
+    lines = [
+        "o bus",
+        *(f"v {x} {y} {z}" for x, y, z in box.vertices),
+        *(f"f {a} {b} {c}" for a, b, c in box.faces + 1),
+    ]
+    path.write_text("\n".join(lines))
+    return str(path)
+
+
+@pytest.mark.parametrize(
+    ("low", "high"),
+    [
+        ((-1, -1, -1), (1, 1, 1)),  # around the camera
+        ((-0.2, -0.3, -0.01), (0.4, 0.3, 0.5)),  # a part of it alone
+        ((-3, -3, 0.5), (3, 3, 0.6)),  # a wall before it
+    ],
+)
+@pytest.mark.parametrize("flown", [False, True])
+def test_a_model_that_hides_the_whole_frame_is_named(tmp_path: Path, low: Any, high: Any, flown: bool) -> None:
+    """By a build and a description before anything is rendered, and by a sample, with bounds and with poses."""
+    table = {"spacecraft": {"model": write_box(tmp_path / "box.obj", low, high)}, "dataset": {"samples": 1}}
+    scene = parse_scene({"title": "t", "camera": {"fov_deg": 60.0}, **table}, source="t.toml")
+    row = {"name": "a", "julian_date": 2457000.5, "sun_distance_au": 2.5}
+    row |= {
+        "camera_x_T_m": 9e3,
+        "camera_y_T_m": 0.0,
+        "camera_z_T_m": 0.0,
+        "sun_x_T": 1.0,
+        "sun_y_T": 0,
+        "sun_z_T": 0,
+    }
+    row |= dict(zip((f"camera_from_T_{a}" for a in "wxyz"), (0.5, 0.5, 0.5, 0.5), strict=True))
+    poses = {key: [value] for key, value in row.items()} if flown else None
+    for act in (Session.warn_of_doubts, lambda session: session.simulate(0)):
+        with pytest.raises(
+            InputError, match=r"spacecraft\.model: box\.obj: hides the whole frame .*'bus'.*translation_m"
+        ):
+            act(Session(scene, poses=poses))
+
+
+def test_a_model_that_hides_most_of_the_frame_is_warned_of(tmp_path: Path) -> None:
+    """A wall in the right two thirds of the frame; in the right third it is not remarkable."""
+    slope = np.tan(np.radians(30))
+    for left, warns in ((-1 / 3, True), (1 / 3, False)):
+        model = write_box(tmp_path / "wall.obj", (left * slope, -1, 1.0), (2, 1, 1.1))
+        table = {"title": "t", "camera": {"fov_deg": 60.0}, "spacecraft": {"model": model}}
+        session = Session(parse_scene(table, source="t.toml"))
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            session.warn_of_doubts()
+        # 10 or 11 of 16 columns of rays
+        assert [("wall.obj" in str(w.message), "69 % of the frame" in str(w.message)) for w in told] == [
+            (True, True)
+        ] * warns
 
 
 def test_blocked_against_a_sphere() -> None:

@@ -55,7 +55,7 @@ class Camera:
         np.subtract(radiance.array, radiance.sun, out=sunless)
         np.maximum(sunless, 0, out=sunless)
         scene = replace(radiance, array=sunless, sun=None, disc=None)
-        sun = replace(radiance, array=radiance.sun, sun=None)
+        sun = replace(radiance, array=radiance.sun, sun=None, fine=None)
         of_scene = electrons(self.lens.image(scene))
         direct = electrons(self.lens.image_of_sun(sun, self.detector.pixel_pitch_um))
         return replace(of_scene, past_rims=direct.array)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import buffers
+from .fine_light import FineLight
 
 CHANNELS = ("R", "G", "B", "I")
 
@@ -93,11 +94,13 @@ class Radiance(Quantity):
 
     `sun` float32[band, y, x] is the part of `array` that comes from the Sun's disc; None where the Sun is not in
     view. `disc` describes this disc, for a lens that images it on its own grid; None where it is not known.
+    `fine` is the part of `array` that comes from a body of few pixels, with positions within pixels; None without.
     """
 
     wavelength_nm: NDArray[np.float64]
     sun: NDArray[np.float32] | None = None
     disc: SunInView | None = None
+    fine: FineLight | None = None
     unit = "W m-2 sr-1 nm-1"
     axes = ("band", "y", "x")
 

@@ -251,6 +251,7 @@ def _trajectory(session: Session, table: Trajectory) -> list[str]:
         f"Sun: {_span(distance.min(), distance.max())} au away, dates {date.min():.5f} to {date.max():.5f} TDB",
         *_rows_that_miss_the_body(session, table, count),
         *_rows_inside_the_body(session, table, count),
+        *_rows_without_the_sun(session, table, count),
     ]
 
 
@@ -285,6 +286,23 @@ def _rows_inside_the_body(session: Session, table: Trajectory, count: int) -> li
         f"warning: {least}{len(inside)} of {count} rows have the camera inside the body, the first is "
         f"{table.name[inside[0]]}; its sample cannot be built: choose other poses, or the body.shape that the "
         "poses were made for"
+    ]
+
+
+def _rows_without_the_sun(session: Session, table: Trajectory, count: int) -> list[str]:
+    """Return a warning if faults need the Sun and the spacecraft hides it in every row that faces it."""
+    faults = [name for name, fault in session.faults.items() if fault.needs_sun]
+    if session.vehicle is None or not faults:
+        return []
+    poses = [table.pose(k) for k in range(min(count, _POSES_DESCRIBED))]
+    sun_C = np.array([pose.T_from_C.T @ pose.sun_direction_T for pose in poses])
+    facing = sun_C[sun_C[:, 2] > 0]
+    if not len(facing) or not session.vehicle.blocked(facing).all():
+        return []
+    return [
+        f"warning: spacecraft.model = {Path(session.scene.spacecraft.model).name!r} hides the Sun in all of the "
+        f"{len(facing)} rows whose camera faces it, so {' and '.join(faults)} cannot show; check its unit, "
+        "spacecraft.translation_m and the turns of the model"
     ]
 
 

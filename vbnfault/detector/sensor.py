@@ -100,7 +100,8 @@ class Sensor:
     source: str = Field(default="", description="what the file describes, and after which document")
     architecture: Architecture = Field(default="cmos", description="how the charge is moved and read")
     shutter: Literal["global", "rolling", "mechanical"] = Field(
-        default="global", description="what ends the exposure; rolling: CMOS only"
+        default="global",
+        description="what ends the exposure; rolling: CMOS only, and all rows still see the scene at one time",
     )
     width_px: int = Field(default=1024, ge=16, le=16384, description="width of the whole sensor")
     height_px: int = Field(default=1024, ge=16, le=16384, description="height of the whole sensor")

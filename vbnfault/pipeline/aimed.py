@@ -101,7 +101,7 @@ def _unmet(spec: SampleSpec, terrain: Terrain, view: AimedView) -> tuple[str, Po
         return f"geometry.clearance_m = {geometry.clearance_m:g} m to any surface", pose
     needing = [name for name in spec.commanded_in_view if spec.faults[name].needs_sun]
     if geometry.sun_visibility == "required" and (needing or aim == "sun") and pose.sun_visible_fraction < 1:
-        return "the whole Sun visible", pose
+        return "the whole Sun visible" + ("" if terrain.vehicle is None else ", past the spacecraft"), pose
     least = geometry.min_lit_fraction if aim != "sun" else 0.0
     if least:
         lit = lit_fraction(scene.camera, terrain, position[None], pose.L_from_C[None], pose.sun_L[None])[0]

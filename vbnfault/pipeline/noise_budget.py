@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.fine_light import FineLight
 from ..core.memory import release_unused
 from ..core.quantities import Radiance, Truth
 from ..render.description import RenderInput
@@ -65,7 +66,12 @@ class SampledRadiance:
 
 
 def sample_to_noise(
-    spec: SampleSpec, scene: RenderInput, truth: Truth, guide: Truth | None, fraction: float
+    spec: SampleSpec,
+    scene: RenderInput,
+    truth: Truth,
+    guide: Truth | None,
+    fraction: float,
+    body: tuple[FineLight, F32] | None = None,
 ) -> SampledRadiance:
     """Render with more samples where sampling noise would show: above `fraction` of the sensor's own noise.
 
@@ -73,6 +79,8 @@ def sample_to_noise(
     large, the cells of the pixel get as many samples as the variation of light in each of them asks for. This is
     done again for pixels that need still more, at most `_ROUNDS` times, until at most 1 % of the lit pixels are
     left. All of it follows from scene and sample, so the result does not depend on how a build runs.
+
+    `body` is the light of a body of few pixels, which is added, with its error float32[y, x] as in `Sampled`.
     """
     from .. import render
 
@@ -82,8 +90,11 @@ def sample_to_noise(
     indirect = None
     if guide is not None and scene.bounces:
         indirect = render.indirect(spec.terrain.surface, scene, guide)
+    if body is not None:
+        indirect = body[0].added_to(np.zeros_like(sampled.radiance.array) if indirect is None else indirect)
+        sampled = replace(sampled, error=sampled.error + body[1])
     light = sampled.radiance.array.copy() if indirect is None else _sum_of(sampled.radiance.array, indirect)
-    whole = sampled.radiance.with_array(light.view())
+    whole = replace(sampled.radiance, array=light.view(), fine=None if body is None else body[0])
     sampled = replace(sampled, radiance=whole)  # a copy in all bands takes 37 MB for a frame of 1024 pixels
     release_unused(_CELLS_BYTES)  # samples in cells have wavefronts of other sizes
     exposure = foreseen_exposure_s(spec.scene, camera, truth, scene.view, whole)

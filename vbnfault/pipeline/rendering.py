@@ -2,22 +2,30 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..core import buffers, spectra
+from ..core.fine_light import FineLight
 from ..core.memory import release_unused
-from ..core.quantities import SKY, FarSource, Radiance, Truth
+from ..core.quantities import BODY, SKY, FarSource, Radiance, Truth
+from ..core.sundisc import Projection
 from ..lens.straylight.scene import RenderGrid, surrounding_grids
 from ..render.description import RenderInput, View
 from ..world import assemble
 from .atmosphere import add_atmosphere
 from .coma import add_coma
-from .noise_budget import SampledRadiance, sample_to_noise
+from .noise_budget import SampledRadiance, green_per_second, sample_to_noise
 from .spec import Pose, Rendering, SampleSpec, SceneLight
 
+if TYPE_CHECKING:
+    from ..render import CloseUp
+
 _SURROUNDING_SAMPLES = 4  # of each pixel of the coarse renders around a view
+_SAMPLES_TO_NOISE = 64  # of each pixel of a close-up where the sensor's noise limits that of sampling
 _LEAST_RAD = 1e-7  # of a disc whose visible fraction is computed
 # layers of truth that need the angles of the light
 ANGLE_LAYERS = {"incidence_deg", "emission_deg", "phase_deg", "albedo"}
@@ -52,7 +60,7 @@ def render_view(spec: SampleSpec, pose: Pose) -> Rendering:
     """Render the radiance of every band, and the truth layers.
 
     The renderer has pinhole cameras only. With a lens prescription it therefore renders a guard band around the
-    image. Truth follows the chief rays of the pixel centres.
+    image. Truth follows the chief rays of the pixel centres. A body of few pixels is rendered in a close-up.
     """
     from .. import render
 
@@ -76,28 +84,110 @@ def render_view(spec: SampleSpec, pose: Pose) -> Rendering:
         guide = render.truth(surface, scene.view, scene.sun) if needed else None
     else:
         truth = guide = render.truth(surface, scene.view, scene.sun, angles=angles)
+    body = body_of_few_pixels(spec, pose, scene)
+    shown = scene if body is None else replace(scene, shows_ground=False)
     if spec.scene.render.noise_fraction is None:
-        sampled = SampledRadiance(
-            radiance=render.radiance(surface, scene, guide), samples_per_pixel=float(scene.samples_per_pixel)
-        )
+        image = render.radiance(surface, shown, guide)
+        if body is not None:
+            image = replace(image, array=body.light.added_to(image.array), fine=body.light)
+        sampled = SampledRadiance(radiance=image, samples_per_pixel=float(scene.samples_per_pixel))
     else:
-        sampled = sample_to_noise(spec, scene, truth, guide, spec.scene.render.noise_fraction)
+        extra = None if body is None else (body.light, body.error)
+        sampled = sample_to_noise(spec, shown, truth, guide, spec.scene.render.noise_fraction, extra)
         release_unused()  # the samples of all pixels
     rendered = sampled.radiance
-    if has_air and guide is not None:
+    if has_air and guide is not None and body is None:
         rendered = add_atmosphere(spec, scene, guide, rendered)
     if has_coma and guide is not None:
-        rendered = add_coma(spec, pose, scene, guide, rendered)
+        rendered = add_coma(spec, pose, scene, surface, guide, rendered, None if body is None else body.near)
     return Rendering(
         scene=scene,
         light=SceneLight(lens=camera.lens, rendered=rendered),
-        truth=truth,
+        truth=truth if body is None else _with_body(truth, body, camera.projection),
         open_sky=guide.semantic == SKY if stars and guide is not None else None,
         samples_per_pixel=sampled.samples_per_pixel,
         noise_fraction_p99=sampled.noise_fraction_p99,
         surroundings=surroundings(spec, scene),
         far_sources=far_sources(spec, pose),
     )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FewPixels:
+    """Hold what a close-up shows of a body of few pixels.
+
+    Attributes
+    ----------
+    near
+        The close-up.
+    light
+        The light of the body in the frame.
+    error
+        float32[y, x]: error of the light's signal in the frame, as in `Sampled`; zeros if it is not asked for.
+    truth
+        Truth in the close-up.
+    """
+
+    near: CloseUp
+    light: FineLight
+    error: NDArray[np.float32]
+    truth: Truth
+
+
+def body_of_few_pixels(spec: SampleSpec, pose: Pose, scene: RenderInput) -> FewPixels | None:
+    """Return the body in a close-up, with its air and the dust in front of it; None if the body is wider."""
+    from .. import render
+
+    air = spec.scene.body.atmosphere
+    near = render.close_up(
+        spec.terrain.surface, scene.view, 0.0 if air is None else render.TOP_SCALE_HEIGHTS * air.scale_height_m
+    )
+    if near is None:
+        return None
+    seen = near.seen_in(scene)
+    error = np.zeros((scene.view.height_px, scene.view.width_px), np.float32)
+    truth = render.truth(
+        near.ground, seen.view, seen.sun, angles=bool(ANGLE_LAYERS & set(spec.scene.dataset.layers))
+    )
+    if spec.scene.render.noise_fraction is None:
+        light = render.radiance(near.ground, seen, truth)
+    else:
+        seen = replace(seen, samples_per_pixel=max(seen.samples_per_pixel, _SAMPLES_TO_NOISE))
+        sampled = render.direct_by_sample(near.ground, seen, green_per_second(spec))
+        light, halves = sampled.radiance, sampled.radiance.with_array(sampled.error[None])
+        error = near.light(halves).added_to(error[None])[0]
+        if scene.bounces:
+            light = light.with_array(light.array + render.indirect(near.ground, seen, truth))
+    if air is not None:
+        light = add_atmosphere(spec, seen, truth, light)
+    if spec.scene.coma is not None:
+        light = add_coma(spec, pose, seen, near.ground, truth, light)
+    return FewPixels(near=near, light=near.light(light), error=error, truth=truth)
+
+
+def _with_body(truth: Truth, body: FewPixels, projection: Projection) -> Truth:
+    """Return truth in which a body smaller than a pixel has the pixel in which its middle is visible.
+
+    That pixel has the depth, the normal and the angles of the middle.
+    """
+    near = body.near
+    row, column = np.nonzero((body.truth.semantic == BODY) & near.unhidden)
+    if near.size_px >= 1 or not len(row):
+        return truth
+    k = np.argmin((row - row.mean()) ** 2 + (column - column.mean()) ** 2)
+    x, y = np.floor(projection.pixel_of(near.slopes[row[k], column[k]])).astype(int)
+    height, width = truth.semantic.shape
+    if not (0 <= x < width and 0 <= y < height):
+        return truth
+    arrays = {}
+    for name, values in vars(truth).items():
+        if values is None:
+            continue
+        source = getattr(body.truth, name)
+        arrays[name] = values.copy()
+        arrays[name][y, x] = -1 if source is None else source[row[k], column[k]]
+    arrays["depth_m"][y, x] += near.nearer_m
+    return replace(truth, **arrays)
 
 
 def _has_sources_around(spec: SampleSpec) -> bool:

@@ -212,7 +212,8 @@ def _usable(
     if sun_required and needing_sun:
         # with the Sun behind the camera these faults cannot show, so such a view is rejected before it is rendered
         seen = (views.sun_visible == 1.0) & (views.sun_angle_deg() < 90)
-        met[f"the whole Sun visible before the camera, for {', '.join(needing_sun)}"] = seen
+        past = "" if vehicle is None else ", past the spacecraft"
+        met[f"the whole Sun visible before the camera{past}, for {', '.join(needing_sun)}"] = seen
     good = np.logical_and.reduce(list(met.values()))
     lit_fraction = plan.strata(scene)[stratum].min_lit_fraction
     needing_light = faults_needing_light(spec) if vehicle is None else []  # a spacecraft in view may be sunlit

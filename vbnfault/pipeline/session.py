@@ -239,12 +239,16 @@ class Session:
         return body
 
     def warn_of_doubts(self) -> None:
-        """Warn if the body has values of another, named one, and if the frame is wider than the lens's field."""
+        """Warn of a body with values of another, named one, and of a frame that lens or spacecraft leave dark.
+
+        Raises InputError if the spacecraft hides all of the frame.
+        """
         with in_file(self.source):
             sentences = (
                 assemble.values_of_another_body(self.scene, self.body),
                 assemble.dark_corners(self.scene),
                 assemble.scaled_lens(self.scene),
+                assemble.much_hidden(self.scene, self.vehicle),
             )
         for sentence in sentences:
             if sentence:

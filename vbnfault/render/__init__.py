@@ -12,9 +12,10 @@ from ..core.lazy_names import load_name
 
 if TYPE_CHECKING:
     from .albedo import AlbedoMap
-    from .atmosphere import Air, air_light
+    from .atmosphere import TOP_SCALE_HEIGHTS, Air, air_light
     from .bounces import indirect
     from .cells import Cells, direct_in_cells
+    from .close_up import CloseUp, close_up
     from .detail import FineRelief
     from .earth import EarthAlbedo
     from .integrate import radiance
@@ -40,12 +41,15 @@ _HOMES = {
     "Air": "atmosphere",
     "AlbedoMap": "albedo",
     "Cells": "cells",
+    "CloseUp": "close_up",
     "EarthAlbedo": "earth",
     "FineRelief": "detail",
     "Sampled": "light",
+    "TOP_SCALE_HEIGHTS": "atmosphere",
     "TerrainMesh": "surface",
     "Vehicle": "vehicle",
     "air_light": "atmosphere",
+    "close_up": "close_up",
     "direct": "light",
     "first_ground": "resolve",
     "first_hit_m": "resolve",
@@ -108,15 +112,18 @@ def self_test() -> str:
 
 
 __all__ = [
+    "TOP_SCALE_HEIGHTS",
     "Air",
     "AlbedoMap",
     "Cells",
+    "CloseUp",
     "EarthAlbedo",
     "FineRelief",
     "Sampled",
     "TerrainMesh",
     "Vehicle",
     "air_light",
+    "close_up",
     "direct",
     "direct_by_sample",
     "direct_in_cells",

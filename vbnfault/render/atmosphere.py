@@ -31,7 +31,7 @@ F64 = NDArray[np.float64]
 Float32 = NDArray[np.float32]
 
 _STEPS = 96
-_TOP_SCALE_HEIGHTS = 12.0  # above, 6e-6 of the air is left
+TOP_SCALE_HEIGHTS = 12.0  # above, 6e-6 of the air is left
 _REFERENCE_NM = 550.0
 # exp(y²) erfc(y) is t exp(Σ a_k t^k) with t = 1 / (1 + y / 2), to 1.2e-7 (Press et al. 1992, Numerical Recipes,
 # section 6.2).
@@ -146,7 +146,7 @@ def air_light(
     # the part of each line within the atmosphere, in float64
     along = -(direction @ start)
     miss2 = np.maximum(start @ start - along**2, 0)
-    half = np.sqrt(np.maximum((unit + _TOP_SCALE_HEIGHTS) ** 2 - miss2, 0))
+    half = np.sqrt(np.maximum((unit + TOP_SCALE_HEIGHTS) ** 2 - miss2, 0))
     begin = np.maximum(along - half, 0)
     reach = np.where(is_ground.ravel(), depth_m.ravel().astype(np.float64) * length, np.inf) / air.scale_height_m
     end = np.minimum(along + half, reach * stretch)

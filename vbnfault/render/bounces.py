@@ -52,6 +52,8 @@ def indirect(surface: TerrainMesh, scene: RenderInput, truth: Truth) -> Image:
     """
     coarse = replace(scene, view=_halved(scene.view))
     tracer = _Indirect(surface, coarse)
+    if tracer.is_empty:
+        return np.zeros((len(scene.wavelength_nm), scene.view.height_px, scene.view.width_px), dtype=np.float32)
     guide, on_vehicle = tracer.guide()
     light = tracer.image()
     if len(on_vehicle):
@@ -161,6 +163,7 @@ class _Indirect(Light):
         first = dr.gather(type(self._first), self._first, strata.pixel, strata.inside)
         hit = self.world.hit(rays, first)
         hit.valid &= strata.inside
+        hit = self.only_shown(hit)
         total, carried = None, None
         for bounce in range(self.scene.bounces):
             dimension = _FIRST_BOUNCE + 3 * bounce

@@ -83,6 +83,8 @@ class RenderInput:
     dust_contrast
         float64[band]: reflectance of dust-covered ground divided by that of bare ground, minus 1. None: dust
         reflects like bare ground.
+    shows_ground
+        Whether the ground is in the image. Otherwise only the spacecraft is, in the light and shadow of the ground.
     """
 
     view: View
@@ -93,6 +95,7 @@ class RenderInput:
     key: int
     bounces: int = 0
     dust_contrast: F64 | None = None
+    shows_ground: bool = True
 
 
 def may_see_sun(view: View, sun: Sunlight) -> bool:

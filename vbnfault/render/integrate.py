@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from ..core.quantities import Radiance, Truth
 from .bounces import indirect
+from .close_up import close_up
 from .description import RenderInput
 from .layers import truth
 from .light import direct
@@ -15,6 +18,11 @@ def radiance(surface: TerrainMesh, scene: RenderInput, guide: Truth | None = Non
 
     `guide` is the `truth` of the view, which light between surfaces needs; it is computed if it is not given.
     """
+    near = close_up(surface, scene.view) if scene.shows_ground else None
+    if near is not None:
+        body = near.light(radiance(near.ground, near.seen_in(scene)))
+        image = radiance(surface, replace(scene, shows_ground=False), guide)
+        return replace(image, array=body.added_to(image.array), fine=body)
     image = direct(surface, scene)
     if not scene.bounces:
         return image

@@ -41,7 +41,7 @@ def truth(
     slopes
         float64[y, x, 2]: tangents x/z and y/z of the rays in C. None: those of the view's pinhole.
     projection
-        The same map for all positions in these pixels. None: the view's pinhole.
+        The same map for all positions in these pixels. None: the view's pinhole; with slopes, no pixel has the Sun.
     """
     optics = Optics(view)
     shape = (view.height_px, view.width_px) if slopes is None else slopes.shape[:2]
@@ -69,7 +69,7 @@ def truth(
     more = {"incidence": "incidence_deg", "emission": "emission_deg", "phase": "phase_deg"}
     more |= {name: name for name in ("dust", "material", "albedo_factor")}
     classes = semantic.numpy().astype(np.uint8).reshape(shape)
-    disc = sun_in_view(surface, view, sun)
+    disc = sun_in_view(surface, view, sun) if slopes is None or projection is not None else None
     if disc is not None:
         _mark_sun(classes, disc, Pinhole(view.intrinsics) if projection is None else projection)
     return Truth(

@@ -163,6 +163,7 @@ class Light:
     def __init__(self, surface: TerrainMesh, scene: RenderInput, *, banded: bool) -> None:
         self.surface, self.scene, self.banded = surface, scene, banded
         self.world = surface.seen_from(scene.view)
+        self.is_empty = not scene.shows_ground and surface.vehicle is None
         self.optics, self.sun = Optics(scene.view), SunDisc(scene.sun)
         self.detail = None
         if surface.fine is not None and surface.fine.slope:
@@ -177,6 +178,12 @@ class Light:
         lit = hit.valid & (dr.dot(hit.normal, towards) > 0)
         lit &= ~self.world.occluded(hit.shadow_rays(towards), lit, coherent=coherent)
         return towards, lit
+
+    def only_shown(self, hit: Any) -> Any:
+        """Return the hits of camera rays without those on ground that the image does not show."""
+        if not self.scene.shows_ground:
+            hit.valid &= hit.on_vehicle
+        return hit
 
     def reflection(self, hit: Any, rays: Any, strata: Strata | None = None) -> Reflection:
         """Return the reflection at `hit` towards the origin of the rays.
@@ -221,6 +228,10 @@ class Direct(Light):
             signals = np.zeros(pixels.count, np.float32), np.empty((pixels.count, spp), np.float16)
             factors, limb = weights.astype(np.float64) @ signal, self.mean_limb(signal)
             white = float(signal @ self.scene.sun.irradiance_W_m2_nm) / np.pi
+        if self.is_empty:
+            if signals is not None:
+                signals[1].fill(0)
+            return out, signals
 
         def started(part: Pixels) -> tuple[slice, list[Any], Any]:
             """Let the kernels of a part run; return its pixels, the sums of its terms, and the samples' signals."""
@@ -279,7 +290,7 @@ class Direct(Light):
     def terms(self, strata: Strata) -> list[Any]:
         """Return what each sample adds to each term."""
         rays = self.optics.camera_rays(strata)
-        hit = self.world.intersect(rays)
+        hit = self.only_shown(self.world.intersect(rays))
         point = strata.disc(SUN_DIMENSION)
         towards, lit = self.lit(hit, point)
 

@@ -51,6 +51,8 @@ class TerrainMesh:
         Relief finer than the facets.
     albedo
         Map of factors on the albedo of the ground. None: 1 everywhere.
+
+    `centre_m` float64[3] and `radius_m` are those of a sphere that holds all vertices.
     """
 
     def __init__(
@@ -72,7 +74,15 @@ class TerrainMesh:
         dr.eval(self._corners, self._dust)
         self.vehicle, self.fine, self.albedo = vehicle, fine, albedo
         self._mesh, self._facet_count = self.scene.shapes()[0], len(faces)
+        low, high = vertices_m.min(axis=0).astype(np.float64), vertices_m.max(axis=0).astype(np.float64)
+        self.centre_m = (low + high) / 2
+        self.radius_m = float(np.linalg.norm(high - low)) / 2
         self.kept_sun: tuple[View, Sunlight, SunInView | None] | None = None  # the last result of `sun_in_view`
+
+    @property
+    def vertices_m(self) -> NDArray[np.float64]:
+        """Return the corners of all facets in L, float64[n, 3]."""
+        return np.asarray(self._mesh.vertex_positions_buffer().numpy().reshape(-1, 3), np.float64)
 
     def corners_m(self, facets: NDArray[np.intp]) -> NDArray[np.float64]:
         """Return the corners of facets, float64[facet, corner, 3] in L."""

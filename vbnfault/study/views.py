@@ -160,7 +160,11 @@ def with_sun(view: RenderedView, camera: Camera, sun: Mapping[str, float]) -> tu
     if add_mean(own, disc, Pinhole(rendering.scene.view.intrinsics), range(len(array))) is None:
         own = None
     radiance = replace(
-        light, array=array if own is None else array + own, sun=own, disc=None if own is None else disc
+        light,
+        array=array if own is None else array + own,
+        sun=own,
+        disc=None if own is None else disc,
+        fine=None if light.fine is None else light.fine.scaled(scale),
     )
     return (
         replace(pose, sun_L=sun_L),
@@ -184,7 +188,7 @@ def sun_rate(camera: Camera, radiance: Radiance) -> F32 | None:
     """Return the electrons per second of the Sun's direct image, float32[y, x, channel]; None out of view."""
     if radiance.sun is None:
         return None
-    sun = replace(radiance, array=radiance.sun, sun=None)
+    sun = replace(radiance, array=radiance.sun, sun=None, fine=None)
     on_sensor = camera.lens.image_of_sun(sun, camera.detector.pixel_pitch_um)
     return camera.detector.electrons_expected(on_sensor, 1.0).array
 

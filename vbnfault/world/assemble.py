@@ -57,6 +57,9 @@ _STAR_OVER_READ_NOISE = 0.1
 # thirds its mean is 15 % higher. A wider star would add to the point spread of the prescription.
 _STAR_SIGMA_PX = 0.6
 
+_HIDING_RAYS = 16  # along each side of the frame that tell what the spacecraft hides of it
+_MUCH_HIDDEN = 0.5  # fraction of the frame
+
 
 # --- Sun and ephemeris --------------------------------------------------------------------------------------
 
@@ -538,7 +541,7 @@ def spacecraft(scene: Scene) -> SpacecraftMesh | None:
             raise InputError(f"spacecraft.pose.{unknown[0]}: the default vehicle has no such joint; it has {known}")
         return vehicle.posed({name: _pose(name, t, vehicle) for name, t in table.pose.items()}).merged()
     with under_key("spacecraft.model"):
-        return load_spacecraft(
+        vehicle = load_spacecraft(
             Path(table.model),
             unit=table.unit,
             placement=ModelPlacement(
@@ -550,7 +553,36 @@ def spacecraft(scene: Scene) -> SpacecraftMesh | None:
             materials={name: _plain(value) for name, value in table.materials.items()},
             poses={name: _pose(name, t, None) for name, t in table.pose.items()},
             default_material=_plain(table.default_material),
-        ).merged()
+        )
+        mesh = vehicle.merged()
+        if hidden_fraction(scene, mesh) == 1.0:
+            alone = [
+                p.name for p in vehicle.parts if hidden_fraction(scene, Spacecraft(parts=(p,)).merged()) == 1.0
+            ]
+            named = f" (its part {alone[0]!r} alone does)" if alone else ""
+            raise InputError(
+                f"{Path(table.model).name}: hides the whole frame{named}: the camera, at the origin of B, is in "
+                "the model or looks at its back; move the model with spacecraft.translation_m, turn it with "
+                "spacecraft.yaw_deg, pitch_deg and roll_deg, or leave out the parts around the camera"
+            )
+        return mesh
+
+
+def hidden_fraction(scene: Scene, mesh: SpacecraftMesh) -> float:
+    """Return the fraction of the camera's frame that a spacecraft hides."""
+    camera = scene.camera
+    return mesh.blocked_fraction(camera.fov_deg, _HIDING_RAYS, camera.height_px / camera.width_px)
+
+
+def much_hidden(scene: Scene, mesh: SpacecraftMesh | None) -> str:
+    """Return a sentence if the spacecraft hides more than half of the frame, else an empty one."""
+    fraction = 0.0 if mesh is None else hidden_fraction(scene, mesh)
+    if fraction <= _MUCH_HIDDEN:
+        return ""
+    return (
+        f"spacecraft.model = {Path(scene.spacecraft.model).name!r}: hides {100 * fraction:.0f} % of the frame; if "
+        "the camera shall see more, move the model with spacecraft.translation_m, or turn it"
+    )
 
 
 def _plain(material: object) -> Any:

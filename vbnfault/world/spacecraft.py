@@ -225,15 +225,14 @@ class SpacecraftMesh:
             hit[start : start + step] = (within & ((part @ normal.T) * height > 0)).any(axis=1)
         return hit
 
-    def blocked_fraction(self, fov_deg: float, side: int = 64) -> float:
-        """Return the fraction of a square image that the vehicle covers, from `side`² rays.
+    def blocked_fraction(self, fov_deg: float, side: int = 64, height_over_width: float = 1.0) -> float:
+        """Return the fraction of an image that the vehicle covers, from `side`² rays.
 
-        `fov_deg` is the full field of view of the image.
-        The boresight is in the centre of the image.
+        `fov_deg` is the full field of view across the image, in whose centre the boresight is.
         """
         across = (np.arange(side) + 0.5) / side * 2 - 1
         slope = np.tan(np.radians(fov_deg) / 2) * across
-        x, y = np.meshgrid(slope, slope)
+        x, y = np.meshgrid(slope, height_over_width * slope)
         return float(self.blocked(np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)).mean())
 
 

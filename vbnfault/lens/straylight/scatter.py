@@ -458,22 +458,43 @@ class _Surfaces:
         Peterson 2004, Proc. SPIE 5178, 184.)
         """
         total = np.zeros(offset.shape)
-        for stretch, harvey, dusty, part in zip(self.stretch, self.roughness, self.dusty, lit, strict=True):
-            bsdf = harvey.bsdf(stretch * offset)
-            if dusty:
-                bsdf = bsdf + particle_bsdf(self.level, self.wavelength_nm, stretch * offset)
-            total += part * stretch**2 * bsdf
+        for k, (stretch, part) in enumerate(zip(self.stretch, lit, strict=True)):
+            total += part * stretch**2 * self._bsdf_at(k, offset)
         return self.scale * total
 
     def of_each(self, offset: F64) -> F64:
         """Return `irradiance` of every surface alone where the whole beam is lit, float64[surface, sample]."""
-        out = []
-        for stretch, harvey, dusty in zip(self.stretch, self.roughness, self.dusty, strict=True):
-            bsdf = harvey.bsdf(stretch * offset)
-            if dusty:
-                bsdf = bsdf + particle_bsdf(self.level, self.wavelength_nm, stretch * offset)
-            out.append(self.scale * stretch**2 * bsdf)
+        out = [self.scale * stretch**2 * self._bsdf_at(k, offset) for k, stretch in enumerate(self.stretch)]
         return np.array(out).reshape(len(out), len(offset))
+
+    def _bsdf(self, surface: int, beta: F64) -> F64:
+        """Return the BSDF of a surface, float64[sample] in 1/sr."""
+        bsdf = self.roughness[surface].bsdf(beta)
+        return bsdf + particle_bsdf(self.level, self.wavelength_nm, beta) if self.dusty[surface] else bsdf
+
+    def _bsdf_at(self, surface: int, offset: F64) -> F64:
+        """Return the BSDF of a surface that brings its light to an offset, float64[sample] in 1/sr."""
+        bsdf = self._bsdf(surface, self.stretch[surface] * offset)
+        return bsdf if self._gathered[surface] == 1 else np.where(offset < 1, self._gathered[surface] * bsdf, 0)
+
+    @cached_property
+    def _gathered(self) -> F64:
+        """Return all light of each surface over that with offsets below 1, float64[surface].
+
+        Where the beam is wider than at the entrance, as in the middle of a retrofocus lens, the paraxial formula
+        gives offsets up to a_j/a_ent. The lens images such light at up to 57°, but no two directions in front of it
+        are so far apart. It is spread like the rest, so that all scattered light arrives.
+        """
+
+        def within(surface: int, most: float) -> float:
+            beta = np.geomspace(1e-6, most * (1 - 1e-9), _OFFSETS.size)
+            return float(np.trapezoid(beta**2 * self._bsdf(surface, beta), x=np.log(beta)))
+
+        out = np.ones(len(self.stretch))
+        for k in np.flatnonzero(self.stretch < 1):
+            inner = within(int(k), float(self.stretch[k]))
+            out[k] = within(int(k), 1.0) / inner if inner else 1.0
+        return out
 
     @property
     def tis(self) -> float:
