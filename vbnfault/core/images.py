@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .errors import VbnfaultError
-from .whole_files import write_whole
+from .path_checks import real
+from .whole_files import replacing, write_whole
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 # Channels of OpenCV's order B, G, R, alpha in the order R, G, B, alpha, and back.
@@ -143,13 +144,14 @@ def write_exr(path: Path, channels: Mapping[str, NDArray[Any]]) -> Path:
     """
     import OpenEXR
 
-    path.write_bytes(b"")  # raises OSError with the system's reason; OpenEXR raises RuntimeError
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    try:
-        # OpenEXR accepts writeable arrays only
-        OpenEXR.File(header, {name: array.copy() for name, array in channels.items()}).write(str(path))
-    except RuntimeError as error:
-        raise VbnfaultError(f"{path}: cannot be written: {error}") from None
+    with replacing(real(path)) as temporary:
+        temporary.write_bytes(b"")  # raises OSError with the system's reason; OpenEXR raises RuntimeError
+        try:
+            # OpenEXR accepts writeable arrays only
+            OpenEXR.File(header, {name: array.copy() for name, array in channels.items()}).write(str(temporary))
+        except RuntimeError as error:
+            raise VbnfaultError(f"{path}: cannot be written: {error}") from None
     return path
 
 

@@ -37,7 +37,7 @@ _RANGED = (
     "noise_fraction_p99",
 )
 _READ = ("injected", "split", "stratum", "site", "parameters", *_RANGED)
-_SHARDS_AT_ONCE = 64
+_SHARDS_AT_ONCE = 16
 _MOST_WORDS = 12  # different texts of a parameter that are counted
 
 

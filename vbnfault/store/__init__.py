@@ -39,7 +39,7 @@ from .codec import Encoded, SharedChunks, encode, mask_union
 from .counts import FaultCounts
 from .files import Location, files_of, located
 from .formats import FORMAT_VERSION
-from .group import check_free, create, is_store, open_store, write_samples
+from .group import MOST_DOCUMENT_BYTES, check_free, create, is_store, open_store, write_samples
 from .labelled import open_dataset
 from .metadata import append_samples, recover
 from .migration import check_target, migrate, migrate_copy
@@ -52,6 +52,7 @@ __all__ = [
     "FORMAT_VERSION",
     "LAYERS",
     "MASK_RULES",
+    "MOST_DOCUMENT_BYTES",
     "OWN",
     "REQUIRED_LAYERS",
     "SCALARS",

@@ -27,7 +27,7 @@ from .formats import DIGEST_VERSION
 from .group import open_store
 from .metadata import metadata_problems, short
 from .opened import Store
-from .schema import VOLATILE_ATTRIBUTES, StoreSpec
+from .schema import MAX_HELD_BYTES, VOLATILE_ATTRIBUTES, StoreSpec
 
 
 class Problem(NamedTuple):
@@ -115,7 +115,8 @@ def examine_shard(store: Store, number: int, *, labels: bool = False) -> ShardCh
         hashes = {name: hashlib.sha256(data).digest() for name, data in layers.items()}
         return _SampleCheck([], sample_digest(hashes, scalars[i]), sentences)
 
-    with ThreadPoolExecutor(threads()) as pool:
+    sample_bytes = sum(map(store.spec.layer_bytes, store.spec.pixel_layers))
+    with ThreadPoolExecutor(min(threads(), 1 + MAX_HELD_BYTES // sample_bytes)) as pool:
         checks = dict(zip(finished, pool.map(examine_sample, finished), strict=True))
     by_layer = sorted(
         (entry for check in checks.values() for entry in check.problems),
@@ -201,7 +202,9 @@ def _layers(
             why = f"has no chunk in {file}"
         else:
             try:
-                layers[name] = compressor(store.spec.codecs[name]).decode(chunks[name][i])
+                layers[name] = compressor(store.spec.codecs[name]).decode(
+                    chunks[name][i], store.spec.layer_bytes(name)
+                )
                 if google_crc32c.value(layers[name]) != crcs[k]:
                     why = f"in {file} does not match its stored crc32c"
             except ValueError:

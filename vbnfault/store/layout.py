@@ -21,6 +21,7 @@ from numcodecs import VLenUTF8
 from numpy.typing import NDArray
 
 from .arrays import Member
+from .attributes import check_names, number_of_samples
 from .compressors import ZSTD, compressor
 from .schema import StoreSpec
 
@@ -55,7 +56,8 @@ def is_sealed(attributes: Mapping[str, Any]) -> bool:
 
 
 def root_attributes(spec: StoreSpec, samples: int) -> dict[str, Any]:
-    """Return the root attributes of a store of `samples` samples, with their checksum."""
+    """Return the root attributes of a store of `samples` samples, with their checksum. Raises InputError."""
+    check_names(spec, number_of_samples({"samples": samples}))
     return sealed(
         {
             **json.loads(json.dumps(spec.attributes)),
@@ -142,12 +144,20 @@ def coordinate_chunks(member: Member) -> Iterator[tuple[str, NDArray[Any]]]:
 
 def encode_values(values: NDArray[Any]) -> bytes:
     """Return numbers or texts (dtype object) as the bytes of a chunk file."""
-    return compressor(ZSTD).encode(VLenUTF8().encode(values) if values.dtype == object else values)
+    return compressor(ZSTD).encode(plain_values(values))
 
 
-def decode_values(data: bytes, dtype: str) -> NDArray[Any]:
-    """Return the values of a chunk file as a flat array. Raises ValueError if the file is damaged."""
-    plain = compressor(ZSTD).decode(data)
+def plain_values(values: NDArray[Any]) -> Any:
+    """Return what the chunk file of values holds compressed."""
+    return VLenUTF8().encode(values) if values.dtype == object else values
+
+
+def decode_values(data: bytes, dtype: str, most_bytes: int) -> NDArray[Any]:
+    """Return the values of a chunk file, of at most so many bytes, as a flat array.
+
+    Raises ValueError if the file is damaged.
+    """
+    plain = compressor(ZSTD).decode(data, most_bytes)
     if dtype != "str":
         return np.frombuffer(plain, dtype=dtype)
     try:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ... import __version__
 from ...core.errors import InputError, VbnfaultError, shown
-from ...core.path_checks import path_of
+from ...core.path_checks import path_of, real
 from ...core.quantities import Sample
 from ...core.tables import did_you_mean
 from ...dataset.card import to_json
@@ -124,7 +124,7 @@ def _check_place(store: Store, target: Path) -> None:
     """Refuse a folder within the store, or one that holds the store."""
     if isinstance(store.path, Url):
         return
-    inside, outside = store.path.resolve(), target.resolve()
+    inside, outside = real(store.path), real(target)
     if inside == outside or inside in outside.parents:
         raise InputError(f"{target}: lies in the store; choose another --out")
 

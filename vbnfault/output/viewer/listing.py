@@ -90,7 +90,8 @@ class Listing:
         if store.spec.empty(name):
             return
         last = store.shards - 1
-        contents = store.files.read_each([store.file_name(name, number) for number in numbers])
+        most_bytes = store.most_bytes(name)
+        contents = store.files.read_each([(store.file_name(name, number), most_bytes) for number in numbers])
         for number, content in zip(numbers, contents, strict=True):
             if isinstance(content, OSError):
                 continue
