@@ -19,6 +19,8 @@ from typing import Any
 import numpy as np
 from fuzz_inputs import NUMBERS, TEXTS, changed, hostile, places
 
+from vbnfault.core.errors import VbnfaultError
+
 NAMES = [
     "../../../pwned",
     "/tmp/pwned",
@@ -54,7 +56,8 @@ def made_by_a_stranger(sound: Path, store: Path, rng: random.Random, private: Pa
     ways: list[Callable[[Path, random.Random, Path], None]] = [_rename, _rename, _attribute, _attribute, _resize]
     ways += [_sparse, _sparse, _bomb, _bomb, _link, _link, _text, _text, _index]
     for way in rng.sample(ways, rng.choice((1, 1, 1, 2, 3))):
-        with contextlib.suppress(OSError, KeyError, IndexError, ValueError):  # what an earlier way has removed
+        # what an earlier way has removed or spoilt
+        with contextlib.suppress(OSError, LookupError, ValueError, TypeError, AttributeError, VbnfaultError):
             way(store, rng, private)
 
 
@@ -104,7 +107,7 @@ def state(here: Path, arguments: list[str]) -> dict[str, tuple[int, bytes]]:
 def escaped(here: Path, arguments: list[str]) -> str:
     """Return what a command has written where it may not, "" if nothing."""
     own = {Path(arguments[arguments.index("--out") + 1]).name} if "--out" in arguments else set()
-    beside = {p.name for p in (here / "out").iterdir()} - own
+    beside = {p.name for p in (here / "out").iterdir() if not p.name.startswith(tuple(f".{n}." for n in own))} - own
     beside |= {p.name for p in (*here.parent.iterdir(), *Path("/tmp").iterdir()) if "pwned" in p.name}
     if beside:
         return f"files beside the output: {sorted(beside)}"
@@ -138,7 +141,6 @@ def read(path: str) -> None:
 
 def look(path: str) -> None:
     """Ask a viewer for everything that its page asks for."""
-    from vbnfault.core.errors import VbnfaultError
     from vbnfault.output.viewer import server
     from vbnfault.store import open_store
 
@@ -239,7 +241,7 @@ def _sparse(store: Path, rng: random.Random, _: Path) -> None:
 
 
 def zeros(size: int, claimed: int | None) -> bytes:
-    """Return a Zstd frame of zeros, of a few bytes for each 128 KiB, that claims to hold so many; None: it says nothing.
+    """Return a Zstd frame of zeros that claims to hold so many; None: it says nothing.
 
     RFC 8878, sections 3.1.1.1 and 3.1.1.2: a block of the type RLE holds one byte and how often it is repeated.
     """

@@ -41,6 +41,7 @@ from .files import Location, files_of, located
 from .formats import FORMAT_VERSION
 from .group import MOST_DOCUMENT_BYTES, check_free, create, is_store, open_store, write_samples
 from .labelled import open_dataset
+from .layout import drawn_table
 from .metadata import append_samples, recover
 from .migration import check_target, migrate, migrate_copy
 from .opened import Store
@@ -83,6 +84,7 @@ __all__ = [
     "count_faults",
     "create",
     "digest",
+    "drawn_table",
     "encode",
     "examine",
     "examine_shard",

@@ -25,6 +25,7 @@ from .compressors import compressor
 from .counts import FaultCounts
 from .formats import DIGEST_VERSION
 from .group import open_store
+from .layout import drawn_table
 from .metadata import metadata_problems, short
 from .opened import Store
 from .schema import MAX_HELD_BYTES, VOLATILE_ATTRIBUTES, StoreSpec
@@ -377,7 +378,11 @@ def _check_labels(
 ) -> Iterator[str]:
     """Yield one sentence for each contradiction between a sample's labels and its pixels or other labels."""
     injected = scalars["injected"]
-    parameters = json.loads(str(scalars["parameters"]) or "{}")
+    try:
+        parameters = drawn_table(scalars["parameters"])
+    except ValueError:
+        yield f"sample {i}: its parameters are no table in JSON"
+        return
     for fault, is_in in zip(spec.faults, injected.tolist(), strict=True):
         drawn = parameters.get(fault)
         listed = drawn is not None and not (isinstance(drawn, dict) and drawn.get("injected") is False)
@@ -479,7 +484,7 @@ def _parsed(text: str) -> Any:
     """Return JSON text as data, so that the order of keys does not count; return other text as it is."""
     try:
         return json.loads(text)
-    except ValueError:
+    except (ValueError, RecursionError):
         return text
 
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -31,6 +32,7 @@ CHECKSUM = "attributes_sha256"
 # root attributes that the store needs for itself; all others are the user's
 OWN_ATTRIBUTES = ("store", "samples", "coordinates", CHECKSUM)
 
+_BRACKETS, _DEEPEST = re.compile(r"[][{}]"), 64
 _LITTLE_ENDIAN = {"name": "bytes", "configuration": {"endian": "little"}}
 
 
@@ -127,6 +129,23 @@ def group_document(
         metadata = {name: arrays[name] for name in sorted(arrays)}
         document["consolidated_metadata"] = {"kind": "inline", "must_understand": False, "metadata": metadata}
     return {**document, "node_type": "group"}
+
+
+def drawn_table(text: object) -> dict[str, Any]:
+    """Return the table that the scalar `parameters` or `proposal` of a sample holds as JSON.
+
+    Raises ValueError if it is none, or is nested deeper than what vbnfault writes.
+    """
+    depth, content = 0, str(text or "{}")
+    for bracket in _BRACKETS.finditer(content):
+        depth += 1 if bracket[0] in "[{" else -1
+        if depth > _DEEPEST:
+            raise ValueError("it is nested too deep")
+    # no float holds a whole number of more digits, and no array
+    table = json.loads(content, parse_int=lambda digits: int(digits) if len(digits) < 25 else float(digits))
+    if not isinstance(table, dict):
+        raise ValueError("no table in JSON")
+    return table
 
 
 def coordinate_chunks(member: Member) -> Iterator[tuple[str, NDArray[Any]]]:

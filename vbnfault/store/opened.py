@@ -35,6 +35,7 @@ from .layout import (
     SPARE,
     array_documents,
     decode_values,
+    drawn_table,
     encode_values,
     group_document,
     sealed,
@@ -273,6 +274,16 @@ class Store:
     def file_name(self, name: str, number: int) -> str:
         """Return the name, relative to the store, of the file that holds an array's values for one shard."""
         return f"{name}/c/{number}{'/0' * len(self._shape(name))}"
+
+    def table(self, index: int, name: str, text: object) -> dict[str, Any]:
+        """Return the table in the scalar `parameters` or `proposal` of a sample. Raises VbnfaultError."""
+        try:
+            return drawn_table(text)
+        except ValueError:
+            raise VbnfaultError(
+                f"{self.path}: sample {index}: its {name} are damaged, they are no table in JSON; the build command "
+                "repairs them"
+            ) from None
 
     def most_bytes(self, name: str) -> int:
         """Return the most bytes that the file of an array for one shard may have."""

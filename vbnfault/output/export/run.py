@@ -265,7 +265,7 @@ def _row(store: Store, sample: Sample) -> dict[str, Any]:
     row = {name: plain(np.asarray(v).ravel() if np.ndim(v) else v) for name, v in scalars.items()}
     row["injected"] = [f for f, on in zip(store.spec.faults, sample.scalars["injected"], strict=True) if on]
     row["stratum"] = STRATA[int(row["stratum"])]
-    parsed = {name: json.loads(sample.scalars[name] or "{}") for name in _PARSED}
+    parsed = {name: store.table(sample.index, name, sample.scalars[name]) for name in _PARSED}
     return {"sample": sample.index, **row, **plain(parsed)}
 
 
