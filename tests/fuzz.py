@@ -1,9 +1,10 @@
 """Run the program on many malformed inputs: `python -m tests.fuzz --count 5000 --seed 7`.
 
 Each case damages a valid input: a scene, study, lens or sensor file, a mesh of any format, a spacecraft, a texture,
-a SPICE kernel or DSK, options and environment variables, or a store. The program then runs as from the command
-line. It may succeed or refuse the input: exit code 0, 1 or 2, with a short message if it is not 0. A case fails if
-it ends with a traceback or a signal, or uses more than 20 s of processor time or 2 GiB of memory. A failure is
+a SPICE kernel or DSK, options and environment variables, or a store; or it makes the store of a stranger. The
+program then runs as from the command line. It may succeed or refuse the input: exit code 0, 1 or 2, with a short
+message if it is not 0. A case fails if it ends with a traceback or a signal, or uses more than 20 s of processor
+time or 2 GiB of memory, and the store of a stranger also if anything outside the output is touched. A failure is
 printed with the command that repeats it (`--only N`). `--kinds study lens` runs cases of these kinds only.
 
 A few processes run all cases, so that the imports are paid once; a process that dies is replaced. A case depends
@@ -35,6 +36,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
+import fuzz_stores
 from fuzz_cases import CASES, dry, whole_scene
 from fuzz_inputs import ROOT, Seeds, toml
 
@@ -56,16 +58,21 @@ def run(arguments: list[str]) -> tuple[int, str, str]:
     Return its exit code (-1 for a traceback), its standard error and its standard output.
     """
     from vbnfault import cli
+    from vbnfault.core.errors import VbnfaultError
 
     output, errors = io.StringIO(), io.StringIO()
     before = sys.argv
     sys.argv = ["vbnfault", *arguments]
+    action = {"read": fuzz_stores.read, "view": fuzz_stores.look}.get(arguments[0] if arguments else "")
     try:
         with contextlib.redirect_stdout(output), contextlib.redirect_stderr(errors), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             try:
-                cli.main()
+                action(arguments[1]) if action else cli.main()
                 code = 0
+            except VbnfaultError as error:
+                print(error, file=sys.stderr)
+                code = error.exit_code if action else -1
             except SystemExit as stop:
                 code = stop.code if isinstance(stop.code, int) else 0
             except BaseException:
@@ -92,12 +99,18 @@ def attempt(seeds: Seeds, seed: str, number: int, keep: Path | None = None) -> d
     here = Path(tempfile.mkdtemp(dir=seeds.folder)) if keep is None else keep
     cpu_before = sum(os.times()[:4])
     arguments, variables = CASES[kind][0](seeds, rng, here)
+    untouched = fuzz_stores.state(here, arguments) if kind == "stranger" else {}
     before = dict(os.environ)
     os.environ.update(variables)
     folder = os.getcwd()
     os.chdir(here)  # commands may write to the working folder
+    outside = ""
     try:
         code, errors, _ = run(arguments)
+        if kind == "stranger":
+            outside = fuzz_stores.escaped(here, arguments)
+            if fuzz_stores.state(here, arguments) != untouched:
+                outside = "files outside the output have changed"
     finally:
         os.chdir(folder)
         os.environ.clear()
@@ -111,6 +124,8 @@ def attempt(seeds: Seeds, seed: str, number: int, keep: Path | None = None) -> d
         problem = f"exit code {code} without a word"
     elif kind != "options" and code and max(map(len, errors.splitlines())) > LONGEST_MESSAGE:
         problem = f"a message of {len(errors)} characters"
+    elif outside:
+        problem = outside
     elif "not enough memory" in errors:
         problem = "not enough memory"
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024

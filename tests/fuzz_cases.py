@@ -12,6 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import fuzz_stores
 from fuzz_inputs import NUMBERS, TEXTS, Seeds, any_toml, changed, flipped, hostile, places, toml, toml_value
 
 Case = tuple[list[str], dict[str, str]]  # arguments, and environment variables
@@ -367,7 +368,20 @@ def case_store(seeds: Seeds, rng: random.Random, here: Path) -> Case:
     return [command, str(store), *more.get(command, [])], {}
 
 
-CASES: dict[str, tuple[Callable[[Seeds, random.Random, Path], Case], int]] = {  # function, percentage of cases
+def case_stranger(seeds: Seeds, rng: random.Random, here: Path) -> Case:
+    """Give a command the store of a stranger; `fuzz.attempt` looks where it has written."""
+    private = here / "private"
+    private.mkdir()
+    (private / "mine.txt").write_text("precious")
+    for name in ("0", "0/0", "0/0/0"):
+        (private / name).mkdir()
+    (private / "0/0/0/0").write_text("precious")
+    (here / "out").mkdir()
+    fuzz_stores.made_by_a_stranger(seeds.store, here / "store.zarr", rng, private)
+    return fuzz_stores.command(here / "store.zarr", seeds.store, here / "out", rng), {}
+
+
+CASES: dict[str, tuple[Callable[[Seeds, random.Random, Path], Case], int]] = {  # function, weight
     "scene": (case_scene, 12),
     "fault": (case_fault, 11),
     "lens": (case_lens, 12),
@@ -381,4 +395,5 @@ CASES: dict[str, tuple[Callable[[Seeds, random.Random, Path], Case], int]] = {  
     "special": (case_special, 4),
     "options": (case_options, 8),
     "store": (case_store, 5),
+    "stranger": (case_stranger, 20),
 }

@@ -289,11 +289,11 @@ def test_parameters_that_are_no_table_are_a_sentence(
 
 def test_a_report_warns_once_of_images_that_are_missing(copied: Path, tmp_path: Path) -> None:
     shutil.rmtree(copied / "image")
-    with pytest.warns(UserWarning, match="array image is missing") as warned:
+    with pytest.warns(UserWarning, match="image of sample") as warned:
         vbnfault.report(copied, tmp_path / "r.html")
     assert [str(one.message) for one in warned] == [
-        f"{copied}: array image is missing; the build command re-creates it; the same is true of 5 samples more; "
-        "the report shows no images"
+        f"{copied}: image of sample 5 cannot be read: the file image/c/2/0/0/0 is missing; the build command "
+        "repairs it; the same is true of 5 samples more; the report shows no images"
     ]
 
 

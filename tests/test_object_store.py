@@ -93,7 +93,7 @@ def test_ranges_are_written_at_once_and_damage_is_repaired(url: str, digest: str
     assert left_behind(url) == []
     store = st.open_store(url)
     name = store.file_name("image", 1)
-    data = bytearray(store.files.read(name))
+    data = bytearray(store.files.read(name, 1 << 30))
     data[50] ^= 1
     store.files.write([(name, bytes(data))])
     store.files.remove([store.file_name("mask", 0)])
@@ -139,13 +139,13 @@ def test_claims_of_killed_commands_are_removed(url: str, server: S3Server, monke
 def test_a_bucket_that_fails_in_the_middle_ends_a_build_that_resumes(
     url: str, server: S3Server, digest: str, name: str
 ) -> None:
-    kind = InputError if "zarr.json" in name else VbnfaultError
-    with server.failing(503, puts(url, name)) as refused, pytest.raises(kind) as raised:
+    with server.failing(503, puts(url, name)) as refused, pytest.raises(VbnfaultError) as raised:
         run(url, samples=SAMPLES)
     assert len(refused) == 3  # repeated twice
     assert "503 Service Unavailable" in str(raised.value)
     assert "\n" not in str(raised.value)
-    if kind is VbnfaultError:
+    assert raised.value.exit_code == 1
+    if "zarr.json" not in name:
         assert "finished samples stay, and the same command resumes" in str(raised.value)
         assert st.open_store(url).finished() == 4
     else:
@@ -235,7 +235,7 @@ def test_other_objects_are_left_alone(url: str) -> None:
     files.write([("notes/a.txt", b"mine")])
     with pytest.raises(InputError, match=r"holds notes/a\.txt and is no vbnfault store, so it is left alone"):
         run(url, samples=SAMPLES, overwrite=True)
-    assert files.read("notes/a.txt") == b"mine"
+    assert files.read("notes/a.txt", 9) == b"mine"
 
 
 def test_a_store_is_replaced_also_after_interruptions(url: str, server: S3Server) -> None:
@@ -307,7 +307,7 @@ def test_a_write_that_fails_is_not_passed_over(url: str, server: S3Server) -> No
 
 def test_a_sample_is_read_by_ranges_of_its_shard(built: str, server: S3Server) -> None:
     store = st.open_store(built)
-    shard = len(store.files.read(store.file_name("image", 0)))
+    shard = len(store.files.read(store.file_name("image", 0), 1 << 30))
     reader = st.ShardReader(store, ["image"])
     data = st.open_dataset(built)
     for read in (
@@ -365,7 +365,7 @@ def test_a_bucket_is_viewed_by_ranges_and_reported(built: str, tmp_path: Path) -
     viewer = Viewer(st.open_store(built))
     try:
         name = viewer.store.file_name("mask", 0)
-        whole = viewer.store.files.read(name)
+        whole = viewer.store.files.read(name, 1 << 30)
         assert viewer.part(name, None)[0] == whole
         assert viewer.part(name, "bytes=3-9") == (whole[3:10], "")
         assert viewer.part(name, "bytes=-20") == (whole[-20:], "")

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import zarr
 from synthetic import FAULTS, fake_sample, flip, repaired
 
 from vbnfault import store as st
@@ -105,7 +106,7 @@ def test_a_flipped_byte_of_a_scalar_chunk_is_found(whole: st.Store, name: str) -
 
 
 def test_a_scalar_changed_behind_its_checksum_is_found(whole: st.Store) -> None:
-    whole.array("exposure_s")[5] = 2.0
+    zarr.open_array(whole.path / "exposure_s", mode="r+")[5] = 2.0
     assert st.verify(whole) == ["sample 5: its scalars do not match their crc32c"]
 
 
@@ -174,7 +175,7 @@ def test_one_pass_gives_problems_digest_and_counts(whole: st.Store, monkeypatch:
     compressor = check.compressor
 
     def counted(name: str) -> SimpleNamespace:
-        return SimpleNamespace(decode=lambda data: (decoded.append(1), compressor(name).decode(data))[1])
+        return SimpleNamespace(decode=lambda *data: (decoded.append(1), compressor(name).decode(*data))[1])
 
     monkeypatch.setattr(check, "compressor", counted)
     commanded = np.array([fake_sample(whole.spec, i).scalars["injected"] for i in range(10)])
@@ -256,20 +257,20 @@ def test_wrong_coordinates_and_attributes_are_found_and_mended(whole: st.Store) 
         ("layer", 0, "raw"),
         ("sample", 5, 6),
     ):
-        good = whole.array(name)[:]
-        whole.array(name)[position] = value
+        good = zarr.open_array(whole.path / name, mode="r+")[:]
+        zarr.open_array(whole.path / name, mode="r+")[position] = value
         (sentence,) = st.verify(whole.path)
         assert sentence.startswith(f"array {name}: its value {position} is {value}, not ")
         st.recover(whole.path)
         assert st.verify(whole.path) == []
-        np.testing.assert_array_equal(st.open_store(whole.path).array(name)[:], good)
+        np.testing.assert_array_equal(zarr.open_array(whole.path / name, mode="r")[:], good)
     for name, key, wrong in (
         ("mask_any", "faults", ["vignetting"]),
         ("stratum", "flag_meanings", "a b"),
         ("site", "names", []),
         ("depth_m", "units", "km"),
     ):
-        whole.array(name).update_attributes({key: wrong})
+        zarr.open_array(whole.path / name, mode="r+").update_attributes({key: wrong})
         (sentence,) = st.verify(whole.path)
         assert sentence.startswith(f"array {name}: its attribute {key} = {wrong}, not ")
         st.recover(whole.path)
@@ -349,8 +350,6 @@ def test_a_missing_array_is_one_sentence_and_made_again(whole: st.Store, name: s
         what = "cannot be opened" if damage == "unparsable" else "is missing"
         (sentence,) = st.verify(whole.path)
         assert sentence.startswith(f"array {name} {what}")
-        with pytest.raises(VbnfaultError, match=f"array {name} {what}"):
-            st.open_store(whole.path).array(name)
         store = st.recover(whole.path)
         lost = damage == "folder" and name in store.spec.arrays
         repaired(store, list(range(10)) if lost else [], before)

@@ -276,16 +276,18 @@ def test_a_codec_returns_what_it_was_given_and_notices_damage(name: str) -> None
     data = np.random.default_rng(1).integers(0, 9, 6 * 500, dtype=np.uint8)
     codec = compressor(name)
     coded = codec.encode(data)
-    assert codec.decode(coded) == data.tobytes()
+    assert codec.decode(coded, data.size).tobytes() == data.tobytes()
     assert codec.encode(data) == coded
     assert blosc.get_mutex() is None  # else multiprocessing reports a leak when a worker is killed
     for position in (0, 3, 9, len(coded) // 2, len(coded) - 1):
         damaged = bytearray(coded)
         damaged[position] ^= 0x10
         with pytest.raises(ValueError):  # noqa: PT011 - the words are those of the libraries
-            codec.decode(bytes(damaged))
+            codec.decode(bytes(damaged), data.size)
     with pytest.raises(ValueError):  # noqa: PT011
-        codec.decode(coded[:2])
+        codec.decode(coded[:2], data.size)
+    with pytest.raises(ValueError, match="at most"):
+        codec.decode(coded, data.size - 1)
 
 
 def test_a_codec_that_does_not_exist_is_refused() -> None:

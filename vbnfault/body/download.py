@@ -21,6 +21,7 @@ from urllib.parse import quote, unquote, urlsplit, urlunsplit
 from ..core import path_checks
 from ..core.errors import InputError, VbnfaultError, shown
 from ..core.user_files import LIMIT_BYTES, MIB, head_of_input, read_input, sha256_of_input
+from ..core.whole_files import own, unwritable, write_whole
 from .shape import FILE_TYPES, load_shape
 
 LOCK = "shapes.lock"
@@ -141,7 +142,7 @@ def _download(url: str, path: Path, known: str) -> Pin:
         path.parent.mkdir(parents=True, exist_ok=True)
         handle, part = tempfile.mkstemp(dir=path.parent, prefix=".part-", suffix=path.suffix.lower())
     except OSError as error:
-        raise VbnfaultError(f"{path.parent}: cannot be written: {error.strerror}") from None
+        raise unwritable(path.parent, error) from None
     try:
         with os.fdopen(handle, "wb") as file:
             pin = _received(url, file)
@@ -154,7 +155,7 @@ def _download(url: str, path: Path, known: str) -> Pin:
         os.chmod(part, 0o644)  # mkstemp lets nobody else read it
         os.replace(part, path)
     except OSError as error:
-        raise VbnfaultError(f"{path}: cannot be written: {error.strerror}") from None
+        raise unwritable(path, error) from None
     finally:
         Path(part).unlink(missing_ok=True)
     return pin
@@ -231,10 +232,7 @@ def _read_lock(path: Path) -> dict[str, Pin]:
 def _write_lock(path: Path, pins: dict[str, Pin]) -> None:
     """Write the lock file, whole or not at all. Raises VbnfaultError."""
     text = json.dumps({name: asdict(pins[name]) for name in sorted(pins)}, indent=2) + "\n"
-    part = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        part.write_text(text, encoding="utf-8")
-        os.replace(part, path)
+        write_whole(own(path), text)
     except OSError as error:
-        part.unlink(missing_ok=True)
-        raise VbnfaultError(f"{path}: cannot be written: {error.strerror}") from None
+        raise unwritable(path, error) from None

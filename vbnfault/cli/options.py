@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 import typer
 
 from ..core.errors import InputError, shown
+from ..core.path_checks import real
+from ..core.whole_files import unwritable
 
 if TYPE_CHECKING:
     from ..scene.config import Scene
@@ -250,12 +252,11 @@ def progress_bar(length: int, label: str) -> Any:
 
 @contextlib.contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Turn an OSError of a block that writes `path` into an InputError that names it."""
+    """Turn an OSError of a block that writes `path` into the error of `unwritable`."""
     try:
         yield
     except OSError as error:
-        why = "it is a file, not a folder" if isinstance(error, FileExistsError) else error.strerror
-        raise InputError(f"{path}: cannot be written: {why}") from None
+        raise unwritable(path, error) from None
 
 
 def check_written(read: str, written: Mapping[str, Path | None]) -> None:
@@ -263,11 +264,11 @@ def check_written(read: str, written: Mapping[str, Path | None]) -> None:
 
     Two options may not name one file, none the file which is read, and all folders must exist.
     """
-    taken = {Path(read).resolve(): "the input"} if Path(read).is_file() else {}
+    taken = {real(read): "the input"} if Path(read).is_file() else {}
     for option, path in written.items():
         if path is None:
             continue
-        other = taken.setdefault(path.resolve(), option)
+        other = taken.setdefault(real(path), option)
         if other != option:
             raise InputError(f"{option} {path}: is also the file of {other}; choose another path")
         if not path.absolute().parent.is_dir():

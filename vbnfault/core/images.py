@@ -16,9 +16,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .errors import InputError, VbnfaultError
+from .path_checks import real
 from .tiff import HEADS as TIFF_HEADS
 from .tiff import check_values, tiff_pixels
-from .whole_files import write_whole
+from .whole_files import replacing, write_whole
 
 F32 = NDArray[np.float32]
 
@@ -154,13 +155,14 @@ def write_exr(path: Path, channels: Mapping[str, NDArray[Any]]) -> Path:
     """
     import OpenEXR
 
-    path.write_bytes(b"")  # raises OSError with the system's reason; OpenEXR raises RuntimeError
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    try:
-        # OpenEXR accepts writeable arrays only
-        OpenEXR.File(header, {name: array.copy() for name, array in channels.items()}).write(str(path))
-    except RuntimeError as error:
-        raise VbnfaultError(f"{path}: cannot be written: {error}") from None
+    with replacing(real(path)) as temporary:
+        temporary.write_bytes(b"")  # raises OSError with the system's reason; OpenEXR raises RuntimeError
+        try:
+            # OpenEXR accepts writeable arrays only
+            OpenEXR.File(header, {name: array.copy() for name, array in channels.items()}).write(str(temporary))
+        except RuntimeError as error:
+            raise VbnfaultError(f"{path}: cannot be written: {error}") from None
     return path
 
 

@@ -52,6 +52,11 @@ def path_of(value: object, what: str) -> Path:
         raise InputError(f"{what} = {shown(value)}: must be a path") from None
 
 
+def real(path: str | os.PathLike[str]) -> Path:
+    """Return the absolute path without links; links in a circle stay, so that opening the path fails."""
+    return Path(os.path.realpath(path))
+
+
 def check_folder(path: Path) -> None:
     """Check that a path to a folder, which `--out` names, is none to a file. Raises InputError."""
     if path.exists() and not path.is_dir():

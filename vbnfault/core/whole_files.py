@@ -1,14 +1,41 @@
-"""Replace files and folders only once their new content is written: a full disk leaves the former one."""
+"""Write, replace and remove files and folders, and reach nothing through a link.
+
+A file or folder is replaced only once its new content is written: a full disk leaves the former one. What is
+removed or truncated is never reached through a link that has the name of a file or folder that vbnfault makes: the
+link itself makes way (`own`, `own_folder`, `remove`). A path that the user names for a file may be a link, and the
+file behind it is replaced (`write_whole`).
+"""
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import shutil
 import stat
 import uuid
 from pathlib import Path
 from typing import Any
+
+from .errors import InputError, VbnfaultError
+from .path_checks import real
+
+# What ends a run although its path is right; every other error of the system means that the path cannot be used.
+_FAILED_RUNS = (errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EFBIG, errno.EMFILE, errno.ENFILE)
+
+
+def kind_of(error: OSError) -> type[VbnfaultError]:
+    """Return the kind of error, and so the exit code, for a file or folder that cannot be written.
+
+    It is InputError, unless the disk is full or fails, or the process may open no more files.
+    """
+    return VbnfaultError if error.errno in _FAILED_RUNS else InputError
+
+
+def unwritable(path: object, error: OSError) -> VbnfaultError:
+    """Return the error for a file or folder that cannot be written."""
+    why = "it is a file, not a folder" if isinstance(error, FileExistsError) else error.strerror or str(error)
+    return kind_of(error)(f"{path}: cannot be written: {why}")
 
 
 def write_whole(path: Path, content: str | bytes) -> None:
@@ -19,7 +46,7 @@ def write_whole(path: Path, content: str | bytes) -> None:
     cannot be written.
     """
     data = content.encode("utf-8", "replace") if isinstance(content, str) else content
-    target = path.resolve()
+    target = real(path)
     if target.exists() and not target.is_file():
         path.write_bytes(data)
         return
@@ -37,7 +64,10 @@ def write_whole(path: Path, content: str | bytes) -> None:
 
 
 class replacing:
-    """Write a file or folder under a temporary name beside it, and rename it at the end of a `with` block."""
+    """Write a file or folder under a temporary name beside it, and rename it at the end of a `with` block.
+
+    A link of this name is replaced, not what it names; a folder is replaced by a folder only.
+    """
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -49,8 +79,8 @@ class replacing:
     def __exit__(self, kind: Any, *_: object) -> None:
         try:
             if kind is None:
-                if self._path.is_dir():
-                    shutil.rmtree(self._path)
+                if self._temporary.is_dir():
+                    remove(self._path)
                 os.replace(self._temporary, self._path)
         finally:
             with contextlib.suppress(OSError):  # the first error counts
@@ -58,8 +88,21 @@ class replacing:
 
 
 def remove(path: Path) -> None:
-    """Remove a file or a folder, if it exists."""
-    if path.is_dir():
-        shutil.rmtree(path, ignore_errors=True)
+    """Remove a file, a link or a folder with its contents, if it exists; what links name stays."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
     else:
         path.unlink(missing_ok=True)
+
+
+def own(path: Path) -> Path:
+    """Return the path of a file in a folder that vbnfault makes; a link of this name is removed."""
+    if path.is_symlink():
+        path.unlink()
+    return path
+
+
+def own_folder(path: Path) -> Path:
+    """Make a folder within one that vbnfault makes, and return it; a link of this name is removed."""
+    own(path).mkdir(exist_ok=True)
+    return path

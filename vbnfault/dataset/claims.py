@@ -22,6 +22,7 @@ from ..core.errors import VbnfaultError
 from ..store import OWN, Bucket, Url
 from .owners import has_ended, overlap, still_writing, this_process
 
+_MOST_BYTES = 65536  # of a claim
 _FOLDER = f"{OWN}/claims"
 _SECONDS_BETWEEN_BEATS = 20.0
 _SECONDS_OF_A_CLAIM = 120.0
@@ -118,10 +119,10 @@ def _others(bucket: Bucket, own: str) -> list[_Claim]:
         if match is None or name == own:
             continue
         try:
-            owner = json.loads(bucket.read(f"{_FOLDER}/{name}"))
+            owner = json.loads(bucket.read(f"{_FOLDER}/{name}", _MOST_BYTES))
         except FileNotFoundError:  # it has just ended
             continue
-        except ValueError:
+        except (OSError, ValueError):
             owner = {}
         too_old = now is not None and (now - moment).total_seconds() > _SECONDS_OF_A_CLAIM
         if too_old or has_ended(owner):

@@ -8,6 +8,7 @@ overlap: so of two that begin together, at least one sees the other.
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
 import re
@@ -21,6 +22,7 @@ from types import ModuleType
 from typing import Any, NamedTuple
 
 from ..core.errors import InputError, VbnfaultError
+from ..core.whole_files import kind_of
 from ..store import Location, Url
 from . import claims
 from .owners import has_ended, overlap, still_writing, this_process
@@ -31,6 +33,9 @@ try:
 except ImportError:  # Windows has no such locks
     fcntl = None
 
+# a lock is no link, whose target would be emptied, and no pipe, which would block
+_PLAIN = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+_MOST_BYTES = 65536  # of what a lock says of its owner
 _SECONDS_BETWEEN_BEATS = 10.0
 _SECONDS_BETWEEN_TRIES = 0.1
 _SECONDS_TO_PREPARE = 600.0  # after which a command does not wait any longer until another has prepared a store
@@ -143,7 +148,7 @@ def _is_locked(file: Path) -> bool:
     if fcntl is None:
         return False
     try:
-        handle = os.open(file, os.O_RDONLY)
+        handle = os.open(file, os.O_RDONLY | _PLAIN)
     except OSError:
         return False
     try:
@@ -166,7 +171,7 @@ def _take(path: Path, stem: str, stack: contextlib.ExitStack) -> None:
     except OSError as error:
         above = next((p for p in path.absolute().parents if os.path.isfile(p)), None)
         why = f"{above} is a file, not a folder" if above else error.strerror
-        raise InputError(f"{path}: nothing can be created here: {why}") from None
+        raise kind_of(error)(f"{path}: nothing can be created here: {why}") from None
     if fcntl is None or not _lock_file(path, beside / f"{stem}.lock", stack):
         _own(path, beside / f"{stem}.owner", stack)
 
@@ -177,12 +182,14 @@ def _lock_file(path: Path, file: Path, stack: contextlib.ExitStack) -> bool:
     whole = file.name == f"{_stem(path, None)}.lock"
     while True:
         try:
-            handle = os.open(file, os.O_RDWR | os.O_CREAT, 0o666)
+            handle = os.open(file, os.O_RDWR | os.O_CREAT | _PLAIN, 0o666)
         except OSError as error:
+            if error.errno == errno.ELOOP:
+                raise _no_lock(file) from None
             if not whole:
-                raise InputError(f"{file}: a lock cannot be created here: {error.strerror}") from None
+                raise kind_of(error)(f"{file}: a lock cannot be created here: {error.strerror}") from None
             if not os.path.isdir(path):
-                raise InputError(f"{path}: nothing can be created here: {error.strerror}") from None
+                raise kind_of(error)(f"{path}: nothing can be created here: {error.strerror}") from None
             # its parent folder is not writable, so the store cannot be replaced: lock the store's own folder
             handle = os.open(path, os.O_RDONLY)
         with contextlib.ExitStack() as undo:
@@ -196,6 +203,8 @@ def _lock_file(path: Path, file: Path, stack: contextlib.ExitStack) -> bool:
                     file.unlink()
                 return False
             status = os.fstat(handle)
+            if not (stat.S_ISDIR(status.st_mode) or stat.S_ISREG(status.st_mode)):
+                raise _no_lock(file)
             with contextlib.suppress(FileNotFoundError):
                 named = os.stat(path if stat.S_ISDIR(status.st_mode) else file)
                 if (named.st_dev, named.st_ino) == (status.st_dev, status.st_ino):
@@ -211,6 +220,11 @@ def _lock_file(path: Path, file: Path, stack: contextlib.ExitStack) -> bool:
             # the file was removed by its owner between our opening and our locking it: try again
 
 
+def _no_lock(file: Path) -> InputError:
+    """Return the error for a link or a pipe that has the name of a lock."""
+    return InputError(f"{file}: has the name of a lock, but is a link or a pipe; remove it")
+
+
 def _own(path: Path, file: Path, stack: contextlib.ExitStack) -> None:
     """Make an owner's file and keep its heart-beat going until the stack ends, which removes the file."""
     owner = this_process() | {"token": uuid.uuid4().hex}
@@ -224,7 +238,7 @@ def _own(path: Path, file: Path, stack: contextlib.ExitStack) -> None:
             _remove_owner(file, other)
             continue
         except OSError as error:
-            raise InputError(
+            raise kind_of(error)(
                 f"{path}: the file system has no locks, and {file} cannot be made in their place "
                 f"({error.strerror}); choose an --out on another file system"
             ) from None
@@ -246,8 +260,10 @@ def _own(path: Path, file: Path, stack: contextlib.ExitStack) -> None:
 def _read_owner(file: Path) -> dict[str, Any]:
     """Return the content of an owner's file; empty if it cannot be read."""
     try:
-        owner = json.loads(file.read_text())
-    except (OSError, ValueError):
+        handle = os.open(file, os.O_RDONLY | _PLAIN)
+        with os.fdopen(handle, "rb") as content:
+            owner = json.loads(content.read(_MOST_BYTES))
+    except (OSError, ValueError, RecursionError):
         return {}
     return owner if isinstance(owner, dict) else {}
 

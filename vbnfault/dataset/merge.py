@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from .. import store as store_module
 from ..core.errors import InputError, VbnfaultError, shown
 from ..core.interrupts import Stopped, check, exit_code, finishing, interruptible
+from ..core.path_checks import real
 from ..store import Location, SampleDigests, Store, StoreSpec, Url, located, spans
 from . import card, versions
 from .errors import Interrupted
@@ -141,7 +142,7 @@ def _same(path: Location, other: Location) -> bool:
     """Return whether two locations are the same folder or URL."""
     if isinstance(path, Url) or isinstance(other, Url):
         return path == other
-    return path.resolve() == other.resolve()
+    return real(path) == real(other)
 
 
 @dataclass

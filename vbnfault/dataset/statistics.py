@@ -5,7 +5,6 @@ Only scalars are read, a shard at a time, so a store of any size fits in memory.
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from collections import Counter
@@ -37,7 +36,7 @@ _RANGED = (
     "noise_fraction_p99",
 )
 _READ = ("injected", "split", "stratum", "site", "parameters", *_RANGED)
-_SHARDS_AT_ONCE = 64
+_SHARDS_AT_ONCE = 16
 _MOST_WORDS = 12  # different texts of a parameter that are counted
 
 
@@ -284,7 +283,7 @@ def statistics(path: str | os.PathLike[str] | Store) -> Statistics:
         for of, chosen in samples_of.items():
             sites.setdefault(of, set()).update(columns["site"][chosen].tolist())
         for sample, text in zip(samples, columns["parameters"].tolist(), strict=True):
-            for fault, drawn in _drawn(store, sample, text).items():
+            for fault, drawn in store.table(sample, "parameters", text).items():
                 _add_parameters(parameters.setdefault(fault, {}), drawn)
         for values in parameters.values():
             for parameter in values.values():
@@ -309,20 +308,6 @@ def statistics(path: str | os.PathLike[str] | Store) -> Statistics:
         parameters={fault: values for fault, values in parameters.items() if values},
         bounds=_bounds(store),
     )
-
-
-def _drawn(store: Store, sample: int, text: str) -> dict[str, Any]:
-    """Return the drawn parameters of a sample by fault. Raises VbnfaultError if the text is no table in JSON."""
-    try:
-        table = json.loads(text or "{}")
-    except (ValueError, RecursionError):
-        table = None
-    if not isinstance(table, dict):
-        raise VbnfaultError(
-            f"{store.path}: sample {sample}: its parameters are damaged, they are no table in JSON; "
-            "the build command repairs them"
-        )
-    return table
 
 
 def _bounds(store: Store) -> dict[str, dict[str, tuple[float, float]]]:

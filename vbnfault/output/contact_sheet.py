@@ -10,8 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.errors import InputError, VbnfaultError
+from ..core.errors import InputError
 from ..core.images import write_png
+from ..core.whole_files import unwritable
 from ..store import STRATA, Store, open_store
 
 U8 = NDArray[np.uint8]
@@ -239,12 +240,10 @@ def _text_width(text: str, scale: float) -> int:
 
 
 def _write_png(path: Path, rgb: U8) -> None:
-    """Write an RGB image; a path that cannot be used raises InputError, any other failure VbnfaultError."""
+    """Write an RGB image. Raises InputError or VbnfaultError, see `unwritable`."""
     if path.suffix.lower() != ".png":
         raise InputError(f"{path}: the sheet is a PNG, so its name must end in .png")
     try:
         write_png(path, rgb)
-    except (FileNotFoundError, NotADirectoryError, PermissionError) as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror}") from error
     except OSError as error:
-        raise VbnfaultError(f"{path}: cannot be written: {error.strerror}") from error
+        raise unwritable(path, error) from error

@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import isotonic_regression
 
+from ..core.path_checks import real
+from ..core.whole_files import replacing
 from ..lens import Prescription, open_f_number, paraxial_properties
 from ..lens.rays import real_pupil_diameter_mm, trace
 from .json_files import write_json
@@ -40,7 +42,8 @@ def write_table(lens: Prescription, path: Path) -> None:
 
 def draw(lens: Prescription, path: Path, *, half_field_deg: float = 20.0) -> None:
     """Write `layout` to an image file."""
-    layout(lens, half_field_deg=half_field_deg).savefig(path, bbox_inches="tight")
+    with replacing(real(path)) as temporary:
+        layout(lens, half_field_deg=half_field_deg).savefig(temporary, bbox_inches="tight", format="png")
 
 
 def layout(lens: Prescription, *, half_field_deg: float = 20.0) -> Figure:

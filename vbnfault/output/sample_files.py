@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.errors import InputError
 from ..core.images import write_exr, write_png
 from ..core.quantities import Sample, soft_kind
+from ..core.whole_files import own, unwritable
 from ..pipeline import masks
 from ..pipeline.labels import strength
 from ..pipeline.record import to_sample
@@ -47,28 +47,27 @@ def write_frame(frame: Frame, folder: Path) -> list[Path]:
     }
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        files = [_write_exr(frame, strengths, folder / "sample.exr")]
+        files = [_write_exr(frame, strengths, own(folder / "sample.exr"))]
         for name, values in strengths.items():
             white = 255 if soft_kind(name).units == "1" else 1
-            files.append(
-                write_png(folder / f"{name}.png", np.clip(np.rint(values * white), 0, 255).astype(np.uint8))
-            )
+            shown = np.clip(np.rint(values * white), 0, 255).astype(np.uint8)
+            files.append(write_png(own(folder / f"{name}.png"), shown))
         for name, layer in sample.layers.items():
             if layer.ndim == 3 and layer.shape[-1] == 4:
-                files.append(write_png(folder / f"{name}.png", layer[..., :3]))
-                files.append(write_png(folder / f"{name}_intensity.png", layer[..., 3]))
+                files.append(write_png(own(folder / f"{name}.png"), layer[..., :3]))
+                files.append(write_png(own(folder / f"{name}_intensity.png"), layer[..., 3]))
         for layer_name, prefix in (("mask", "mask_"), ("mask_effect", "mask_effect_")):
             for fault, mask in zip(frame.spec.faults, sample.layers.get(layer_name, ()), strict=False):
-                files.append(write_png(folder / f"{prefix}{fault}.png", mask.astype(np.uint8) * 255))
+                files.append(write_png(own(folder / f"{prefix}{fault}.png"), mask.astype(np.uint8) * 255))
         union = sample.layers["mask_any"].astype(np.uint8) * 255
-        files.append(write_png(folder / "mask_any.png", union))
+        files.append(write_png(own(folder / "mask_any.png"), union))
         for name in frame.drawn:
-            files.append(write_png(folder / f"annotated_{name}.png", annotated(frame, name)))
+            files.append(write_png(own(folder / f"annotated_{name}.png"), annotated(frame, name)))
         path = folder / "parameters.json"
-        write_json(path, _scalars(sample))
+        write_json(own(path), _scalars(sample))
         return [*files, path]
     except OSError as error:
-        raise InputError(f"{error.filename or folder}: cannot be written: {error.strerror}") from None
+        raise unwritable(folder, error) from None
 
 
 def annotated(frame: Frame, fault: str) -> NDArray[np.uint8]:

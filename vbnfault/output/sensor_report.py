@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ..camera.characterise import Characterisation, Result, Settings, VirtualCamera, characterise, pictures
 from ..core.errors import InputError
+from ..core.whole_files import own, replacing
 from ..detector.chain import Device
 from ..detector.sensor import load_sensor
 from .json_files import write_json
@@ -122,7 +123,7 @@ class SensorReport:
             "wavelength_nm": self.request.wavelength_nm,
             "channels": [channel.to_dict() for channel in self.channels.values()],
         }
-        write_json(paths[0], table, indent=1)
+        write_json(own(paths[0]), table, indent=1)
         draw(self.channels, self.title, paths[1])
         return paths
 
@@ -175,7 +176,8 @@ def draw(channels: Mapping[str, Characterisation], title: str, path: Path) -> No
     low, high = axes[1, 0].get_ylim()
     axes[1, 0].set_ylim(low, high * (high / low) ** 0.2)  # room for the legend, as the spectra fill the panel
     axes[1, 0].legend(fontsize=7, loc="upper center", ncols=len(channels))
-    figure.savefig(path, dpi=100)
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=100, format="png")
 
 
 def _draw_signals(panels: Any, name: str, channel: Characterisation, colour: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import keyword
+import os
 import re
 from collections.abc import Collection
 from pathlib import Path
@@ -10,7 +11,7 @@ from pathlib import Path
 from .. import faults, reflectance
 from ..core.errors import InputError, shown
 from ..core.path_checks import check_folder
-from ..core.whole_files import write_whole
+from ..core.whole_files import own, unwritable, write_whole
 from ..detector import effects
 
 _FOLDER = Path(__file__).parent / "templates"
@@ -76,12 +77,12 @@ def write_template(kind: str, name: str, folder: Path, *, overwrite: bool = Fals
     text = source.read_text(encoding="utf-8").replace(f"my_{kind}", name)
     class_name = "".join(word.capitalize() for word in name.split("_"))
     path = folder / f"{name}{ending}"
-    if path.exists() and not overwrite:
+    if os.path.lexists(path) and not overwrite:
         raise InputError(f"{path}: exists already; --overwrite replaces it, or choose another name")
     check_folder(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        write_whole(path, text.replace(f"My{kind.capitalize()}", class_name))
+        write_whole(own(path), text.replace(f"My{kind.capitalize()}", class_name))
     except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror}") from None
+        raise unwritable(path, error) from None
     return path

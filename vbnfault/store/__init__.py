@@ -39,9 +39,9 @@ from .codec import Encoded, SharedChunks, encode, mask_union
 from .counts import FaultCounts
 from .files import Location, files_of, located
 from .formats import FORMAT_VERSION
-from .group import check_free, create, is_store, open_store, write_samples
+from .group import MOST_DOCUMENT_BYTES, check_free, create, is_store, open_store, write_samples
 from .labelled import open_dataset
-from .layout import is_sealed, sealed
+from .layout import drawn_table, is_sealed, sealed
 from .metadata import append_samples, recover
 from .migration import check_target, migrate, migrate_copy
 from .opened import Store
@@ -53,6 +53,7 @@ __all__ = [
     "FORMAT_VERSION",
     "LAYERS",
     "MASK_RULES",
+    "MOST_DOCUMENT_BYTES",
     "OWN",
     "REQUIRED_LAYERS",
     "SCALARS",
@@ -83,6 +84,7 @@ __all__ = [
     "count_faults",
     "create",
     "digest",
+    "drawn_table",
     "encode",
     "examine",
     "examine_shard",

@@ -49,6 +49,7 @@ class Array:
     bits: bool = False  # whether `names` are of bits
     codec: str = ZSTD
     ratio: float = 1.0
+    most_bytes: int = 0  # of a text, as UTF-8
 
     @property
     def dims(self) -> tuple[str, ...]:
@@ -471,6 +472,7 @@ SCALARS: dict[str, Array] = {
         "1",
         "split of the dataset, constant per site",
         "train, val or test; samples of one site or one view are never in two splits.",
+        most_bytes=64,
     ),
     "parameters": Array(
         "sample",
@@ -478,6 +480,7 @@ SCALARS: dict[str, Array] = {
         "1",
         "drawn parameters of every injected fault, JSON",
         "By class, the model and the drawn values from which the fault can be injected again.",
+        most_bytes=2 << 20,
     ),
     "proposal": Array(
         "sample",
@@ -485,5 +488,6 @@ SCALARS: dict[str, Array] = {
         "1",
         "proposed variables before redraws, JSON",
         "What the plan drew for the sample before any rendering: its view and its commanded faults.",
+        most_bytes=1 << 18,
     ),
 }

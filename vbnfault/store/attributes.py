@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import fields
 from typing import Any
@@ -52,8 +53,20 @@ _LENGTHS = {
 }
 # The texts in these fields of `StoreSpec` must be among those listed.
 _CHOICES = {"attitude_references": ("sun", "nadir", "centre")}
-# Fields of `StoreSpec` that count something, and the least that they may be.
-_LEAST = {"height": 1, "width": 1, "shard_samples": 0}
+# Fields of `StoreSpec` that count something, and the least and the most that they may be; a scene has fewer pixels.
+_RANGES = {"height": (1, 32768), "width": (1, 32768), "shard_samples": (0, 2**31)}
+_MOST_RENDERED = 65536
+# The most samples of a store, and the most flags that they have together, one for each sample and class.
+MOST_SAMPLES = 10_000_000
+_MOST_FLAGS = 2**28
+# Fields of `StoreSpec` that become names of arrays, of folders and of files of an export.
+_NAMES = ("faults", "soft_layers")
+# Fields and root attributes that are shown as texts, and of those the ones that may have several lines.
+_TEXTS = ("mask_kinds", "mask_rules", "site_names", "lens_names", "detector_names", "sample_names")
+_TEXTS_OF_ROOT = ("title", "licence", "description", "citation", "intensity_channel", "scene_hash", "command")
+_OF_LINES = ("description", "citation", "mask_rules", "command")
+_NAME = re.compile("[a-z][a-z0-9_]{0,127}")
+_MOST_CLASSES, _LONGEST_TEXT = 1024, 65536
 # Fields of `StoreSpec` with one element for each class, or none.
 _OF_CLASSES = ("mask_kinds", "mask_rules", "soft_layers")
 
@@ -79,9 +92,44 @@ def check_attributes(attributes: Mapping[str, Any]) -> None:
 def number_of_samples(attributes: Mapping[str, Any]) -> int:
     """Return how many samples the root attributes of a store count. Raises InputError if that is no such number."""
     samples = attributes["samples"]
-    if type(samples) is not int or samples < 0:
-        raise InputError(f"samples = {shown(samples)}: must be a whole number of at least 0")
+    if type(samples) is not int or not 0 <= samples <= MOST_SAMPLES:
+        raise InputError(f"samples = {shown(samples)}: must be a whole number from 0 to {MOST_SAMPLES}")
     return samples
+
+
+def check_names(spec: Any, samples: int) -> None:
+    """Raise InputError unless the names and texts of a `StoreSpec` can stand in paths, pages and files of exports.
+
+    What names an array, a folder or a file is lower-case letters, digits and underscores. Every other text can be
+    printed.
+    """
+    for field in _NAMES:
+        for name in getattr(spec, field):
+            if not _NAME.fullmatch(name) and (name or field == "faults"):
+                raise InputError(
+                    f"store.{field} = {shown(name)}: must be at most 128 lower-case letters, digits and underscores, "
+                    "beginning with a letter"
+                )
+    for field in ("faults", "layers"):
+        values = getattr(spec, field)
+        if len(values) > _MOST_CLASSES or len({*values}) < len(values):
+            raise InputError(f"store.{field}: must be at most {_MOST_CLASSES} different names")
+    if samples * len(spec.faults) > _MOST_FLAGS:
+        raise InputError(
+            f"samples = {samples}: must be at most {_MOST_FLAGS // len(spec.faults)} with so many classes"
+        )
+    texts = [(f"store.{field}", text) for field in _TEXTS for text in getattr(spec, field)]
+    for key in _TEXTS_OF_ROOT:
+        text = spec.attributes.get(key)
+        if text is not None and not isinstance(text, str):
+            raise InputError(f"{key} = {shown(text)}: must be a text")
+        texts.append((key, text or ""))
+    for key, text in texts:
+        lines = text.replace("\n", "").replace("\t", "") if key.rpartition(".")[2] in _OF_LINES else text
+        if not lines.isprintable() or len(text) > _LONGEST_TEXT:
+            raise InputError(
+                f"{key} = {shown(text)}: must be a text of printable characters, at most {_LONGEST_TEXT}"
+            )
 
 
 def _values_at(table: Mapping[str, Any], path: list[str], above: str = "") -> Iterator[tuple[str, Any]]:
@@ -125,8 +173,11 @@ def check_plain_spec(plain: Any, spec: type) -> None:
         value, kind = plain[field.name], str(field.type)
         if (value is not None or not kind.endswith("| None")) and not _is_of(kind, value):
             raise InputError(f"store.{field.name} = {shown(value)}: must be {_in_words(kind)}")
-        if field.name in _LEAST and value < _LEAST[field.name]:
-            raise InputError(f"store.{field.name} = {shown(value)}: must be at least {_LEAST[field.name]}")
+        least, most = _RANGES.get(field.name, (None, None))
+        if least is not None and not least <= value <= most:
+            raise InputError(f"store.{field.name} = {shown(value)}: must be from {least} to {most}")
+        if field.name == "rendered_shape" and not all(0 < n <= _MOST_RENDERED for n in value):
+            raise InputError(f"store.rendered_shape = {shown(value)}: must be from 1 to {_MOST_RENDERED}")
         choices = _CHOICES.get(field.name)
         if choices is not None and not {*value} <= {*choices}:
             raise InputError(f"store.{field.name} = {shown(value)}: elements must be among {', '.join(choices)}")

@@ -24,6 +24,7 @@ from functools import cached_property, partial
 from typing import Any
 
 from ..core.errors import InputError, VbnfaultError, shown
+from .disk import Misplaced
 
 SCHEMES = ("s3", "s3a", "gs", "az", "azure", "adl", "abfs", "abfss")
 OWN = ".vbnfault"  # what is below this name is no part of the data
@@ -156,24 +157,28 @@ class Bucket:
 
     # --- reading --------------------------------------------------------------------------------------------
 
-    def read(self, name: str) -> bytes:
-        """Return the content of an object."""
+    def read(self, name: str, most_bytes: int) -> bytes:
+        """Return the content of an object of at most so many bytes. Raises Misplaced for a larger one."""
         import obstore
 
         with self._reading(name):
-            return bytes(obstore.get(self._objects, name).bytes())
+            found = obstore.get(self._objects, name)
+            if (size := found.meta["size"]) <= most_bytes:
+                return bytes(found.bytes())
+        why = f"it has {size} bytes, where at most {most_bytes} are possible"
+        raise Misplaced(errno.EFBIG, why, f"{self.path}/{name}")
 
-    def read_each(self, names: Sequence[str]) -> Iterator[bytes | OSError]:
+    def read_each(self, files: Sequence[tuple[str, int]]) -> Iterator[bytes | OSError]:
         """Yield the content of each object, several of which are read at once, or why it cannot be read."""
 
-        def content(name: str) -> bytes | OSError:
+        def content(file: tuple[str, int]) -> bytes | OSError:
             try:
-                return self.read(name)
+                return self.read(*file)
             except OSError as error:
                 return error
 
         with ThreadPoolExecutor(_READS_AT_ONCE) as pool:
-            yield from pool.map(content, names)
+            yield from pool.map(content, files)
 
     def read_parts(
         self, name: str, tail: int, choose: Callable[[bytes], Sequence[tuple[int, int]]]
@@ -227,9 +232,6 @@ class Bucket:
         with self._reading(folder):
             entries = obstore.list_with_delimiter(self._objects, folder)["objects"]
         return {entry["path"].rsplit("/", 1)[-1]: entry["last_modified"] for entry in entries}
-
-    def expect_file(self, name: str) -> None:
-        """Do nothing: a name belongs to an object or to none."""
 
     def zarr(self) -> Any:
         """Return the store object that zarr and xarray open; they read ranges of objects by it."""
@@ -287,9 +289,9 @@ class Bucket:
             for future in running:
                 future.result()
 
-    def copied(self, name: str, *, link: bool) -> bytes:
+    def copied(self, name: str, most_bytes: int, *, link: bool) -> bytes:
         """Return the content of an object, which `write` of another store takes."""
-        return self.read(name)
+        return self.read(name, most_bytes)
 
     # --- the store as a whole -------------------------------------------------------------------------------
 

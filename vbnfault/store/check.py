@@ -25,9 +25,10 @@ from .compressors import compressor
 from .counts import FaultCounts
 from .formats import DIGEST_VERSION
 from .group import open_store
+from .layout import drawn_table
 from .metadata import metadata_problems, short
 from .opened import Store
-from .schema import VOLATILE_ATTRIBUTES, StoreSpec
+from .schema import MAX_HELD_BYTES, VOLATILE_ATTRIBUTES, StoreSpec
 
 
 class Problem(NamedTuple):
@@ -115,7 +116,8 @@ def examine_shard(store: Store, number: int, *, labels: bool = False) -> ShardCh
         hashes = {name: hashlib.sha256(data).digest() for name, data in layers.items()}
         return _SampleCheck([], sample_digest(hashes, scalars[i]), sentences)
 
-    with ThreadPoolExecutor(threads()) as pool:
+    sample_bytes = sum(map(store.spec.layer_bytes, store.spec.pixel_layers))
+    with ThreadPoolExecutor(min(threads(), 1 + MAX_HELD_BYTES // sample_bytes)) as pool:
         checks = dict(zip(finished, pool.map(examine_sample, finished), strict=True))
     by_layer = sorted(
         (entry for check in checks.values() for entry in check.problems),
@@ -201,7 +203,9 @@ def _layers(
             why = f"has no chunk in {file}"
         else:
             try:
-                layers[name] = compressor(store.spec.codecs[name]).decode(chunks[name][i])
+                layers[name] = compressor(store.spec.codecs[name]).decode(
+                    chunks[name][i], store.spec.layer_bytes(name)
+                )
                 if google_crc32c.value(layers[name]) != crcs[k]:
                     why = f"in {file} does not match its stored crc32c"
             except ValueError:
@@ -374,7 +378,11 @@ def _check_labels(
 ) -> Iterator[str]:
     """Yield one sentence for each contradiction between a sample's labels and its pixels or other labels."""
     injected = scalars["injected"]
-    parameters = json.loads(str(scalars["parameters"]) or "{}")
+    try:
+        parameters = drawn_table(scalars["parameters"])
+    except ValueError:
+        yield f"sample {i}: its parameters are no table in JSON"
+        return
     for fault, is_in in zip(spec.faults, injected.tolist(), strict=True):
         drawn = parameters.get(fault)
         listed = drawn is not None and not (isinstance(drawn, dict) and drawn.get("injected") is False)
@@ -480,7 +488,7 @@ def _parsed(text: str) -> Any:
     """Return JSON text as data, so that the order of keys does not count; return other text as it is."""
     try:
         return json.loads(text)
-    except ValueError:
+    except (ValueError, RecursionError):
         return text
 
 

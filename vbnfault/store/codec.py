@@ -199,7 +199,10 @@ def _scalar(spec: StoreSpec, index: int, name: str, value: Any) -> Any:
     """Return a scalar in the dtype of the schema; raise ValueError if its shape or value does not fit."""
     row = SCALARS[name]
     if row.is_text:
-        return value if isinstance(value, str) else json.dumps(value, sort_keys=True)
+        text = value if isinstance(value, str) else json.dumps(value, sort_keys=True)
+        if len(text.encode()) > row.most_bytes:
+            raise ValueError(f"sample {index}: {name} is longer than {row.most_bytes} bytes")
+        return text
     array = np.asarray(value)
     shape = spec.shape(row)
     if array.shape != shape:

@@ -23,26 +23,28 @@ from pathlib import Path
 from typing import TypeVar
 
 from ..core.errors import InputError, VbnfaultError
+from ..core.whole_files import kind_of
 
 PARTIAL = ".partial"
 # Number of parallel flushes. Measured on ext4, the 42 files and 90 folders of a shard take 45-600 ms one after the
 # other, and 15-35 ms eight at a time.
 _FLUSHES = 8
+_MOST_COPIED_BYTES = 1 << 32  # all layers of a shard have less
 T = TypeVar("T")
 _UNSUPPORTED = (errno.EINVAL, errno.ENOTSUP)  # errors of file systems that cannot flush a folder
 
 
 class Misplaced(OSError):
-    """Report that the name of a file belongs to something else: a folder, a link, a pipe."""
+    """Report that the name of a file belongs to something else: a folder, a link, a pipe, a file too large."""
 
 
 @contextlib.contextmanager
 def explained(path: Path, doing: str) -> Iterator[None]:
-    """Turn an OSError in a `with` block into a VbnfaultError with one sentence for the user."""
+    """Turn an OSError in a `with` block into a VbnfaultError or InputError with one sentence for the user."""
     try:
         yield
     except OSError as error:
-        raise VbnfaultError(
+        raise kind_of(error)(
             f"{path}: {error.strerror or error} while {doing}; finished samples stay, "
             f"and the same command resumes once that is mended"
         ) from error
@@ -58,13 +60,13 @@ def denied(error: PermissionError, path: str | Path) -> InputError:
     )
 
 
-def read(path: str | Path) -> bytes:
-    """Return the content of a regular file.
+def read(path: str | Path, most_bytes: int) -> bytes:
+    """Return the content of a regular file of at most so many bytes.
 
     Raises
     ------
     Misplaced
-        The path is a folder, a link or a pipe.
+        The path is a folder, a link or a pipe, or the file is larger.
     OSError
         The file cannot be read.
     InputError
@@ -72,10 +74,12 @@ def read(path: str | Path) -> bytes:
     """
     file, size = _opened(path)
     try:
+        if size > most_bytes:
+            raise Misplaced(errno.EFBIG, f"it has {size} bytes, where at most {most_bytes} are possible", str(path))
         # os.read reserves what it may read; one byte more than the file has tells that nothing follows
         parts = [os.read(file, min(size + 1, 1 << 30))]
         if len(parts[0]) != size:
-            while part := os.read(file, 1 << 30):
+            while (part := os.read(file, 1 << 20)) and sum(map(len, parts)) <= most_bytes:
                 parts.append(part)
     finally:
         os.close(file)
@@ -83,7 +87,7 @@ def read(path: str | Path) -> bytes:
 
 
 def read_parts(
-    path: Path, tail: int, choose: Callable[[bytes], Sequence[tuple[int, int]]]
+    path: str | Path, tail: int, choose: Callable[[bytes], Sequence[tuple[int, int]]]
 ) -> list[tuple[int, bytes]]:
     """Return parts of a regular file, each with its start in the file; a part may be shorter at the file's end.
 
@@ -135,16 +139,6 @@ def _opened(path: str | Path) -> tuple[int, int]:
     return file, status.st_size
 
 
-def expect_file(path: Path) -> None:
-    """Raise Misplaced if the path is a folder, a link, a pipe or a device, which other libraries would read."""
-    try:
-        status = os.lstat(path)
-    except OSError:  # missing: the reader says so
-        return
-    if not stat.S_ISREG(status.st_mode):
-        raise Misplaced(errno.EISDIR, "it is not a regular file", str(path))
-
-
 def names(folder: Path) -> list[str]:
     """Return the names in a folder; an empty list if there is no such folder.
 
@@ -185,7 +179,7 @@ def write(root: Path, files: Iterable[tuple[str, bytes | Path]]) -> None:
     try:
         for name, content in files:
             target = root / name
-            _make_folders(root, target.parent, changed)
+            make_folders(root, target.parent, changed)
             changed[target.parent] = None
             partial = target.with_name(f"{target.name}.{uuid.uuid4().hex}{PARTIAL}")
             written.append((partial, target))
@@ -195,7 +189,7 @@ def write(root: Path, files: Iterable[tuple[str, bytes | Path]]) -> None:
                     linked.add(partial)
                     continue
                 except OSError:  # on another device, or a file system without links
-                    content = read(content)
+                    content = read(content, _MOST_COPIED_BYTES)
             flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
             opened.append(os.open(partial, flags, 0o666))
             _write_all(opened[-1], content)
@@ -257,23 +251,26 @@ def _write_all(file: int, content: bytes) -> None:
         rest = rest[count:]
 
 
-def _make_folders(root: Path, folder: Path, changed: dict[Path, None]) -> None:
-    """Make a folder and its missing parents below `root`; add the folders whose entries changed to `changed`."""
+def make_folders(root: Path, folder: Path, changed: dict[Path, None]) -> None:
+    """Make a folder and its missing parents below `root`; add the folders whose entries changed to `changed`.
+
+    A file or a link that has the name of one of them is removed.
+    """
     if folder == root or folder in changed:
         return
+    make_folders(root, folder.parent, changed)
     try:
-        is_folder = stat.S_ISDIR(os.stat(folder).st_mode)  # follows a link
-    except OSError:  # it does not exist, or one of its parents is a file
+        is_folder = stat.S_ISDIR(os.lstat(folder).st_mode)
+    except OSError:  # it does not exist
         is_folder = False
     if is_folder:
         return
-    _make_folders(root, folder.parent, changed)
     try:
         with contextlib.suppress(FileNotFoundError):
             os.unlink(folder)
         os.mkdir(folder)
     except OSError:
-        if not folder.is_dir():  # otherwise another worker has just made it
+        if not folder.is_dir() or folder.is_symlink():  # otherwise another worker has just made it
             raise
     changed[folder.parent] = changed[folder] = None
 
@@ -285,7 +282,7 @@ def _make_way(target: Path) -> None:
     except FileNotFoundError:
         return
     if in_the_way:
-        remove_tree(target)
+        shutil.rmtree(target)
 
 
 def _flush(file: int) -> None:
@@ -324,18 +321,6 @@ def rename(source: Path, target: Path) -> None:
     flush_folder(target.parent)
 
 
-def remove_tree(folder: Path) -> None:
-    """Remove a folder and its contents; links in it are removed, their targets are not."""
-    with os.scandir(folder) as entries:
-        inside = [(entry.path, entry.is_dir(follow_symlinks=False)) for entry in entries]
-    for path, is_folder in inside:
-        if is_folder:
-            remove_tree(Path(path))
-        else:
-            os.unlink(path)
-    os.rmdir(folder)
-
-
 def remove_partials(folder: str | Path) -> None:
     """Remove the temporary files that a killed process left in a folder or below it."""
     folders = [os.fspath(folder)]  # text, because a large store has half a million folders
@@ -359,27 +344,47 @@ class Disk:
         self.path = path
         self._folder = str(path)
 
-    def read(self, name: str) -> bytes:
+    def read(self, name: str, most_bytes: int) -> bytes:
         """Return the content of a file, see `read`."""
-        return read(f"{self._folder}/{name}")  # a large store has many files, and paths take longer than this
+        return read(self._inside(name), most_bytes)
 
-    def read_each(self, names: Sequence[str]) -> Iterator[bytes | OSError]:
-        """Yield the content of each file, or why it cannot be read."""
-        for name in names:
+    def read_each(self, files: Sequence[tuple[str, int]]) -> Iterator[bytes | OSError]:
+        """Yield the content of each file, given by its name and its most bytes, or why it cannot be read."""
+        for name, most_bytes in files:
             try:
-                yield self.read(name)
+                yield self.read(name, most_bytes)
             except OSError as error:
                 yield error
+
+    def _inside(self, name: str) -> str:
+        """Return the path of a file or folder as text: a large store has many, and paths take longer.
+
+        Raises Misplaced if a folder above it, within the store, is a link: what it names is no part of the store.
+        """
+        path = f"{self._folder}/{name}"
+        end = path.find("/", len(self._folder) + 1)
+        while end > 0:
+            try:
+                is_link = stat.S_ISLNK(os.lstat(path[:end]).st_mode)
+            except PermissionError as error:
+                raise denied(error, path) from error
+            if is_link:
+                raise Misplaced(errno.ELOOP, "a folder above it is a link", path)
+            end = path.find("/", end + 1)
+        return path
 
     def read_parts(
         self, name: str, tail: int, choose: Callable[[bytes], Sequence[tuple[int, int]]]
     ) -> list[tuple[int, bytes]]:
         """Return parts of a file, see `read_parts`."""
-        return read_parts(self.path / name, tail, choose)
+        return read_parts(self._inside(name), tail, choose)
 
     def names(self, folder: str) -> list[str]:
-        """Return the names in a folder."""
-        return names(self.path / folder)
+        """Return the names in a folder; none where it, or a folder above it, is a link."""
+        try:
+            return names(Path(self._inside(f"{folder}/").rstrip("/")))
+        except OSError:
+            return []
 
     def exists(self, name: str) -> bool:
         """Return whether something has this name, also a broken link."""
@@ -392,10 +397,6 @@ class Disk:
         except OSError:
             return None
         return status.st_ino, status.st_mtime_ns
-
-    def expect_file(self, name: str) -> None:
-        """Raise Misplaced if the name belongs to something else than a file."""
-        expect_file(self.path / name)
 
     def zarr(self) -> Path:
         """Return what zarr and xarray open."""
@@ -410,15 +411,24 @@ class Disk:
         write(self.path, files)
 
     def remove(self, files: Iterable[str]) -> None:
-        """Remove files durably."""
-        remove(self.path, files)
+        """Remove files durably; what lies behind a link to a folder stays."""
 
-    def copied(self, name: str, *, link: bool) -> bytes | Path:
+        def within() -> Iterator[str]:
+            for name in files:
+                with contextlib.suppress(OSError):
+                    self._inside(name)
+                    yield name
+
+        remove(self.path, within())
+
+    def copied(self, name: str, most_bytes: int, *, link: bool) -> bytes | Path:
         """Return a file as `write` of another store takes it."""
-        return self.path / name if link else self.read(name)
+        return Path(self._inside(name)) if link else self.read(name, most_bytes)
 
     def why_occupied(self, own: Iterable[str]) -> str:
         """Return why no store can be created here, as a clause; what a killed creation has left is beside it."""
+        if self.path.is_symlink():
+            return "is a link, in whose place nothing is created; name another --out, or what the link names"
         if self.path.exists() and (not self.path.is_dir() or any(self.path.iterdir())):
             return "exists and is no vbnfault store, so it is left alone; choose another --out"
         above = next(p for p in self.path.absolute().parents if p.exists())
@@ -464,7 +474,7 @@ def _replace(hidden: Path, target: Path, *, old: bool) -> None:
             rename(retired, target)
         raise
     with contextlib.suppress(OSError):
-        remove_tree(retired)
+        shutil.rmtree(retired)
 
 
 # --- folders in which a store is created before it has its name --------------------------------------------
@@ -492,7 +502,7 @@ def _hidden_folder(target: Path) -> Iterator[Path]:
         yield folder
     finally:
         with contextlib.suppress(OSError):
-            remove_tree(folder)
+            shutil.rmtree(folder)
         _unlock_folder(lock)
 
 
@@ -505,7 +515,7 @@ def _remove_abandoned(target: Path) -> None:
             lock = _lock_folder(folder, wait=False)
             if lock is not None:
                 with contextlib.suppress(OSError):
-                    remove_tree(folder)
+                    shutil.rmtree(folder)
                 _unlock_folder(lock)
 
 

@@ -47,15 +47,15 @@ class Files(Protocol):
         """Return where the store is."""
         ...
 
-    def read(self, name: str) -> bytes:
-        """Return the content of a file.
+    def read(self, name: str, most_bytes: int) -> bytes:
+        """Return the content of a file of at most so many bytes.
 
         Raises
         ------
         FileNotFoundError
             There is no such file.
         OSError
-            The file is damaged: it cannot be read.
+            The file is damaged: it cannot be read, is larger, or a link stands in its place or above it.
         InputError
             This user may not read it.
         VbnfaultError
@@ -63,8 +63,8 @@ class Files(Protocol):
         """
         ...
 
-    def read_each(self, names: Sequence[str]) -> Iterator[bytes | OSError]:
-        """Yield the content of each file, or the OSError of `read`."""
+    def read_each(self, files: Sequence[tuple[str, int]]) -> Iterator[bytes | OSError]:
+        """Yield the content of each file, given by its name and its most bytes, or the OSError of `read`."""
         ...
 
     def read_parts(
@@ -83,10 +83,6 @@ class Files(Protocol):
 
     def stamp(self, name: str) -> object:
         """Return what changes if a file is replaced; None if there is no file."""
-        ...
-
-    def expect_file(self, name: str) -> None:
-        """Raise Misplaced if the name belongs to something else than a file, which zarr would read."""
         ...
 
     def zarr(self) -> Any:
@@ -108,7 +104,7 @@ class Files(Protocol):
         """Remove files durably; names that do not exist are left out."""
         ...
 
-    def copied(self, name: str, *, link: bool) -> Any:
+    def copied(self, name: str, most_bytes: int, *, link: bool) -> Any:
         """Return a file as `write` of another store takes it. `link`: where possible, no byte is copied."""
         ...
 

@@ -6,10 +6,13 @@ import json
 import os
 import warnings
 from collections.abc import Iterable, Iterator
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from ..core.errors import InputError, VbnfaultError
+from ..core.path_checks import real
 from ..core.quantities import Sample
+from ..core.whole_files import kind_of
 from .bucket import Url
 from .codec import Encoded, encode
 from .files import Files, Location, files_of, located
@@ -46,12 +49,12 @@ def create(path: str | os.PathLike[str] | Url, spec: StoreSpec, samples: int, *,
     old = is_store(target)
     if old and not overwrite:
         raise InputError(f"{target}: exists already; resume it, or give --overwrite to replace it")
-    if not old:
+    if not old or (isinstance(target, Path) and target.is_symlink()):
         check_free(target, spec, samples)
     try:
         files.create(group_files(spec, samples), old=old)
     except OSError as error:
-        raise InputError(f"{target}: no store can be created here: {error.strerror or error}") from error
+        raise kind_of(error)(f"{target}: no store can be created here: {error.strerror or error}") from error
     return open_store(target, "r+")
 
 
@@ -65,7 +68,7 @@ def check_free(path: str | os.PathLike[str] | Url, spec: StoreSpec, samples: int
 
 def _why_within(target: Location) -> str:
     """Return why no store can be created at a path within another one, as a clause; "" if it is not within one."""
-    above = [] if isinstance(target, Url) else [path for path in target.resolve().parents if is_store(path)]
+    above = [] if isinstance(target, Url) else [path for path in real(target).parents if is_store(path)]
     return f"lies in the store {above[0]}, and would be lost with it; choose another --out" if above else ""
 
 
@@ -100,10 +103,19 @@ class Root(NamedTuple):
         return self.damage + self.unfinished
 
 
+# The root of a store whose million samples have names of ten letters takes 22 MB and a million values. A list or a
+# table of JSON takes some 100 bytes of memory, so that values are limited as well.
+MOST_DOCUMENT_BYTES = 1 << 27
+_MOST_VALUES = 4_000_000
+
+
 def read_document(files: Files, name: str) -> dict[str, Any] | None:
-    """Return the JSON object in a file; None if it is missing, unreadable or not a JSON object."""
+    """Return the JSON object in a file; None if it is missing, unreadable, too large or not a JSON object."""
     try:
-        document = json.loads(files.read(name))
+        content = files.read(name, MOST_DOCUMENT_BYTES)
+        if sum(map(content.count, b",[{")) > _MOST_VALUES:
+            return None
+        document = json.loads(content)
     except (OSError, ValueError, RecursionError):
         return None
     return document if isinstance(document, dict) else None

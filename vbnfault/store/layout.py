@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -21,6 +22,7 @@ from numcodecs import VLenUTF8
 from numpy.typing import NDArray
 
 from .arrays import Member
+from .attributes import check_names, number_of_samples
 from .compressors import ZSTD, compressor
 from .schema import StoreSpec
 
@@ -30,6 +32,7 @@ CHECKSUM = "attributes_sha256"
 # root attributes that the store needs for itself; all others are the user's
 OWN_ATTRIBUTES = ("store", "samples", "coordinates", CHECKSUM)
 
+_BRACKETS, _DEEPEST = re.compile(r"[][{}]"), 64
 _LITTLE_ENDIAN = {"name": "bytes", "configuration": {"endian": "little"}}
 
 
@@ -55,7 +58,8 @@ def is_sealed(attributes: Mapping[str, Any]) -> bool:
 
 
 def root_attributes(spec: StoreSpec, samples: int) -> dict[str, Any]:
-    """Return the root attributes of a store of `samples` samples, with their checksum."""
+    """Return the root attributes of a store of `samples` samples, with their checksum. Raises InputError."""
+    check_names(spec, number_of_samples({"samples": samples}))
     return sealed(
         {
             **json.loads(json.dumps(spec.attributes)),
@@ -127,6 +131,23 @@ def group_document(
     return {**document, "node_type": "group"}
 
 
+def drawn_table(text: object) -> dict[str, Any]:
+    """Return the table that the scalar `parameters` or `proposal` of a sample holds as JSON.
+
+    Raises ValueError if it is none, or is nested deeper than what vbnfault writes.
+    """
+    depth, content = 0, str(text or "{}")
+    for bracket in _BRACKETS.finditer(content):
+        depth += 1 if bracket[0] in "[{" else -1
+        if depth > _DEEPEST:
+            raise ValueError("it is nested too deep")
+    # no float holds a whole number of more digits, and no array
+    table = json.loads(content, parse_int=lambda digits: int(digits) if len(digits) < 25 else float(digits))
+    if not isinstance(table, dict):
+        raise ValueError("no table in JSON")
+    return table
+
+
 def coordinate_chunks(member: Member) -> Iterator[tuple[str, NDArray[Any]]]:
     """Yield the file name, relative to the array's folder, and the values of each chunk of a coordinate."""
     if member.values is None or not len(member.values):
@@ -142,12 +163,20 @@ def coordinate_chunks(member: Member) -> Iterator[tuple[str, NDArray[Any]]]:
 
 def encode_values(values: NDArray[Any]) -> bytes:
     """Return numbers or texts (dtype object) as the bytes of a chunk file."""
-    return compressor(ZSTD).encode(VLenUTF8().encode(values) if values.dtype == object else values)
+    return compressor(ZSTD).encode(plain_values(values))
 
 
-def decode_values(data: bytes, dtype: str) -> NDArray[Any]:
-    """Return the values of a chunk file as a flat array. Raises ValueError if the file is damaged."""
-    plain = compressor(ZSTD).decode(data)
+def plain_values(values: NDArray[Any]) -> Any:
+    """Return what the chunk file of values holds compressed."""
+    return VLenUTF8().encode(values) if values.dtype == object else values
+
+
+def decode_values(data: bytes, dtype: str, most_bytes: int) -> NDArray[Any]:
+    """Return the values of a chunk file, of at most so many bytes, as a flat array.
+
+    Raises ValueError if the file is damaged.
+    """
+    plain = compressor(ZSTD).decode(data, most_bytes)
     if dtype != "str":
         return np.frombuffer(plain, dtype=dtype)
     try:

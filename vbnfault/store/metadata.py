@@ -14,6 +14,7 @@ from ..core.errors import InputError
 from . import disk
 from .arrays import Member
 from .bucket import Url
+from .compressors import most_compressed
 from .files import Files
 from .group import open_store, read_document, read_root
 from .layout import (
@@ -25,6 +26,7 @@ from .layout import (
     decode_values,
     encode_values,
     group_document,
+    plain_values,
     sealed,
     to_bytes,
 )
@@ -52,7 +54,7 @@ def metadata_problems(store: Store) -> tuple[list[str], bool]:
         is_coordinate = member.values is not None
         stored = read_document(store.files, f"{name}/{DOCUMENT}")
         if stored is None:
-            problems.append(store.why_closed(name))
+            problems.append(_why_closed(store.files, name))
             hopeless |= not is_coordinate
             continue
         differences = list(_differences(stored, documents[name]))
@@ -69,6 +71,13 @@ def metadata_problems(store: Store) -> tuple[list[str], bool]:
             sound[name] = documents[name]
             problems += [f"array {name}: {clause}" for clause in _misvalued(store.files, name, member)]
     return problems + list(_root_differences(store, sound, documents)), hopeless
+
+
+def _why_closed(files: Files, name: str) -> str:
+    """Return why the document of an array is none, as a clause."""
+    if not files.exists(f"{name}/{DOCUMENT}"):
+        return f"array {name} is missing"
+    return f"array {name} cannot be opened, {name}/{DOCUMENT} is damaged"
 
 
 def _samples_of(document: Mapping[str, Any]) -> int | None:
@@ -100,7 +109,7 @@ def _differ(a: Any, b: Any) -> bool:
 def _misvalued(files: Files, name: str, member: Member) -> Iterator[str]:
     """Yield a clause for each chunk of a coordinate that cannot be decoded or holds wrong values."""
     for chunk, wanted in coordinate_chunks(member):
-        stored = _values_in(files, f"{name}/{chunk}", member.dtype)
+        stored = _values_in(files, f"{name}/{chunk}", member.dtype, wanted)
         if stored is None or stored.shape != wanted.shape:
             yield f"its values in {name}/{chunk} are missing or cannot be decoded"
         elif not np.array_equal(stored, wanted):
@@ -109,10 +118,11 @@ def _misvalued(files: Files, name: str, member: Member) -> Iterator[str]:
             yield f"its value {number} is {short(stored[first])}, not {short(wanted[first])}"
 
 
-def _values_in(files: Files, name: str, dtype: str) -> NDArray[Any] | None:
-    """Return the values in a chunk file; None if it is missing or cannot be decoded."""
+def _values_in(files: Files, name: str, dtype: str, wanted: NDArray[Any]) -> NDArray[Any] | None:
+    """Return the values in a chunk file; None if it is missing, cannot be decoded, or is far larger."""
+    most_bytes = 2 * len(memoryview(plain_values(wanted)).cast("B")) + 1024
     try:
-        return decode_values(files.read(name), dtype)
+        return decode_values(files.read(name, most_compressed(most_bytes)), dtype, most_bytes)
     except (OSError, ValueError):
         return None
 
@@ -201,7 +211,7 @@ def _outdated_arrays(
     """Yield the name and right content of each array document and coordinate chunk that is wrong."""
     for name, member in members.items():
         for chunk, wanted in coordinate_chunks(member):
-            stored = _values_in(files, f"{name}/{chunk}", member.dtype)
+            stored = _values_in(files, f"{name}/{chunk}", member.dtype, wanted)
             if stored is None or not np.array_equal(stored, wanted):
                 yield f"{name}/{chunk}", encode_values(wanted)
         yield from _outdated(files, {f"{name}/{DOCUMENT}": documents[name]})

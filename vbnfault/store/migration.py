@@ -16,6 +16,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from ..core.errors import InputError, VbnfaultError
+from ..core.path_checks import real
+from ..core.whole_files import remove
 from . import disk
 from .arrays import SCALARS
 from .bucket import Url
@@ -24,7 +26,7 @@ from .codec import join_shard, threads
 from .compressors import compressor
 from .files import files_of, located
 from .formats import FORMAT_VERSION
-from .group import group_files, is_store, open_store, read_root
+from .group import group_files, open_store, read_root
 from .layout import root_attributes
 from .metadata import bring_to
 from .opened import Store
@@ -67,10 +69,9 @@ def migrate_copy(
     hidden = target.with_name(f".{target.name}.migrate{disk.PARTIAL}")
     with disk.explained(target, "copying the store"):
         target.parent.mkdir(parents=True, exist_ok=True)
-        begun = read_root(files_of(hidden))
+        begun = None if hidden.is_symlink() else read_root(files_of(hidden))
         if begun is None or begun.attributes != root_attributes(spec, source.samples):
-            if hidden.exists():
-                disk.remove_tree(hidden)
+            remove(hidden)
             hidden.mkdir()
             disk.write(hidden, group_files(spec, source.samples))
         disk.remove_partials(hidden)
@@ -90,10 +91,10 @@ def check_target(source: Store, target: str | os.PathLike[str]) -> Path:
     if isinstance(path, Url):
         raise InputError(f"{path}: a copy is made on a disk; give a path, and copy its files to the object store")
     if isinstance(source.path, Path):
-        inside, outside = source.path.resolve(), path.resolve()
+        inside, outside = real(source.path), real(path)
         if inside == outside or inside in outside.parents:
             raise InputError(f"{target}: lies in the store that is migrated; choose another --out")
-    if is_store(path) or (path.exists() and (not path.is_dir() or any(path.iterdir()))):
+    if path.is_symlink() or (path.exists() and (not path.is_dir() or any(path.iterdir()))):
         raise InputError(f"{target}: exists already, so it is left alone; choose another --out")
     return path
 
@@ -102,13 +103,13 @@ def _copy_shard(source: Store, spec: StoreSpec, number: int, hidden: Path) -> No
     """Copy one shard into the hidden folder, unless it was copied before."""
     name = source.file_name("done", number)
     try:
-        done = source.files.read(name)
+        done = source.files.read(name, source.most_bytes("done"))
     except FileNotFoundError:
         return  # no sample of it is finished
     except OSError as error:
         raise _damaged(source, name, error) from error
     try:
-        if disk.read(hidden / name) == done:
+        if disk.read(hidden / name, len(done)) == done:
             return
     except OSError:
         pass
@@ -127,7 +128,12 @@ def _shard_files(source: Store, spec: StoreSpec, number: int) -> Iterator[tuple[
         file = source.file_name(name, number)
         try:
             is_same = source.spec.codecs.get(name) == spec.codecs.get(name)
-            yield file, source.files.read(file) if is_same else _recoded(source, spec, name, number)
+            yield (
+                file,
+                source.files.read(file, source.most_bytes(name))
+                if is_same
+                else _recoded(source, spec, name, number),
+            )
         except (FileNotFoundError, ValueError, disk.Misplaced) as error:
             raise _damaged(source, file, error) from error
 
@@ -137,7 +143,8 @@ def _recoded(source: Store, spec: StoreSpec, name: str, number: int) -> bytes:
     old, new = compressor(source.spec.codecs[name]), compressor(spec.codecs[name])
     chunks = source.chunk(name, number)
     with ThreadPoolExecutor(threads()) as pool:
-        recoded = pool.map(lambda chunk: new.encode(old.decode(chunk)), chunks.values())
+        size = spec.layer_bytes(name)
+        recoded = pool.map(lambda chunk: new.encode(old.decode(chunk, size)), chunks.values())
         first = source.shard(number).start
         return join_shard({i - first: chunk for i, chunk in zip(chunks, recoded, strict=True)}, spec.shard_samples)
 

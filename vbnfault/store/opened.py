@@ -6,8 +6,9 @@ Only whole files are written, and `done` is written last.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,7 @@ from ..core.errors import InputError, VbnfaultError
 from ..core.quantities import Sample
 from . import disk
 from .arrays import SCALARS
-from .attributes import check_attributes, number_of_samples
+from .attributes import check_attributes, check_names, number_of_samples
 from .codec import (
     Encoded,
     chunk_ranges,
@@ -26,6 +27,7 @@ from .codec import (
     join_shard,
     split_shard,
 )
+from .compressors import compressor, most_compressed
 from .files import Files
 from .layout import (
     DOCUMENT,
@@ -33,15 +35,13 @@ from .layout import (
     SPARE,
     array_documents,
     decode_values,
+    drawn_table,
     encode_values,
     group_document,
     sealed,
     to_bytes,
 )
-from .schema import spec_from_plain
-
-if TYPE_CHECKING:
-    import zarr
+from .schema import SPLITS, spec_from_plain
 
 # errors that mean a damaged or missing file; any other OSError may be temporary
 _DAMAGE = (ValueError, FileNotFoundError, NotADirectoryError, disk.Misplaced)
@@ -52,8 +52,7 @@ _READS = 3
 class Store:
     """Hold an open store, as `open_store` returns it.
 
-    `array` and `read` read through zarr, as a user does, and so does `read_sample` the layers. `column` and `chunk`
-    read the files directly.
+    The files are read directly, and no more of them than the schema allows: the store may be that of a stranger.
     """
 
     def __init__(self, files: Files, attributes: dict[str, Any], mode: str) -> None:
@@ -63,8 +62,8 @@ class Store:
         check_attributes(self.attributes)
         self.samples = number_of_samples(attributes)
         self.spec = spec_from_plain(attributes["store"], self.attributes)
+        check_names(self.spec, self.samples)
         self._mode: Any = mode
-        self._arrays: dict[str, zarr.Array[Any]] = {}
         self._shapes: dict[str, tuple[int, ...]] = {}
 
     @property
@@ -77,24 +76,6 @@ class Store:
         size = self.spec.shard_samples
         return range(number * size, min((number + 1) * size, self.samples))
 
-    def array(self, name: str) -> zarr.Array[Any]:
-        """Return the zarr array. Raises VbnfaultError if it is missing or its metadata cannot be read."""
-        if name not in self._arrays:
-            import zarr  # not above: reading the files directly needs no zarr, and its import takes 0.4 s
-
-            try:
-                self.files.expect_file(f"{name}/{DOCUMENT}")
-                root = self.files.zarr()
-                self._arrays[name] = zarr.open_array(root, path=name, mode=self._mode, zarr_format=3)
-            except Exception as error:  # zarr raises many types for metadata that it cannot parse
-                failure = self.files.failure(error, name)
-                if failure is not None:
-                    raise failure from error
-                raise VbnfaultError(
-                    f"{self.path}: {self.why_closed(name)}; the build command re-creates it"
-                ) from error
-        return self._arrays[name]
-
     def update_attributes(self, values: Mapping[str, Any]) -> None:
         """Change root attributes on disk, in `spare` first. A store must be opened again to show them."""
         self.root_attributes = sealed({**self.root_attributes, **json.loads(json.dumps(values))})
@@ -102,56 +83,46 @@ class Store:
         self.files.write([(f"{SPARE}/{DOCUMENT}", to_bytes(group_document(self.root_attributes)))])
         self.files.write([(DOCUMENT, to_bytes(group_document(self.root_attributes, arrays)))])
 
-    def why_closed(self, name: str) -> str:
-        """Return why `array` cannot open an array, as a clause."""
-        if not self.files.exists(f"{name}/{DOCUMENT}"):
-            return f"array {name} is missing"
-        return f"array {name} cannot be opened, {name}/{DOCUMENT} is damaged"
-
     def read(self, name: str, start: int = 0, stop: int | None = None) -> NDArray[Any]:
         """Return samples `start` to `stop` - 1 of an array; samples that are not built yet have the fill value.
 
         Raises VbnfaultError if the samples cannot be decoded, or if the file of a finished one is missing.
         """
         stop = self.samples if stop is None else stop
-        try:
-            if name in self.spec.arrays:
-                for number in range(start // self.spec.shard_samples, -(-stop // self.spec.shard_samples)):
-                    self.files.expect_file(self.file_name(name, number))
-            values = np.asarray(self.array(name)[start:stop])
-        except VbnfaultError:
-            raise
-        except Exception as error:
-            failure = self.files.failure(error, name)
-            if failure is not None:
-                raise failure from error
-            raise VbnfaultError(
-                f"{self.path}: {name} of {_samples(start, stop)} cannot be read ({error}); "
-                f"the build command repairs it"
-            ) from error
-        self._expect_written(name, start, values)
+        row = self.spec.arrays[name]
+        dtype = object if row.is_text else row.dtype
+        values = np.full((max(0, stop - start), *self._shape(name)), row.fill, dtype=dtype)
+        for number in range(start // self.spec.shard_samples, -(-stop // self.spec.shard_samples)):
+            wanted = [i for i in self.shard(number) if start <= i < stop]
+            why = ""
+            try:
+                for i, value in self._values(name, number, wanted).items():
+                    values[i - start] = value
+            except FileNotFoundError:
+                lost = [i for i in wanted if name != "done" and self.done(number)[i]]
+                if lost:
+                    wanted, why = lost, f": the file {self.file_name(name, number)} is missing"
+            except (OSError, ValueError) as error:
+                why = f" ({error})"
+            if why:
+                raise VbnfaultError(
+                    f"{self.path}: {name} of {_samples(wanted[0], wanted[-1] + 1)} cannot be read{why}; the build "
+                    "command repairs it"
+                )
         return values
 
-    def _expect_written(self, name: str, start: int, values: NDArray[Any]) -> None:
-        """Raise VbnfaultError if zarr read zeros because the file of finished samples, from `start` on, is missing.
-
-        Only values that are all zero ask whether their file exists, which costs a request to an object store.
-        """
-        if name not in self.spec.arrays or name == "done" or self.spec.empty(name):
-            return
-        fill = self.spec.arrays[name].fill
-        for number in range(start // self.spec.shard_samples, -(-(start + len(values)) // self.spec.shard_samples)):
-            samples, file = self.shard(number), self.file_name(name, number)
-            part = values[max(0, samples.start - start) : max(0, samples.stop - start)]
-            written = ~np.isnan(part) if isinstance(fill, float) else part != fill  # numbers: NaN
-            if written.any() or self.files.exists(file):
-                continue
-            lost = [i for i, done in self.done(number).items() if done and start <= i < start + len(values)]
-            if lost:
-                raise VbnfaultError(
-                    f"{self.path}: {name} of {_samples(lost[0], lost[-1] + 1)} cannot be read: the file {file} is "
-                    "missing; the build command repairs it"
-                )
+    def _values(self, name: str, number: int, samples: Collection[int]) -> dict[int, Any]:
+        """Return the values of samples of a shard. Raises OSError or ValueError if they cannot be read."""
+        if name not in self.spec.pixel_layers:
+            column, first = self.column(name, number), self.shard(number).start
+            return {i: column[i - first] for i in samples}
+        row, codec = self.spec.pixel_layers[name], compressor(self.spec.codecs[name])
+        layers = {}
+        for i, chunk in self.chunk(name, number, samples).items():
+            layers[i] = np.empty(self._shape(name), dtype=row.dtype)
+            if layers[i].size:
+                codec.decode_into(chunk, layers[i])
+        return layers
 
     def read_sample(self, index: int, layers: Collection[str] | None = None) -> Sample:
         """Return one sample, compared with its checksums; with `layers`, only these of its layers.
@@ -212,7 +183,8 @@ class Store:
         """Yield several scalars for all samples of a shard, or why one cannot be read, in the order of `names`."""
         wanted = list(names)
         stored = [name for name in wanted if 0 not in self._shape(name)]
-        contents = dict(zip(stored, self.files.read_each([self.file_name(n, number) for n in stored]), strict=True))
+        files = [(self.file_name(n, number), self.most_bytes(n)) for n in stored]
+        contents = dict(zip(stored, self.files.read_each(files), strict=True))
         for name in wanted:
             content = contents.get(name, b"")
             if isinstance(content, OSError):
@@ -225,7 +197,7 @@ class Store:
 
     def column(self, name: str, number: int) -> NDArray[Any]:
         """Return a scalar for all samples of a shard. Raises OSError or ValueError if its chunk is damaged."""
-        content = b"" if 0 in self._shape(name) else self.files.read(self.file_name(name, number))
+        content = b"" if 0 in self._shape(name) else self._content(name, number)
         return self._column(name, number, content)
 
     def _column(self, name: str, number: int, content: bytes) -> NDArray[Any]:
@@ -234,7 +206,10 @@ class Store:
         samples = len(self.shard(number))
         if 0 in shape:
             return np.zeros((samples, *shape), dtype=row.dtype)
-        return decode_values(content, row.dtype).reshape(self.spec.shard_samples, *shape)[:samples]
+        values = decode_values(content, row.dtype, self._column_size(name))
+        if name == "split" and not {"", *SPLITS} >= {*values.tolist()}:  # they become names of folders and files
+            raise ValueError(f"a split is none of {', '.join(SPLITS)}")
+        return values.reshape(self.spec.shard_samples, *shape)[:samples]
 
     def _shape(self, name: str) -> tuple[int, ...]:
         """Return the shape of one sample of an array; a large store asks for it a hundred thousand times."""
@@ -277,11 +252,7 @@ class Store:
 
     def lacks_done(self) -> bool:
         """Return whether the array that marks the finished samples is missing."""
-        try:
-            self.files.read(f"done/{DOCUMENT}")
-        except OSError:
-            return True
-        return False
+        return not self.files.exists(f"done/{DOCUMENT}")
 
     def whole_shards(self) -> set[int]:
         """Return the shards whose samples are all marked as finished in `done`."""
@@ -293,7 +264,7 @@ class Store:
         counts: dict[bytes, int] = {}  # most files have the same content, so each content is decoded once
         for number in self.begun():
             try:
-                data = self.files.read(self.file_name("done", number))
+                data = self._content("done", number)
                 if data not in counts or number >= full:
                     counts[data] = sum(self.done(number).values())
             except OSError:
@@ -303,6 +274,34 @@ class Store:
     def file_name(self, name: str, number: int) -> str:
         """Return the name, relative to the store, of the file that holds an array's values for one shard."""
         return f"{name}/c/{number}{'/0' * len(self._shape(name))}"
+
+    def table(self, index: int, name: str, text: object) -> dict[str, Any]:
+        """Return the table in the scalar `parameters` or `proposal` of a sample. Raises VbnfaultError."""
+        try:
+            return drawn_table(text)
+        except ValueError:
+            raise VbnfaultError(
+                f"{self.path}: sample {index}: its {name} are damaged, they are no table in JSON; the build command "
+                "repairs them"
+            ) from None
+
+    def most_bytes(self, name: str) -> int:
+        """Return the most bytes that the file of an array for one shard may have."""
+        if name in self.spec.pixel_layers:
+            size = self.spec.shard_samples
+            return size * most_compressed(self.spec.layer_bytes(name)) + index_size(size)
+        return most_compressed(self._column_size(name))
+
+    def _column_size(self, name: str) -> int:
+        """Return the most bytes that a scalar of a shard may have, before it is compressed."""
+        row, samples = self.spec.arrays[name], self.spec.shard_samples
+        if row.is_text:  # behind the number of texts, the length of each in front of it
+            return 4 + samples * (4 + row.most_bytes)
+        return samples * math.prod(self._shape(name)) * np.dtype(row.dtype).itemsize
+
+    def _content(self, name: str, number: int) -> bytes:
+        """Return the file of an array for one shard."""
+        return self.files.read(self.file_name(name, number), self.most_bytes(name))
 
     def file(self, name: str, number: int) -> Any:
         """Return the path or the URL of the file that holds an array's values for one shard."""
@@ -317,13 +316,15 @@ class Store:
         if self.spec.empty(name):
             return dict.fromkeys(self.shard(number) if samples is None else samples, b"")
         if samples is None:
-            chunks = split_shard(self.files.read(self.file_name(name, number)), size)
+            chunks = split_shard(self._content(name, number), size)
             return {first + i: chunk for i, chunk in chunks.items()}
         wanted: dict[int, tuple[int, int]] = {}
 
         def choose(tail: bytes) -> list[tuple[int, int]]:
-            ranges = chunk_ranges(tail, size)
+            ranges, most_bytes = chunk_ranges(tail, size), most_compressed(self.spec.layer_bytes(name))
             wanted.update({i: ranges[i - first] for i in samples if i - first in ranges})
+            if any(length > most_bytes for _, length in wanted.values()):
+                raise ValueError(f"its index names a chunk of more than {most_bytes} bytes")
             return _joined(wanted.values())
 
         parts = self.files.read_parts(self.file_name(name, number), index_size(size), choose)
@@ -382,7 +383,10 @@ class Store:
                 self._write_done(number, set())
             names = [name for name in self.spec.arrays if name != "done" and not self.spec.empty(name)]
             files = [self.file_name(name, number) for name in names]
-            self.files.write((file, source.files.copied(file, link=link)) for file in files)
+            self.files.write(
+                (file, source.files.copied(file, source.most_bytes(name), link=link))
+                for name, file in zip(names, files, strict=True)
+            )
             self._write_done(number, set(finished))
 
     def remove_shard(self, number: int) -> None:

@@ -5,6 +5,7 @@ This module holds plain data; it reads and writes no file.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
@@ -40,6 +41,8 @@ VOLATILE_ATTRIBUTES = ("created", "modified", "command")
 MAX_SHARD_SAMPLES = 16
 MAX_SHARD_BYTES = 2**30
 MAX_HELD_BYTES = 2**31  # all layers of a shard, uncompressed: a task may have to hold them in memory
+
+MAX_SAMPLE_BYTES = 2**34  # all layers of a sample, uncompressed
 
 _SCALARS = "scalars"  # the entry of the `layer` axis that stands for all scalars of a sample
 
@@ -183,6 +186,11 @@ class StoreSpec:
         if self.localised_faults is None:
             object.__setattr__(self, "localised_faults", self.mask_any_faults)
         sizes = [self.layer_bytes(name) for name in self.pixel_layers]
+        if sum(sizes) > MAX_SAMPLE_BYTES:
+            raise InputError(
+                f"the layers of one sample take {sum(sizes) / 2**30:.1f} GiB: at most {MAX_SAMPLE_BYTES >> 30}; "
+                "store fewer layers or smaller images"
+            )
         most = max(1, min(MAX_SHARD_SAMPLES, MAX_SHARD_BYTES // max(sizes), MAX_HELD_BYTES // sum(sizes)))
         wished = self.shard_samples if self.shard_samples > 0 else most
         # the plan assigns sites to groups of the wished size; a divisor keeps each shard within one group
@@ -347,7 +355,7 @@ class StoreSpec:
     def layer_bytes(self, name: str) -> int:
         """Return the uncompressed size of one sample of a layer, in bytes."""
         row = self.pixel_layers[name]
-        return int(np.prod(self.shape(row), dtype=np.int64)) * np.dtype(row.dtype).itemsize
+        return math.prod(self.shape(row)) * np.dtype(row.dtype).itemsize
 
     @property
     def estimated_sample_bytes(self) -> int:

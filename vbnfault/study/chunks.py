@@ -18,6 +18,7 @@ from typing import Any
 from ..core import activity, file_contents
 from ..core.errors import InputChanged, InputError, VbnfaultError
 from ..core.interrupts import check, finishing
+from ..core.whole_files import kind_of
 from ..dataset.progress import Progress
 from ..dataset.work import Fatal, Lazy, Queue, Tick, describe
 from . import results
@@ -168,7 +169,9 @@ def _as_error(folder: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise VbnfaultError(f"{folder}: cannot be written: {error.strerror}; the same command continues") from error
+        raise kind_of(error)(
+            f"{folder}: cannot be written: {error.strerror}; the same command continues"
+        ) from error
 
 
 class StudyJob:

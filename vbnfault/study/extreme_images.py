@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.images import write_png
+from ..core.whole_files import own, own_folder
 from .spec import Evaluation
 from .summaries import StudyResults
 
@@ -70,9 +71,9 @@ def write_images(
             continue
         names = ("best", "worst")
         pair = _shown([image(extremes.best_row), image(extremes.worst_row)])
-        (Path(folder) / IMAGES).mkdir(parents=True, exist_ok=True)
+        images = own_folder(Path(folder) / IMAGES)
         for name, each in zip(names, pair, strict=True):
-            paths.append(write_png(Path(folder) / IMAGES / f"{metric}_{name}.png", each))
+            paths.append(write_png(own(images / f"{metric}_{name}.png"), each))
     return paths
 
 

@@ -27,6 +27,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
+from ..core.whole_files import replacing
 from .ranking_plots import ranking
 from .response_plots import responses, tornado
 from .sheets import (
@@ -125,9 +126,11 @@ def save(drawing: Drawing, folder: Path) -> tuple[Path, Path]:
     """Write a figure as PNG and SVG to a folder and return the two paths."""
     png, svg = folder / f"{drawing.stem}.png", folder / f"{drawing.stem}.svg"
     with matplotlib.rc_context(STYLE):
-        drawing.figure.savefig(png, dpi=DPI, metadata={"Software": None})
+        with replacing(png) as temporary:
+            drawing.figure.savefig(temporary, format="png", dpi=DPI, metadata={"Software": None})
         nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
-        drawing.figure.savefig(svg, transparent=True, metadata=nothing)
+        with replacing(svg) as temporary:
+            drawing.figure.savefig(temporary, format="svg", transparent=True, metadata=nothing)
     return png, svg
 
 

@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 
 from ..core.html_page import Page, Section, data_url, escaped, grouped_digits, html_table, with_minus
+from ..core.whole_files import own, own_folder
 from . import sheets
 from .extreme_images import IMAGES
 from .plots import drawings, save
@@ -87,7 +88,7 @@ def write_report(
     """
     folder = Path(folder)
     results = StudyResults(dataset=dataset, table=table, spec=spec)
-    (folder / PLOTS).mkdir(parents=True, exist_ok=True)
+    own_folder(folder / PLOTS)
     figures = []
     for drawing in drawings(results):
         png, svg = save(drawing, folder / PLOTS)
@@ -98,7 +99,7 @@ def write_report(
             )
         )
     path = folder / PAGE
-    _page(results, _within_budget(figures), folder / IMAGES).write(path)
+    _page(results, _within_budget(figures), folder / IMAGES).write(own(path))
     return path
 
 

@@ -362,7 +362,8 @@ def _prepare_folder(path: Path, spec: StudySpec, identity: Mapping[str, Any]) ->
                     f"{path}: holds something else than a study of vbnfault, so it is left alone; choose another "
                     "--out"
                 )
-        (path / "rows").mkdir(parents=True, exist_ok=True)
+        path.mkdir(parents=True, exist_ok=True)
+        whole_files.own_folder(path / "rows")
         if record.exists():
             try:
                 stored = json.loads(record.read_text(encoding="utf-8"))
@@ -374,8 +375,8 @@ def _prepare_folder(path: Path, spec: StudySpec, identity: Mapping[str, Any]) ->
         for partial_file in results.partial_files(path):
             whole_files.remove(partial_file)
         if not record.exists():
-            whole_files.write_whole(path / "study.toml", toml_files.toml_text(spec.resolved()))
-            whole_files.write_whole(record, json.dumps(identity, indent=1))
+            whole_files.write_whole(whole_files.own(path / "study.toml"), toml_files.toml_text(spec.resolved()))
+            whole_files.write_whole(whole_files.own(record), json.dumps(identity, indent=1))
 
 
 @contextlib.contextmanager
@@ -384,7 +385,7 @@ def _writing(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise InputError(f"{error.filename or path}: cannot be written: {error.strerror}") from None
+        raise whole_files.unwritable(error.filename or path, error) from None
 
 
 def _differences(stored: Any, now: Any) -> str:

@@ -22,11 +22,13 @@ from typing import Any
 
 from ...core.errors import InputError
 from ...core.path_checks import check_folder
+from ...core.whole_files import remove
 from ...store import disk, is_sealed, sealed
 
 STATE = "export.json"
 SUMS = "SHA256SUMS"
 _PARTS = ".parts"
+_MOST_BYTES = 1 << 30  # of a record: the parameters of the samples of a part
 _OWN = re.compile(rf"{re.escape(STATE)}\.[0-9a-f]{{32}}{re.escape(disk.PARTIAL)}")
 _UNSAID = {"masks": "footprint", "min_area_px": 1}  # what holds where `export.json` does not name a key
 _FILES_AT_ONCE = 8  # files that are open and in memory at once, in each thread
@@ -53,7 +55,7 @@ class Folder:
     def put_with(self, name: str, make: Callable[[Path], object]) -> None:
         """Write one file by a function that gets a temporary path; it is complete or not there."""
         target = self.path / name
-        target.parent.mkdir(parents=True, exist_ok=True)
+        disk.make_folders(self.path, target.parent, {})
         disk.write_with(target, make)
         self.checksums[name] = _sha256(target)
 
@@ -106,8 +108,7 @@ class Folder:
 
     def clear(self) -> None:
         """Remove the records of parts."""
-        if (self.path / _PARTS).is_dir():
-            disk.remove_tree(self.path / _PARTS)
+        remove(self.path / _PARTS)
 
     def _is_whole(self) -> bool:
         """Return whether all files of a complete export have their checksums still."""
@@ -168,7 +169,7 @@ def _sha256(path: Path) -> str:
 def _document(path: Path) -> dict[str, Any] | None:
     """Return the JSON object in a file; None if there is none."""
     try:
-        document = json.loads(disk.read(path))
-    except (OSError, ValueError):
+        document = json.loads(disk.read(path, _MOST_BYTES))
+    except (OSError, ValueError, RecursionError):
         return None
     return document if isinstance(document, dict) else None

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ... import __version__
 from ...core.errors import InputError, VbnfaultError, shown
-from ...core.path_checks import path_of
+from ...core.path_checks import path_of, real
 from ...core.quantities import Sample
 from ...core.tables import did_you_mean
 from ...dataset.card import to_json
@@ -133,7 +133,7 @@ def _check_place(store: Store, target: Path) -> None:
     """Refuse a folder within the store, or one that holds the store."""
     if isinstance(store.path, Url):
         return
-    inside, outside = store.path.resolve(), target.resolve()
+    inside, outside = real(store.path), real(target)
     if inside == outside or inside in outside.parents:
         raise InputError(f"{target}: lies in the store; choose another --out")
 
@@ -280,7 +280,7 @@ def _row(store: Store, sample: Sample) -> dict[str, Any]:
     row = {name: plain(np.asarray(v).ravel() if np.ndim(v) else v) for name, v in scalars.items()}
     row["injected"] = [f for f, on in zip(store.spec.faults, sample.scalars["injected"], strict=True) if on]
     row["stratum"] = STRATA[int(row["stratum"])]
-    parsed = {name: json.loads(sample.scalars[name] or "{}") for name in _PARSED}
+    parsed = {name: store.table(sample.index, name, sample.scalars[name]) for name in _PARSED}
     return {"sample": sample.index, **row, **plain(parsed)}
 
 

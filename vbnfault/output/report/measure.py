@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,7 +15,7 @@ from ...core.errors import VbnfaultError
 from ...core.quantities import Sample
 from ...dataset.statistics import is_seed, key_of
 from ...faults import registry
-from ...store import SPLITS, STRATA, Store
+from ...store import SPLITS, STRATA, Store, drawn_table
 
 F64 = NDArray[np.float64]
 
@@ -183,10 +182,9 @@ def read_drawn(store: Store, scalars: Scalars) -> tuple[list[Drawn], int]:
 def parsed(text: Any) -> dict[str, Any]:
     """Return the parameters of a sample by fault; empty if the text is no table in JSON."""
     try:
-        table = json.loads(str(text or "{}"))
-    except (ValueError, RecursionError):
+        return drawn_table(text)
+    except ValueError:
         return {}
-    return table if isinstance(table, dict) else {}
 
 
 def _by_shard(samples: NDArray[np.int64], chosen: NDArray[np.int64], size: int) -> dict[int, list[int]]:

@@ -15,6 +15,7 @@ from ...core import tables
 from ...core.errors import InputError, VbnfaultError, shown
 from ...core.html_page import Page, Section, escaped, grouped_digits, html_table
 from ...core.path_checks import path_of
+from ...core.whole_files import unwritable
 from ...dataset.statistics import Statistics, statistics
 from ...store import STRATA, Store, open_store
 from ..contact_sheet import COLOURS, abbreviations
@@ -102,7 +103,7 @@ def write_report(
     try:
         page.write(path)
     except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror}") from error
+        raise unwritable(path, error) from error
     return path
 
 

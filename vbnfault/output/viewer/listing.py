@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...store import SPLITS, Store
+from ...store import SPLITS, Store, drawn_table
 
 NOT_KNOWN = 255  # a split without a name, or a severity of a fault that is not injected or draws no number
 _BITS = 32
@@ -62,26 +61,29 @@ class Listing:
         get the same value; 255: the fault is not injected, or its model draws no number.
         """
         store, faults = self.store, self.store.spec.faults
-        measured = np.full((len(faults), store.samples), np.nan)
         keys, begun = _keys(store), store.begun()
+        # only what has files takes memory: a store may count more samples than it holds
+        start = {number: k * store.spec.shard_samples for k, number in enumerate(begun)}
+        index = np.concatenate([np.array(store.shard(n)) for n in begun]) if begun else np.zeros(0, dtype=np.int64)
+        measured = np.full((len(faults), len(index)), np.nan)
         for number, texts in self._column("parameters", begun):
-            first = store.shard(number).start
+            first = start[number]
             for offset, text in enumerate(texts):
                 try:
-                    drawn = json.loads(str(text) or "{}")
-                except (ValueError, RecursionError):
+                    drawn = drawn_table(text)
+                except ValueError:
                     continue
                 for k, fault in enumerate(faults):
-                    if isinstance(drawn, dict) and isinstance(drawn.get(fault), dict):
+                    if isinstance(drawn.get(fault), dict):
                         measured[k, first + offset] = _measure(drawn[fault], *keys[k])
-        ranked = np.full(measured.shape, NOT_KNOWN, dtype=np.uint8)
+        ranked = np.full((len(faults), store.samples), NOT_KNOWN, dtype=np.uint8)
         for k, row in enumerate(measured):
             known = np.flatnonzero(np.isfinite(row))
             values, position = np.unique(row[known], return_inverse=True)
             if len(values) > 1:
                 counts = np.bincount(position)
                 middle = np.cumsum(counts) - (counts + 1) / 2
-                ranked[k, known] = np.round(254 * middle / (len(known) - 1)).astype(np.uint8)[position]
+                ranked[k, index[known]] = np.round(254 * middle / (len(known) - 1)).astype(np.uint8)[position]
         return ranked.tobytes()
 
     def _column(self, name: str, numbers: Sequence[int]) -> Iterator[tuple[int, NDArray[Any]]]:
@@ -90,7 +92,8 @@ class Listing:
         if store.spec.empty(name):
             return
         last = store.shards - 1
-        contents = store.files.read_each([store.file_name(name, number) for number in numbers])
+        most_bytes = store.most_bytes(name)
+        contents = store.files.read_each([(store.file_name(name, number), most_bytes) for number in numbers])
         for number, content in zip(numbers, contents, strict=True):
             if isinstance(content, OSError):
                 continue

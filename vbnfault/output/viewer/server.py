@@ -11,10 +11,14 @@ that no page of the web can reach it by a name that resolves to this address, an
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import re
+import socket
+import sys
 import threading
+import time
 from collections.abc import Callable
 from functools import cached_property, lru_cache
 from http import HTTPStatus
@@ -28,7 +32,7 @@ from numpy.typing import NDArray
 
 from ...core import images
 from ...core.errors import InputError, VbnfaultError
-from ...store import SCALARS, SEMANTIC, SPLITS, STRATA, ShardReader, Store
+from ...store import MOST_DOCUMENT_BYTES, SCALARS, SEMANTIC, SPLITS, STRATA, ShardReader, Store
 from ..contact_sheet import COLOURS, abbreviations, overlay, resized, resized_mask
 from .listing import Listing
 
@@ -52,11 +56,16 @@ _LAST = 2**62  # no file has so many bytes
 _SIDES_PX = (160, 240, 320)  # of the small images
 _JPEG_QUALITY = 82
 _ROOTS = np.sqrt(255 * np.arange(256)).round().astype(np.uint8)  # black and white stay as they are
+_COORDINATES = ("fault", "channel", "sample", "layer")
+_MOST_OF_COORDINATE = 1 << 20  # bytes of a chunk
+# A connection that has sent no whole request for so long is closed, and so is one too many: a page opens six.
+_SECONDS_TO_ASK, _MOST_CONNECTIONS = 20.0, 64
 _MOST_SMALL = 3000  # small images that are kept, of some 10 kB each
 _KEPT_S = 60
+_PORT_OF_HTTP = 80
 
 
-class _Missing(Exception):
+class Missing(Exception):
     """Report that a request names nothing that is served."""
 
 
@@ -81,10 +90,9 @@ class Viewer:
         self.listing = Listing(store)
         self._lock = threading.Lock()
         try:
-            self.server = ThreadingHTTPServer(("127.0.0.1", port), _handler(self))
+            self.server = _Server(("127.0.0.1", port), _handler(self))
         except OSError as error:
             raise InputError(f"--port {port}: {error.strerror}; 0 takes a free port") from error
-        self.server.daemon_threads = True
 
     @property
     def port(self) -> int:
@@ -111,7 +119,7 @@ class Viewer:
     # --- what is served -------------------------------------------------------------------------------------
 
     def answer(self, path: str, query: dict[str, str]) -> tuple[bytes, str, str]:
-        """Return body, kind and cache time of a request that is not for a file of the store. Raises _Missing."""
+        """Return body, kind and cache time of a request that is not for a file of the store. Raises Missing."""
         if path in _PAGE:
             name, kind = _PAGE[path]
             return resources.files(__package__).joinpath("page", name).read_bytes(), kind, "no-cache"
@@ -125,7 +133,7 @@ class Viewer:
             "layer": lambda: (self.layer(rest), "application/octet-stream"),
         }
         if not path.startswith("api/") or what not in routes:
-            raise _Missing
+            raise Missing
         body, kind = routes[what]()
         return body, kind, f"private, max-age={_KEPT_S}" if what == "small" else "no-store"
 
@@ -211,7 +219,7 @@ class Viewer:
     def pixels(self, name: str, index: int) -> NDArray[Any]:
         """Return a layer of a sample, compared with its checksum. Raises VbnfaultError if it cannot be read."""
         if name not in self.store.spec.pixel_layers:
-            raise _Missing
+            raise Missing
         row, reader = self.store.spec.pixel_layers[name], ShardReader(self.store, (name,))
         fetched = reader.fetch(index // self.store.spec.shard_samples, [index])[index]
         out = np.empty(self.store.spec.shape(row), dtype=row.dtype)
@@ -231,7 +239,7 @@ class Viewer:
         """
         sides = {str(side): side for side in _SIDES_PX}
         if (side := sides.get(query.get("side", "240"))) is None:
-            raise _Missing
+            raise Missing
         masks, brighter = (query.get(name) == "1" for name in ("masks", "brighter"))
         return self._small(_index(rest, self.store.samples), side, masks, brighter)
 
@@ -258,10 +266,9 @@ class Viewer:
         """Return a part of a file of the store, and which part it is as the header `Content-Range` says it.
 
         `header`: the header `Range`, None for the whole file. The second value is "" for an object store, which
-        does not tell the size. Raises _Missing if there is no such file, ValueError if the range is none.
+        does not tell the size. Raises Missing if there is no such file, ValueError if the range is none.
         """
-        if not self._is_served(name):
-            raise _Missing
+        most_bytes = self._most_bytes(name)
         asked = _RANGE.fullmatch(header or "bytes=0-")
         if asked is None:
             raise ValueError(header)
@@ -273,21 +280,21 @@ class Viewer:
         def choose(tail: bytes) -> list[tuple[int, int]]:
             nonlocal end
             end = tail
-            return [] if suffix is not None else [(first or 0, (last or 0) - (first or 0) + 1)]
+            return [] if suffix is not None else [(first or 0, min((last or 0) - (first or 0) + 1, most_bytes))]
 
         try:
             if header is None or (suffix is None and last is None):
-                body = files.read(name)[first or 0 :]
+                body = files.read(name, most_bytes)[first or 0 :]
             elif suffix is None and (last or 0) < (first or 0):
                 raise ValueError(header)
             else:
-                parts = files.read_parts(name, suffix or 1, choose)
+                parts = files.read_parts(name, min(suffix or 1, most_bytes), choose)
                 body = parts[0][1] if parts else end
             if header is not None and not body:
                 raise ValueError(header)
             size = self._size(name)
         except OSError as error:
-            raise _Missing from error
+            raise Missing from error
         start = (size or 0) - len(body) if suffix is not None else first or 0
         return body, "" if size is None else f"bytes {start}-{start + len(body) - 1}/{size}"
 
@@ -295,19 +302,22 @@ class Viewer:
         """Return the size of a file of the store in bytes, None in an object store."""
         return (self.store.path / name).stat().st_size if isinstance(self.store.path, Path) else None
 
-    def _is_served(self, name: str) -> bool:
-        """Return whether a name may belong to a file of the store: metadata or a chunk of one of its arrays."""
-        if name == "zarr.json":
-            return True
-        array, _, rest = name.partition("/")
-        known = array in self.store.spec.arrays or array in ("fault", "channel", "sample", "layer")
-        return known and (rest == "zarr.json" or re.fullmatch(r"c(?:/\d{1,9}){1,6}", rest) is not None)
+    def _most_bytes(self, name: str) -> int:
+        """Return the most bytes of a file that is served: a document, or a chunk of an array. Raises Missing."""
+        is_chunk = "/c/" in name
+        array, _, rest = name.partition("/c/") if is_chunk else name.rpartition("/")
+        known = {"", *self.store.spec.arrays, *_COORDINATES}
+        if array not in known or not re.fullmatch(r"\d{1,9}(?:/\d{1,9}){0,5}" if is_chunk else r"zarr\.json", rest):
+            raise Missing
+        if not is_chunk:
+            return MOST_DOCUMENT_BYTES
+        return self.store.most_bytes(array) if array in self.store.spec.arrays else _MOST_OF_COORDINATE
 
 
 def _index(text: str, samples: int) -> int:
-    """Return the index of a sample. Raises _Missing if there is no such sample."""
+    """Return the index of a sample. Raises Missing if there is no such sample."""
     if not (text.isascii() and text.isdecimal() and len(text) < 12 and int(text) < samples):
-        raise _Missing
+        raise Missing
     return int(text)
 
 
@@ -334,17 +344,64 @@ def _json(value: Any) -> bytes:
     return json.dumps(value, separators=(",", ":"), allow_nan=False).encode()
 
 
+class _Server(ThreadingHTTPServer):
+    """Serve a few connections, and close those that ask for nothing."""
+
+    daemon_threads = True
+
+    def __init__(self, *given: Any) -> None:
+        self.asking: dict[socket.socket, float] = {}  # since when a connection is waited for
+        self._open = threading.BoundedSemaphore(_MOST_CONNECTIONS)
+        super().__init__(*given)
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Answer a connection in a thread; close it where there are too many."""
+        if not self._open.acquire(blocking=False):
+            self.shutdown_request(request)
+            return
+        super().process_request(request, client_address)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        """Answer a connection."""
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self.asking.pop(request, None)
+            self._open.release()
+
+    def service_actions(self) -> None:
+        """Close, again and again, the connections whose request does not arrive."""
+        now = time.monotonic()
+        for connection, since in [*self.asking.items()]:
+            if now - since > _SECONDS_TO_ASK:
+                self.asking.pop(connection, None)
+                with contextlib.suppress(OSError):
+                    connection.shutdown(socket.SHUT_RDWR)
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Print nothing of a connection that ended early."""
+        if not isinstance(sys.exc_info()[1], OSError):
+            super().handle_error(request, client_address)
+
+
 class _Handler(BaseHTTPRequestHandler):
     """Answer one connection to a viewer, which `_handler` sets."""
 
     viewer: ClassVar[Viewer]
 
+    timeout = 60.0  # seconds that a read, or the sending of a whole answer, may take
     protocol_version = "HTTP/1.1"
     server_version, sys_version = "vbnfault", ""
     disable_nagle_algorithm = True
 
+    def handle_one_request(self) -> None:
+        """Answer a request, which must arrive in time."""
+        self.server.asking[self.connection] = time.monotonic()  # type: ignore[attr-defined]
+        super().handle_one_request()
+
     def do_GET(self) -> None:
         """Answer a request."""
+        self.server.asking.pop(self.connection, None)  # type: ignore[attr-defined]
         self._reply(*self._answered())
 
     do_HEAD = do_GET
@@ -354,7 +411,9 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _answered(self) -> tuple[int, bytes, dict[str, str]]:
         """Return status, body and headers."""
-        hosts = {f"{name}:{self.viewer.port}" for name in ("127.0.0.1", "localhost")}
+        names, port = ("127.0.0.1", "localhost"), self.viewer.port
+        # a browser leaves out the port of HTTP
+        hosts = {f"{name}:{port}" for name in names}.union(names if port == _PORT_OF_HTTP else ())
         if self.headers.get("Host", "") not in hosts:
             return HTTPStatus.FORBIDDEN, b"this server answers this machine only", {}
         path, _, query = self.path.partition("?")
@@ -364,7 +423,7 @@ class _Handler(BaseHTTPRequestHandler):
             pairs = dict(pair.partition("=")[::2] for pair in query.split("&"))
             body, kind, cache = self.viewer.answer(path.lstrip("/"), pairs)
             return HTTPStatus.OK, body, {"Content-Type": kind, "Cache-Control": cache}
-        except _Missing:
+        except Missing:
             return HTTPStatus.NOT_FOUND, b"not found", {}
         except VbnfaultError as error:  # damaged, or not finished: the page shows the sentence
             return HTTPStatus.UNPROCESSABLE_ENTITY, str(error).encode(), {"Content-Type": "text/plain"}
@@ -391,7 +450,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.end_headers()
             if self.command != "HEAD":
                 self.wfile.write(body)
-        except (BrokenPipeError, ConnectionResetError):  # the page has scrolled on
+        except OSError:  # the page has scrolled on, or reads no further
             self.close_connection = True
 
 

@@ -91,7 +91,7 @@ def _members(store: Store, sample: Sample) -> Iterator[tuple[str, bytes]]:
 def _scalars(store: Store, sample: Sample) -> dict[str, Any]:
     """Return the scalars of a sample, the faults by name."""
     injected = dict(zip(store.spec.faults, sample.scalars["injected"].tolist(), strict=True))
-    parsed = {name: json.loads(sample.scalars[name] or "{}") for name in ("parameters", "proposal")}
+    parsed = {name: store.table(sample.index, name, sample.scalars[name]) for name in ("parameters", "proposal")}
     scalars = {name: value for name, value in sample.scalars.items() if name not in parsed}
     row: dict[str, Any] = plain({"sample": sample.index, **scalars, "injected": injected, **parsed})
     return row
