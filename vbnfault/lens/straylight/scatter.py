@@ -196,10 +196,9 @@ def obscured_fraction(cleanliness_level: float) -> float:
 def scattered_intensity(size_parameter: ArrayLike, cosine: ArrayLike, *, index: complex = DUST_INDEX) -> F64:
     """Return k² dσ/dΩ of spheres for unpolarised light, float64[size, angle].
 
-    Up to a size parameter π D/λ of 500, the result is Mie's series. For larger
-    spheres, the result is the sum of Fraunhofer diffraction, the rays reflected outside and the rays refracted
-    twice, without interference. Up to 70°, this sum is within 8 % of the mean of Mie's series over sizes; at 90°
-    the sum is a fifth below this mean.
+    Up to a size parameter π D/λ of 500, the result is Mie's series. For larger spheres, the result is the sum of
+    Fraunhofer diffraction, the rays reflected outside and the rays refracted twice, without interference. Up to
+    70°, this sum is within 8 % of the mean of Mie's series over sizes; at 90° the sum is a fifth below this mean.
     """
     x, mu = np.atleast_1d(np.asarray(size_parameter, float)), np.atleast_1d(np.asarray(cosine, float))
     small = x <= _MIE_LARGEST
