@@ -53,7 +53,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "study": OUTPUT | {"navigation"},
     "output": OUTPUT | {"navigation", "study"},
     "cli": OUTPUT | {"output", "study"},
-    "__main__": {"cli"},
+    "__main__": {"core", "cli"},
 }
 
 ONLY = {  # distribution → the packages or modules that import it

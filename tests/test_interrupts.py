@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import json
 import signal
+import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+import signal_moments
+import typer
 from synthetic import SAMPLES, Session
 from synthetic import run as build
 from test_cli import run
 
 from vbnfault import store
-from vbnfault.core import resources
+from vbnfault.core import interrupts, resources
+from vbnfault.core.errors import InputError
 from vbnfault.core.quantities import Sample
 from vbnfault.dataset.errors import Interrupted
 
@@ -48,8 +53,14 @@ def replaced(number: int) -> None:
         raise ValueError("Invalid bounding box") from None
 
 
+def replaced_below(number: int) -> None:
+    """A library function such as `build` has an interruptible block of its own, within that of the command."""
+    with interrupts.interruptible():
+        replaced(number)
+
+
 @pytest.mark.parametrize("number", NUMBERS)
-@pytest.mark.parametrize("arrive", [signal.raise_signal, in_a_destructor, replaced])
+@pytest.mark.parametrize("arrive", [signal.raise_signal, in_a_destructor, replaced, replaced_below])
 def test_a_signal_ends_a_command_wherever_it_arrives(
     arrive: Callable[[int], None],
     number: int,
@@ -71,6 +82,53 @@ def test_a_signal_ends_a_command_wherever_it_arrives(
     monkeypatch.setattr(resources, "packaged", lambda _: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         run(monkeypatch, "list", "lenses")
+
+
+def test_at_every_moment_signals_end_the_command_with_one_sentence() -> None:
+    """From the first import of the command line until its outcome is known; later ones change nothing."""
+    command = [sys.executable, signal_moments.__file__, "3", "90", "--version"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    ended = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("[")]
+    known = next(k for k, (_, code, _) in enumerate(ended) if code == 0)
+    assert known > 20
+    for k, (number, *outcome) in enumerate(ended):
+        assert outcome == ([128 + number, SENTENCE] if k < known else [0, ""])
+    assert done.stderr == ""
+
+
+def test_more_signals_after_the_sentence_change_nothing(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    echo = typer.echo
+
+    def echo_and_arrive(*args: object, **kwargs: bool) -> None:
+        echo(*args, **kwargs)
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGHUP)
+
+    monkeypatch.setattr(resources, "packaged", lambda _: signal.raise_signal(signal.SIGINT))
+    monkeypatch.setattr(typer, "echo", echo_and_arrive)
+    assert run(monkeypatch, "list", "lenses") == 130
+    assert capsys.readouterr().err == SENTENCE
+
+
+def misread(number: int) -> None:
+    """Code that imports or reads something reports any failure as the user's."""
+    try:
+        signal.raise_signal(number)
+    except BaseException:
+        raise InputError("body.shape = 'x.obj': cannot be read") from None
+
+
+@pytest.mark.parametrize("arrive", [signal.raise_signal, replaced, misread])
+def test_a_build_that_ends_before_its_first_sample_says_so(
+    arrive: Callable[[int], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first session imports drjit, whose C code replaces exceptions."""
+    monkeypatch.setattr(Session, "__call__", lambda _: arrive(signal.SIGTERM))
+    with pytest.raises(Interrupted, match="interrupted; 0 of 18 samples are finished") as stopped:
+        build(tmp_path / "s.zarr")
+    assert stopped.value.exit_code == 143
 
 
 @pytest.mark.parametrize("arrive", [in_a_destructor, replaced])

@@ -47,6 +47,15 @@ def test_every_packaged_scene_builds_a_store_that_verifies(name: str, tmp_path: 
             variable.load()
 
 
+def test_every_image_of_quickstart_shows_lit_ground() -> None:
+    small = {**_SMALL, "dataset.sites": 4, "patch.max_triangles": 100_000}
+    session = pipeline.Session(config.load_scene("quickstart", small))
+    for index in range(session.scene.dataset.samples):
+        intensity = session.frame(index).images.clean.array[..., 3]
+        # asked for is 0.2 by rays; the ground is brighter than 16 DN except where the light is grazing
+        assert (intensity >= 16).mean() > 0.15, index
+
+
 @pytest.mark.parametrize("name", sorted(resources.packaged("scenes")))
 def test_the_commands_in_a_scenes_comments_are_accepted(name: str) -> None:
     """Each `--set` that a scene file shows names keys and values that its faults take."""

@@ -34,29 +34,28 @@ def main() -> None:
     # takes it from render threads. The library reads this when numpy is imported; to change it later is not safe.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     streams.warn_in_sentences()
-    with streams.steady(), interrupts.interruptible():
-        try:
-            code, stopped = _exit_code(), False
-        except (interrupts.Stopped, KeyboardInterrupt, typer.Abort) as stop:
-            code, stopped = interrupts.exit_code(stop), not streams.is_unread(stop)
-            if stopped:
-                with interrupts.finishing():
-                    typer.echo(f"vbnfault: {_INTERRUPTED}", err=True)
-    if stopped:
-        interrupts.ignore()  # a second Ctrl-C while Python ends
+    with interrupts.listening(), streams.steady():
+        code = _outcome()
     sys.exit(code)
 
 
-def _exit_code() -> int:
-    """Run the command, print the sentence of an error, and return the exit code."""
+def _outcome() -> int:
+    """Run the command, print the sentence of an error or an interrupt, and return the exit code.
+
+    Within this function a signal raises nothing, only within `_interruptible`.
+    """
     try:
-        code = app(standalone_mode=False)  # a command's typer.Exit comes back as its exit code
-        interrupts.check()
+        return _interruptible()
+    except (interrupts.Stopped, KeyboardInterrupt, typer.Abort) as stop:
+        interrupts.ignore()  # a second Ctrl-C while Python ends
+        if not streams.is_unread(stop):
+            typer.echo(f"vbnfault: {_INTERRUPTED}", err=True)
+        return interrupts.exit_code(stop)
     except VbnfaultError as error:
+        if isinstance(error, interrupts.Interrupted):
+            interrupts.ignore()
         typer.echo(f"vbnfault: {error}", err=True)
         return error.exit_code
-    except typer.Abort:
-        raise
     except OSError as error:  # one that no command expects, such as a full disk under standard output
         where = f"{error.filename}: " if error.filename else ""
         typer.echo(f"vbnfault: {where}{error.strerror or error}", err=True)
@@ -65,13 +64,24 @@ def _exit_code() -> int:
         typer.echo("vbnfault: not enough memory", err=True)
         return 1
     except Exception as error:
-        interrupts.check()
         # click's own usage errors (bad option, missing argument) know how to print themselves
         show = getattr(error, "show", None)
         if show is None:
             raise
         show()
         return int(getattr(error, "exit_code", 2))
+
+
+def _interruptible() -> int:
+    """Run the command so that a signal ends it, and return its exit code."""
+    with interrupts.interruptible():
+        interrupts.check()  # a signal may have arrived before
+        return _exit_code()
+
+
+def _exit_code() -> int:
+    """Run the command and return its exit code."""
+    code = app(standalone_mode=False)  # a command's typer.Exit comes back as its exit code
     return code if isinstance(code, int) else 0
 
 

@@ -85,8 +85,7 @@ def view(
     import signal
     import webbrowser
 
-    from ..core import interrupts
-    from ..dataset.errors import Interrupted
+    from ..core.interrupts import interruptible
     from ..output.viewer import Viewer
     from ..store import open_store
 
@@ -96,8 +95,7 @@ def view(
         webbrowser.open(viewer.url)
     before = signal.signal(signal.SIGINT, lambda *_: viewer.stop())  # this is how a viewer ends: no error
     try:
-        viewer.serve()
-    except interrupts.Stopped as stop:  # SIGTERM or SIGHUP
-        raise Interrupted(f"the view of {viewer.store.path} was ended", interrupts.exit_code(stop)) from None
+        with interruptible(lambda: f"the view of {viewer.store.path} was ended"):  # SIGTERM or SIGHUP
+            viewer.serve()
     finally:
         signal.signal(signal.SIGINT, before)

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from .. import store as store_module
 from ..core import environment, tables
 from ..core.errors import InputError, VbnfaultError, shown
-from ..core.interrupts import Stopped, exit_code, finishing, interruptible
+from ..core.interrupts import interruptible
 from ..store import FaultCounts, Location, Planned, Store, StoreSpec, Url, files_of, located
 from .dask import check_scheduler, run_on_dask
 from .errors import BuildFailed, Interrupted
@@ -339,14 +339,11 @@ def build(
         check_scheduler(options.scheduler)
 
     began = time.monotonic()
-    with interruptible():
-        try:
-            with contextlib.ExitStack() as stack:
-                store = _locked_store(plan, path, options, stack)
-                summary = _outlook(plan, path, options)  # another build may have ended before the lock was free
-                run = _run(session_factory, plan, options, store, summary)
-        except (Stopped, KeyboardInterrupt) as stop:
-            raise _interrupted(path, len(plan.site), stop) from stop
+    with interruptible(lambda: _interrupted(path, len(plan.site))):
+        with contextlib.ExitStack() as stack:
+            store = _locked_store(plan, path, options, stack)
+            summary = _outlook(plan, path, options)  # another build may have ended before the lock was free
+            run = _run(session_factory, plan, options, store, summary)
         run.raise_failures()
         store = store_module.open_store(path)
         return replace(
@@ -372,14 +369,10 @@ def _run(
     return run
 
 
-def _interrupted(path: Location, samples: int, stop: Stopped | KeyboardInterrupt) -> Interrupted:
-    """Return the error that says how many samples are finished after an interruption."""
-    with finishing():
-        done = store_module.open_store(path).finished() if store_module.is_store(path) else 0
-    return Interrupted(
-        f"{path}: interrupted; {done} of {samples} samples are finished, and the same command resumes",
-        exit_code(stop),
-    )
+def _interrupted(path: Location, samples: int) -> str:
+    """Return the sentence that says how many samples are finished after an interruption."""
+    done = store_module.open_store(path).finished() if store_module.is_store(path) else 0
+    return f"{path}: interrupted; {done} of {samples} samples are finished, and the same command resumes"
 
 
 def _outlook(plan: BuildPlan, path: Location, options: BuildOptions) -> Summary:

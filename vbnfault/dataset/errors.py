@@ -5,17 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from ..core.errors import VbnfaultError
+from ..core.interrupts import Interrupted
 
-
-class Interrupted(VbnfaultError):
-    """Report that the user or the system stopped the build; the same command resumes it.
-
-    `exit_code`: 128 + the signal's number.
-    """
-
-    def __init__(self, sentence: str, exit_code: int = 130) -> None:
-        super().__init__(sentence)
-        self.exit_code = exit_code
+__all__ = ["BuildFailed", "Interrupted"]
 
 
 class BuildFailed(VbnfaultError):

@@ -18,11 +18,10 @@ from numpy.typing import NDArray
 
 from .. import store as store_module
 from ..core.errors import InputError, VbnfaultError, shown
-from ..core.interrupts import Stopped, check, exit_code, finishing, interruptible
+from ..core.interrupts import check, finishing, interruptible
 from ..core.path_checks import real
 from ..store import Location, SampleDigests, Store, StoreSpec, Url, located, spans
 from . import card, versions
-from .errors import Interrupted
 from .lock import locked
 from .progress import Progress
 from .resume import check_same_dataset
@@ -124,17 +123,13 @@ def join_stores(
     sources = [store_module.open_store(path) for path in paths if not _same(path, target)]
     if not sources:
         raise InputError(f"--out {target}: there is nothing to merge: give at least one other store")
-    with interruptible(), contextlib.ExitStack() as stack:
-        try:
-            for path in (target, *(source.path for source in sources if move)):
-                stack.enter_context(locked(path))
-            merge = _Merge(sources, target, move=move)
-            with Progress(merge.store.samples, shown=progress) as bar:
-                summary = merge.run(bar)
-        except (Stopped, KeyboardInterrupt) as stop:
-            raise Interrupted(
-                f"{target}: interrupted; merged samples stay, and the same command resumes", exit_code(stop)
-            ) from stop
+    sentence = f"{target}: interrupted; merged samples stay, and the same command resumes"
+    with interruptible(lambda: sentence), contextlib.ExitStack() as stack:
+        for path in (target, *(source.path for source in sources if move)):
+            stack.enter_context(locked(path))
+        merge = _Merge(sources, target, move=move)
+        with Progress(merge.store.samples, shown=progress) as bar:
+            summary = merge.run(bar)
     return summary
 
 

@@ -44,11 +44,18 @@ _SECONDS_TO_STOP = 60.0  # for a worker to write its finished items; a second Ct
 
 
 def _worker(factory: WorkerFactory, pipe: connection.Connection) -> None:
-    """Run a worker process: receive tasks from the pipe, and send events back. It ends when its parent ends."""
+    """Run a worker process. It ends when its parent ends."""
     with contextlib.suppress(EOFError, OSError, interrupts.Stopped), streams.steady():
         interrupts.obey_parent()
         streams.warn_in_sentences()
         threading.Thread(target=_die_with_parent, daemon=True).start()
+        _do_tasks(factory, pipe)
+
+
+def _do_tasks(factory: WorkerFactory, pipe: connection.Connection) -> None:
+    """Receive tasks from the pipe, and send events back, until the pipe is closed."""
+    with interrupts.interruptible():
+        interrupts.check()
         worker = factory()
         while True:
             task = pipe.recv()

@@ -25,11 +25,10 @@ import numpy as np
 from .. import __version__
 from ..core import environment, file_contents, tables, toml_files, whole_files
 from ..core.errors import InputError, VbnfaultError, shown
-from ..core.interrupts import Stopped, exit_code, finishing, interruptible
+from ..core.interrupts import interruptible
 from ..core.path_checks import check_folder, path_of
 from ..dataset import BuildOptions
 from ..dataset.dask import check_scheduler, run_on_dask
-from ..dataset.errors import Interrupted
 from ..dataset.identity import versions
 from ..dataset.lock import locked
 from ..dataset.processes import Pool
@@ -169,7 +168,7 @@ def run_study(
     if options.scheduler is not None:
         check_scheduler(options.scheduler)
     began = time.monotonic()
-    with interruptible(), locked(path):
+    with interruptible(lambda: _interrupted(path, design)), locked(path):
         _prepare_folder(path, spec, plan.identity)
         job = StudyJob(path, design, Progress(len(design), shown=options.progress, noun="evaluations"))
         names = tuple(metric.name for metric in metrics)
@@ -416,29 +415,26 @@ def _flat(node: Any, above: str = "") -> Iterator[tuple[str, Any]]:
 def _evaluate(source: ChunkWorkers, evaluator: Evaluator, job: StudyJob, options: BuildOptions) -> tuple[str, ...]:
     """Do all chunks on a cluster, here, or in worker processes, and return the warnings of the evaluator."""
     warnings = tuple(_too_few(source.spec))
-    try:
-        if job.finished < len(job.design):
-            with source.contents.in_use():
-                warnings += tuple(evaluator.check() or ())
-        _warn(warnings)
-        with job.progress:
-            if options.scheduler is not None:
-                run_on_dask(source, job, options.scheduler)
-            elif options.workers == 1:
-                run_here(partial(source.with_evaluator, evaluator), job)
-            else:
-                threads = options.threads or max(1, environment.usable_cores() // options.workers)
-                tasks = max(options.recycle_shards, _MOST_EVALUATIONS_OF_A_PROCESS // job.chunk_size)
-                Pool(source, job, threads, tasks).work(options.workers)
-    except (Stopped, KeyboardInterrupt) as stop:
-        with finishing():
-            done = StudyJob(job.path, job.design, job.progress).finished
-        raise Interrupted(
-            f"{job.path}: interrupted; {done} of {len(job.design)} evaluations are finished, and the same command "
-            "continues",
-            exit_code(stop),
-        ) from stop
+    if job.finished < len(job.design):
+        with source.contents.in_use():
+            warnings += tuple(evaluator.check() or ())
+    _warn(warnings)
+    with job.progress:
+        if options.scheduler is not None:
+            run_on_dask(source, job, options.scheduler)
+        elif options.workers == 1:
+            run_here(partial(source.with_evaluator, evaluator), job)
+        else:
+            threads = options.threads or max(1, environment.usable_cores() // options.workers)
+            tasks = max(options.recycle_shards, _MOST_EVALUATIONS_OF_A_PROCESS // job.chunk_size)
+            Pool(source, job, threads, tasks).work(options.workers)
     return warnings
+
+
+def _interrupted(path: Path, design: Design) -> str:
+    """Return the sentence that says how many evaluations are finished after an interruption."""
+    done = StudyJob(path, design, Progress(len(design), shown=False)).finished
+    return f"{path}: interrupted; {done} of {len(design)} evaluations are finished, and the same command continues"
 
 
 def _warn(sentences: Sequence[str]) -> None:

@@ -22,11 +22,10 @@ from scipy.optimize import isotonic_regression
 
 from ..core import environment, toml_files
 from ..core.errors import InputError, VbnfaultError, shown
-from ..core.interrupts import Stopped, exit_code, interruptible
+from ..core.interrupts import interruptible
 from ..core.tables import did_you_mean
 from ..core.whole_files import write_whole
 from ..dataset import BuildOptions
-from ..dataset.errors import Interrupted
 from ..dataset.processes import Pool
 from ..dataset.progress import Progress
 from ..dataset.work import run_here
@@ -319,15 +318,12 @@ def evaluate_models(
     planned = sum(group.count for group in groups)
     job = SeverityJob(path or Path(views.scene), groups, Progress(planned, shown=options.progress, noun="views"))
     workers = ViewWorkers(metric=metric)
-    try:
-        with interruptible(), job.progress:
-            if options.workers == 1:
-                run_here(workers, job)
-            else:
-                threads = options.threads or max(1, environment.usable_cores() // options.workers)
-                Pool(workers, job, threads, options.recycle_shards).work(options.workers)
-    except (Stopped, KeyboardInterrupt) as stop:
-        raise Interrupted(f"{job.path}: interrupted; nothing was written", exit_code(stop)) from stop
+    with interruptible(lambda: f"{job.path}: interrupted; nothing was written"), job.progress:
+        if options.workers == 1:
+            run_here(workers, job)
+        else:
+            threads = options.threads or max(1, environment.usable_cores() // options.workers)
+            Pool(workers, job, threads, options.recycle_shards).work(options.workers)
     if 2 * len(job.errors) < planned:
         raise VbnfaultError(
             f"{views.scene}: only {len(job.errors)} of {planned} views have {metric} without faults; take another "

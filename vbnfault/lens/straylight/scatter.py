@@ -13,6 +13,7 @@ import json
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -32,6 +33,7 @@ from .pyramid import in_layers
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
+C128 = NDArray[np.complex128]
 
 REFERENCE_NM = 550.0  # wavelength at which roughness and the Harvey knee are quoted
 # Outside these limits the models are not valid: a surface is not optically smooth, or dust covers all of it.
@@ -194,10 +196,9 @@ def obscured_fraction(cleanliness_level: float) -> float:
 def scattered_intensity(size_parameter: ArrayLike, cosine: ArrayLike, *, index: complex = DUST_INDEX) -> F64:
     """Return k² dσ/dΩ of spheres for unpolarised light, float64[size, angle].
 
-    Up to a size parameter π D/λ of 500, the result is Mie's series, with coefficients from miepython. For larger
-    spheres, the result is the sum of Fraunhofer diffraction, the rays reflected outside and the rays refracted
-    twice, without interference. Up to 70°, this sum is within 8 % of the mean of Mie's series over sizes; at 90°
-    the sum is a fifth below this mean.
+    Up to a size parameter π D/λ of 500, the result is Mie's series. For larger spheres, the result is the sum of
+    Fraunhofer diffraction, the rays reflected outside and the rays refracted twice, without interference. Up to
+    70°, this sum is within 8 % of the mean of Mie's series over sizes; at 90° the sum is a fifth below this mean.
     """
     x, mu = np.atleast_1d(np.asarray(size_parameter, float)), np.atleast_1d(np.asarray(cosine, float))
     small = x <= _MIE_LARGEST
@@ -211,26 +212,53 @@ def _mie(x: F64, mu: F64, index: complex) -> F64:
     """Return the intensity by Mie's series, as one matrix product (Bohren & Huffman 1983, chapter 4)."""
     if not len(x):
         return np.empty((0, len(mu)))
-    import miepython
-
-    # miepython has the opposite sign of absorption
-    series = [miepython.coefficients(np.conj(index), float(size)) for size in x]
-    orders = max(s.shape[1] for s in series)
+    a, b = _coefficients(x, index)
+    orders = a.shape[1]
     pi, tau = np.zeros((2, orders + 1, len(mu)))
     pi[1] = 1
     for n in range(1, orders + 1):
         if n > 1:
             pi[n] = ((2 * n - 1) * mu * pi[n - 1] - n * pi[n - 2]) / (n - 1)
         tau[n] = n * mu * pi[n] - (n + 1) * pi[n - 1]
-    a, b = np.zeros((2, len(x), orders), complex)
-    for row, s in enumerate(series):
-        a[row, : s.shape[1]], b[row, : s.shape[1]] = s
     order = np.arange(1, orders + 1)
     a, b = ((2 * order + 1) / (order * (order + 1)) * c for c in (a, b))
     plus = (a + b) @ (pi + tau)[1:]
     minus = (a - b) @ (pi - tau)[1:]
     # S1 and S2 are half the sum and half the difference of the two
     return (np.abs(plus) ** 2 + np.abs(minus) ** 2) / 4
+
+
+def _coefficients(x: F64, index: complex) -> tuple[C128, C128]:
+    """Return the coefficients a and b of Mie's series, complex128[size, order - 1]; 0 beyond Wiscombe's last order.
+
+    They follow from the Riccati-Bessel functions ψ and χ of x and from ψ'/ψ of x and of `index` x (Bohren & Huffman
+    1983, eq. 4.88). Each recurrence runs in its stable direction: χ upwards, ψ'/ψ downwards. ψ follows from both by
+    the Wronskian ψ'χ - ψχ' = 1. Up to x = 500 the error is below 1e-13.
+    """
+    last = np.floor(x + 4.05 * np.cbrt(x) + 2)  # Wiscombe 1980, Applied Optics 19, 1505
+    orders = int(last.max())
+    n = np.arange(1, orders + 1)[:, None]
+
+    def logarithmic_derivative(z: NDArray[Any]) -> NDArray[Any]:
+        value = np.zeros((orders + 1, len(x)), z.dtype)
+        for k in range(orders + 16 + int(np.abs(z).max()), 0, -1):
+            value[min(k - 1, orders)] = k / z - 1 / (value[min(k, orders)] + k / z)
+        return value[1:]
+
+    chi = np.empty((orders + 1, len(x)))
+    chi[0], before = np.cos(x), -np.sin(x)
+    with np.errstate(over="ignore", invalid="ignore"):  # of small spheres beyond their last order
+        for k in range(orders):
+            chi[k + 1], before = (2 * k + 1) / x * chi[k] - before, chi[k]
+        inside, outside = logarithmic_derivative(index * x), logarithmic_derivative(x) + n / x
+        psi = 1 / (outside * chi[1:] - chi[:-1])
+        psi_before = outside * psi
+        xi, xi_before = psi - 1j * chi[1:], psi_before - 1j * chi[:-1]
+        a, b = (
+            np.where(n <= last, (factor * psi - psi_before) / (factor * xi - xi_before), 0).T
+            for factor in (inside / index + n / x, inside * index + n / x)
+        )
+    return a, b
 
 
 def _large(x: F64, mu: F64, index: complex) -> F64:
@@ -270,7 +298,7 @@ def _intensities(index: complex) -> tuple[F64, F64, F64]:
         return {"intensity": scattered_intensity(np.sqrt(edges[1:] * edges[:-1]), np.cos(angles), index=index)}
 
     here = Path(__file__)
-    code = code_hash([here, here.parents[1] / "coating.py"], ["miepython"])
+    code = code_hash([here, here.parents[1] / "coating.py"])
     key = hashlib.sha256(json.dumps([code, index.real, index.imag]).encode()).hexdigest()
     table = _TABLES.kept(key, computed)["intensity"]
     for array in (edges, angles, table):

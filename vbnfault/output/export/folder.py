@@ -113,7 +113,7 @@ class Folder:
     def _is_whole(self) -> bool:
         """Return whether all files of a complete export have their checksums still."""
         try:
-            lines = disk.read(self.path / SUMS).decode().splitlines()
+            lines = disk.read(self.path / SUMS, _MOST_BYTES).decode().splitlines()
         except (OSError, ValueError):
             return False
         return all(self._has(name, checksum) for checksum, _, name in (line.partition("  ") for line in lines))
