@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import ast
+import importlib.metadata
 import re
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
@@ -13,6 +15,7 @@ from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 
 import vbnfault
 
@@ -202,6 +205,37 @@ def test_only_one_unit_imports(library: str) -> None:
         if i.target.split(".")[0] == library and not {i.unit, i.module} & ONLY[library]
     ]
     assert not wrong
+
+
+def requirements() -> list[Requirement]:
+    project = tomllib.loads((ROOT.parent / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    return [Requirement(line) for line in project["dependencies"]]
+
+
+def test_every_required_package_that_is_imported_is_declared() -> None:
+    """And the next versions are refused that rename what is used here: Mitsuba 3.10 has other meshes."""
+    declared = {required.name: required.specifier for required in requirements()}
+    imported = {i.target.partition(".")[0] for i in imports() if i.target_unit is None}
+    names = importlib.metadata.packages_distributions()
+    needed = {name.replace("_", "-") for module in imported for name in names.get(module, [])}
+    optional = {"SALib", "dask", "distributed", "obstore", "spiceypy", "torch", "vbnfault"}
+    assert needed - optional <= declared.keys() | {"pydantic-core"}  # pydantic requires one version of it
+    for name, version in (("mitsuba", "3.10.0"), ("drjit", "1.6.0"), ("zarr", "4.0.0"), ("pydantic", "3.0.0")):
+        assert version not in declared[name]
+        assert importlib.metadata.version(name) in declared[name]
+
+
+def test_an_installation_needs_no_compiler() -> None:
+    """Numba and its LLVM are 208 MB."""
+    found, left = set[str](), [required.name for required in requirements()]
+    while left:
+        name = left.pop()
+        if name not in found:
+            found.add(name)
+            asked = [Requirement(line) for line in importlib.metadata.requires(name) or []]
+            left += [r.name for r in asked if r.marker is None or r.marker.evaluate({"extra": ""})]
+    assert {"pandas", "networkx"} <= found  # of xarray and scikit-image
+    assert not found & {"numba", "llvmlite", "torch", "astropy"}
 
 
 def test_spectra_need_numpy_scipy_and_colour_only() -> None:

@@ -27,8 +27,8 @@ _winding_up: list[finishing] = []
 _reporters: list[Callable[[sys.UnraisableHookArgs], Any]] = []
 # The signals since the outermost `listening` block began: C code may replace `Stopped` by another exception.
 _recorded: list[int] = []
-# The functions that hold an `interruptible` block. Once a function has ended, nothing is raised in its callers, so
-# that they can say in peace what happened.
+# The frames of the functions with an `interruptible` block. A signal is raised only in these functions and in those
+# that they call; so a caller reports the outcome without interruption, however many signals arrive.
 _interruptible: list[FrameType] = []
 
 

@@ -79,8 +79,10 @@ def _factors(table: AlbedoMapTable) -> Float32:
         and np.array_equal(values[..., 0], values[..., 2])
     ):
         values = values[..., :1]
-    if table.encoding == "srgb":  # IEC 61966-2-1
-        values = np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4).astype(np.float32)
+    if table.encoding == "srgb":
+        from colour.models import eotf_sRGB  # takes two seconds to import
+
+        values = eotf_sRGB(values).astype(np.float32)
     if is_equal_area:
         values = _with_equal_latitudes(values)
         rows = len(values)
