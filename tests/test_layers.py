@@ -191,7 +191,7 @@ def test_mask_effect_is_stored_by_default_and_soft_layers_need_their_fault() -> 
 
 def test_mask_any_holds_the_pixels_that_several_faults_turn_white() -> None:
     """Bright grains and flares saturate the same pixels: none of the two changes anything there alone."""
-    grains = {"density_per_m3": [1e5, 1e5], "albedo": [0.6, 0.6], "radius_mm": [5, 100], "size_exponent": 1.0}
+    grains = {"density_per_m3": [1e5, 1e5], "albedo": [0.6, 0.6], "radius_mm": [5, 100], "size_exponent": 1}
     table = small_scene(
         dataset={"samples": 3, "sites": 1, "layers": ["clean", "mask_effect"]},
         plan={"faulty_fraction": 1.0, "mode": "per_class", "on_invisible": "drop"},
@@ -199,7 +199,7 @@ def test_mask_any_holds_the_pixels_that_several_faults_turn_white() -> None:
     )
     table["faults"] = {
         "straylight": {"count": [10, 10], "radius": [0.3, 0.3], "brightness": [2.5, 2.5]},
-        "particles": {**grains, "nearest_m": 2.0, "farthest_m": 30.0},
+        "particles": {**grains, "nearest_m": 2.0, "farthest_m": 30.0, "most_grains": 5000},
     }
     frame = Session(config.parse_scene(table, source="test")).frame(1)
     development, draws = frame.injection.development, frame.injection.draws
