@@ -63,3 +63,16 @@ def test_describe_prints_the_size_of_the_body_its_doubts_and_the_values_of_67p_t
     assert not [line for line in right if "body.unit" in line]
     (doubt,) = (line for line in lines(1.2, 1.1, 1.0) if "body.unit" in line)
     assert "2.4 m long, has a mean radius below 5 m and is shorter than 3 times patch.radius_m" in doubt
+
+
+def test_describe_says_how_many_samples_get_no_fault_how_a_defect_looks_and_how_often_suns_are_seen() -> None:
+    lines = described("dataset.samples=64", scene="paper67p")
+    (faults,) = (line for line in lines if line.startswith("faults: "))
+    assert faults.startswith("faults: 32 of 64 samples (50%) get none")
+    assert "broken_pixels: each defect shows as a plus of five pixels" in faults
+    (suns,) = (line for line in lines if line.startswith("Suns: "))
+    own, count, other, none = map(
+        int, re.search(r"(\d+) of (\d+) are seen.*, (\d+) only.*and (\d+) from", suns).groups()
+    )  # type: ignore[union-attr]
+    assert own + other + none == count > 10
+    assert own > 0.8 * count

@@ -18,6 +18,7 @@ from vbnfault.core.errors import InputError
 from vbnfault.core.quantities import SOFT_KINDS, soft_kind
 from vbnfault.faults import Fault, from_dict, registry
 from vbnfault.pipeline import Session
+from vbnfault.pipeline.record import to_sample
 from vbnfault.scene import config, sampling
 
 # The names of layers that the scene file takes; the patterns of names are filled in below.
@@ -186,3 +187,28 @@ def test_mask_effect_is_stored_by_default_and_soft_layers_need_their_fault() -> 
     assert "mask_effect" in sampling.DatasetTable().layers
     with pytest.raises(InputError, match="'dust_opacity': no fault of the scene has it; the faults have: none"):
         Session(config.parse_scene({"title": "t", "dataset": {"layers": ["dust_opacity"]}}, source="test"))
+
+
+def test_mask_any_holds_the_pixels_that_several_faults_turn_white() -> None:
+    """Bright grains and flares saturate the same pixels: none of the two changes anything there alone."""
+    grains = {"density_per_m3": [1e5, 1e5], "albedo": [0.6, 0.6], "radius_mm": [5, 100], "size_exponent": 1}
+    table = small_scene(
+        dataset={"samples": 3, "sites": 1, "layers": ["clean", "mask_effect"]},
+        plan={"faulty_fraction": 1.0, "mode": "per_class", "on_invisible": "drop"},
+        camera={"width_px": 64, "height_px": 64, "exposure_s": 5.0},
+    )
+    table["faults"] = {
+        "straylight": {"count": [10, 10], "radius": [0.3, 0.3], "brightness": [2.5, 2.5]},
+        "particles": {**grains, "nearest_m": 2.0, "farthest_m": 30.0, "most_grains": 5000},
+    }
+    frame = Session(config.parse_scene(table, source="test")).frame(1)
+    development, draws = frame.injection.development, frame.injection.draws
+    image, clean = (development.image(d, noisy=False).array for d in (draws, {}))
+    changed = (image != clean).any(axis=2)
+    of_none = changed & ~frame.labels.effects["straylight"] & ~frame.labels.effects["particles"]
+    assert of_none.sum() > 20
+    assert (image[of_none] == 255).all()
+    assert not (changed & ~frame.labels.mask_any).any()
+    sample = to_sample(frame)
+    np.testing.assert_array_equal(sample.layers["mask_any"], frame.labels.mask_any)
+    assert (sample.layers["mask_any"] & ~sample.layers["mask"].any(axis=0))[of_none].all()

@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import zarr
-from synthetic import FAULTS, fake_sample, flip, repaired
+from synthetic import FAULTS, fake_sample, filled, flip, repaired
 
 from vbnfault import store as st
 from vbnfault.core.errors import InputError, VbnfaultError
@@ -242,6 +243,21 @@ def test_a_fault_that_was_not_commanded_is_found(whole: st.Store) -> None:
     assert relabelled(whole, 1, **changes, parameters=parameters) == []
     (sentence,) = st.verify(whole, expected=lambda i, _: {"injected": commanded[i]})
     assert sentence == f"sample 1: {FAULTS[off]} is injected, but the plan does not command it"
+
+
+def test_a_joint_mask_any_may_hold_more_than_the_masks_but_not_less(tmp_path: Path) -> None:
+    store = filled(tmp_path / "s.zarr", mask_any_joint=True)
+    assert st.verify(store) == []
+    index = next(i for i in range(store.samples) if fake_sample(store.spec, i).layers["mask"][:3].any())
+    union = fake_sample(store.spec, index).layers["mask"][:3].any(0)
+    more, less = union.copy(), union & False
+    more[0] = True
+    assert relabelled(store, index, mask_any=more) == []
+    (sentence,) = relabelled(store, index, mask_any=less)
+    assert sentence.startswith(f"sample {index}: mask_any does not hold the masks of ")
+    # as it is read again, also by its description; a store of version 0.2 has the union alone
+    assert st.open_store(store.path).spec.mask_any_joint
+    assert "together" in st.open_store(store.path).array("mask_any").attrs["rule"]
 
 
 # --- coordinates, attributes and metadata -------------------------------------------------------------------

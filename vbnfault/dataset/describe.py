@@ -182,8 +182,8 @@ def _suns_seen(session: Session) -> str:
         for numbers in zip(*((s.diagonal().sum(), (~s.any(axis=0)).sum(), len(s)) for s in of_sites), strict=True)
     )
     return (
-        f"Suns: on the shape model, at {len(some)} of {len(used)} sites chosen for their Suns, {own} of {count} are "
-        f"seen from the position drawn for them, {count - own - never} only from that of another sample, and {never} "
+        f"Suns: on the shape model, at {len(some)} of {len(used)} sites chosen for them, {own} of {count} are seen "
+        f"from the position drawn for them, {count - own - never} only from that of another sample, and {never} "
         "from none, so that a new position is drawn, or at last another Sun"
     )
 
