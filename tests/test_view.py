@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -27,7 +28,7 @@ from vbnfault.core import images
 from vbnfault.core.errors import InputError
 from vbnfault.faults import registry
 from vbnfault.output.contact_sheet import overlay
-from vbnfault.output.viewer import Viewer
+from vbnfault.output.viewer import Viewer, server
 from vbnfault.output.viewer.listing import NOT_KNOWN, Listing, _keys, _measure
 from vbnfault.output.viewer.server import _exact, _plain
 from vbnfault.scene.names import STRATA
@@ -130,6 +131,50 @@ def test_requests_for_another_host_are_refused(served: Served) -> None:
     assert served.ask("/", Host=f"localhost:{served.viewer.port}")[0] == 200
     assert served.ask("/", "POST")[0] == 501
     assert served.viewer.server.server_address[0] == "127.0.0.1"
+
+
+def test_a_browser_leaves_out_the_port_of_http(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert served.ask("/", Host="127.0.0.1")[0] == 403
+    monkeypatch.setattr(server, "_PORT_OF_HTTP", served.viewer.port)  # as if it were that port
+    assert served.ask("/", Host="127.0.0.1")[0] == served.ask("/", Host="localhost")[0] == 200
+    assert served.ask("/", Host="evil.example")[0] == 403
+
+
+def test_connections_without_a_request_are_closed(described_store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One that sends half of a request is closed in time, and one too many at once; a page is served meanwhile."""
+    monkeypatch.setattr(server, "_MOST_CONNECTIONS", 3)
+    one = Served(st.open_store(described_store))
+    address = ("127.0.0.1", one.viewer.port)
+    held = [socket.create_connection(address, timeout=60) for _ in range(2)]
+    for connection in held:
+        connection.sendall(b"GET / HTTP/1.1\r\nHost: ")
+    assert one.ask("/")[0] == 200
+    while len(one.viewer.server.asking) < 2:  # until both threads wait
+        pass
+    held.append(socket.create_connection(address, timeout=60))
+    with socket.create_connection(address, timeout=60) as fourth:
+        assert fourth.recv(1) == b""
+    monkeypatch.setattr(server, "_SECONDS_TO_ASK", 0.0)
+    for connection in held:
+        assert connection.recv(1) == b""
+        connection.close()
+    one.stop()
+
+
+def test_a_folder_that_is_a_link_is_not_served(described_store: Path, tmp_path: Path) -> None:
+    store = shutil.copytree(described_store, tmp_path / "s.zarr")
+    (tmp_path / "private/0/0/0").mkdir(parents=True)
+    (tmp_path / "private/0/0/0/0").write_text("SECRET")
+    shutil.rmtree(store / "normal/c")
+    (store / "normal/c").symlink_to(tmp_path / "private")
+    os.truncate(store / "depth_m/c/0/0/0", 6 << 30)
+    one = Served(st.open_store(store))
+    for headers in ({}, {"Range": "bytes=0-5"}, {"Range": "bytes=-6"}):
+        assert one.ask("/store/normal/c/0/0/0/0", **headers)[0] == 404
+    assert one.ask("/store/depth_m/c/0/0/0")[0] == 404
+    assert one.ask("/store/image/c/0/0/0/0")[0] == 200
+    assert one.ask("/store/zarr.json")[0] == one.ask("/store/image/zarr.json")[0] == 200
+    one.stop()
 
 
 def test_the_page_takes_nothing_from_elsewhere(served: Served) -> None:

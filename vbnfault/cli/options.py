@@ -85,7 +85,18 @@ def on_this_machine(param: typer.CallbackParam, value: Path | None) -> Path | No
 
 def local_path(text: str, *names: str, unset: str | None = None) -> Any:
     """Return an option that takes the path of a file or folder to write; `unset` as `number` says it."""
-    return typer.Option(*names, callback=on_this_machine, help=text, show_default=unset or True)
+    return typer.Option(
+        *names, parser=_path, metavar="PATH", callback=on_this_machine, help=text, show_default=unset or True
+    )
+
+
+def _path(given: str | Path) -> Path:
+    """Return a path that an option was given. Raises BadParameter for an empty one and for the root folder."""
+    if not str(given).strip():  # it would be the working folder
+        raise typer.BadParameter(f"{shown(given)} must be a path, and not empty")
+    if Path(given).root and not Path(given).name:
+        raise typer.BadParameter(f"{shown(given)} is the root folder; choose a folder in it")
+    return Path(given)
 
 
 def replaced(what: str, example: str) -> Any:

@@ -45,11 +45,21 @@ def kind_of(status: os.stat_result) -> str:
 
 
 def path_of(value: object, what: str) -> Path:
-    """Return a path from a text or an object that stands for one. Raises InputError for anything else."""
+    """Return a path from a text or an object that stands for one, its last part a name.
+
+    Raises InputError for anything else: an empty text, which would name the working folder, and the root folder,
+    beside which nothing can lie.
+    """
     try:
-        return Path(value)  # type: ignore[arg-type]
+        path = Path(value)  # type: ignore[arg-type]
     except TypeError:
         raise InputError(f"{what} = {shown(value)}: must be a path") from None
+    if not str(value).strip():
+        raise InputError(f"{what} = {shown(value)}: must be a path, and not empty")
+    path = real(path) if path.name in ("", "..") else path
+    if not path.name:
+        raise InputError(f"{what} = {shown(str(value))}: is the root folder; choose a folder in it")
+    return path
 
 
 def real(path: str | os.PathLike[str]) -> Path:

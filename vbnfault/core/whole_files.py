@@ -34,7 +34,9 @@ def kind_of(error: OSError) -> type[VbnfaultError]:
 
 def unwritable(path: object, error: OSError) -> VbnfaultError:
     """Return the error for a file or folder that cannot be written."""
-    why = "it is a file, not a folder" if isinstance(error, FileExistsError) else error.strerror or str(error)
+    why = error.strerror or str(error)
+    if isinstance(error, FileExistsError):
+        why = "it is a link that leads nowhere" if os.path.islink(str(path)) else "it is a file, not a folder"
     return kind_of(error)(f"{path}: cannot be written: {why}")
 
 

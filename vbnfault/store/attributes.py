@@ -107,8 +107,8 @@ def check_names(spec: Any, samples: int) -> None:
         for name in getattr(spec, field):
             if not _NAME.fullmatch(name) and (name or field == "faults"):
                 raise InputError(
-                    f"store.{field} = {shown(name)}: must be at most 128 lower-case letters, digits and underscores, "
-                    "beginning with a letter"
+                    f"store.{field} = {shown(name)}: must be at most 128 lower-case letters, digits, underscores "
+                    "and begin with a letter"
                 )
     for field in ("faults", "layers"):
         values = getattr(spec, field)

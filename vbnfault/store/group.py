@@ -68,7 +68,8 @@ def check_free(path: str | os.PathLike[str] | Url, spec: StoreSpec, samples: int
 
 def _why_within(target: Location) -> str:
     """Return why no store can be created at a path within another one, as a clause; "" if it is not within one."""
-    above = [] if isinstance(target, Url) else [path for path in real(target).parents if is_store(path)]
+    folders = () if isinstance(target, Url) else real(target).parents
+    above = [path for path in folders if read_root(files_of(path)) is not None]
     return f"lies in the store {above[0]}, and would be lost with it; choose another --out" if above else ""
 
 

@@ -281,8 +281,8 @@ class Store:
             return drawn_table(text)
         except ValueError:
             raise VbnfaultError(
-                f"{self.path}: sample {index}: its {name} are damaged, they are no table in JSON; the build command "
-                "repairs them"
+                f"{self.path}: sample {index}: its {name} are damaged, they are no table in JSON; "
+                "the build command repairs them"
             ) from None
 
     def most_bytes(self, name: str) -> int:
