@@ -204,7 +204,7 @@ def test_without_a_network_a_sentence_says_so(tmp_path: Path) -> None:
 def test_a_wrong_address_is_refused(tmp_path: Path, url: str, sentence: str) -> None:
     with pytest.raises(InputError, match=rf"url = '.*': .*{sentence}"):
         fetch_shape(url, tmp_path)
-    with pytest.raises(InputError, match="file to download = .*: must be a path of at most"):
+    with pytest.raises(InputError, match=r"file to download = .*: must be a path of at most"):
         fetch_shape(f"https://example.org/{'a' * 300}.obj", tmp_path)
 
 
