@@ -198,7 +198,7 @@ def test_without_a_network_a_sentence_says_so(tmp_path: Path) -> None:
         ("https://example.org:x/a.obj", "Port could not be cast"),
         ("https://:80/a.obj", "must begin with http:// or https:// and a host"),
         ("https://a..é/a.obj", "label empty or too long"),
-        (f"https://{'a' * 64}.org/a.obj", "label too long"),
+        (f"https://{'a' * 64}.org/a.obj", "label .*too long"),
         ("https://example.org/a%0ab.obj", "must end with the name of a shape file"),
     ],
 )
