@@ -59,6 +59,7 @@ _UNITS = {
     "_urad": "µrad",
     "_K": "K",
     "_mag_deg": "mag/°",
+    "_deg_day2": "°/d²",
     "_years": "a",
     "_share_yr": "1/a",
 }

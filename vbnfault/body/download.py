@@ -131,9 +131,8 @@ def _encoded(url: str) -> str:
     """Return an address in ASCII: its host by IDNA, the rest in per cent. Raises ValueError for a wrong host."""
     parts = urlsplit(url)
     parts.port  # noqa: B018  (it is checked when it is read)
-    host = parts.netloc if parts.netloc.isascii() else parts.netloc.encode("idna").decode()
     path, query = (quote(text, safe="/%:@!$&'()*+,;=~?") for text in (parts.path, parts.query))
-    return urlunsplit((parts.scheme, host, path, query, ""))
+    return urlunsplit((parts.scheme, parts.netloc.encode("idna").decode(), path, query, ""))
 
 
 def _download(url: str, path: Path, known: str) -> Pin:
@@ -185,9 +184,9 @@ def _received(url: str, file: Any) -> Pin:
                 digest.update(data)
                 file.write(data)
     except HTTPError as error:
-        raise VbnfaultError(f"{url}: the server answers {error.code} {error.reason}") from None
+        raise VbnfaultError(f"{url}: the server answers {error.code} {' '.join(error.reason.split())}") from None
     except (OSError, HTTPException) as error:
-        reason = getattr(error, "reason", None) or error
+        reason = " ".join(str(getattr(error, "reason", None) or error).split())
         raise VbnfaultError(
             f"{url}: cannot be downloaded: {reason}; check the network, or download the file elsewhere and put it "
             "into the folder"

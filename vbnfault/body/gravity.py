@@ -137,20 +137,3 @@ class PolyhedronGravity:
         acceleration = self.evaluate(points).acceleration_m_s2
         acceleration[:, :2] += omega_rad_s**2 * points[:, :2]
         return acceleration
-
-
-def polyhedron_gravity(vertices_m: NDArray, faces: NDArray, density_kg_m3: float, points_m: ArrayLike) -> Float64:
-    """Return the acceleration float64[k, 3] in m/s² at `points_m` float64[k, 3]; see `PolyhedronGravity`."""
-    return PolyhedronGravity(vertices_m, faces, density_kg_m3).evaluate(points_m).acceleration_m_s2
-
-
-def polyhedron_potential(vertices_m: NDArray, faces: NDArray, density_kg_m3: float, points_m: ArrayLike) -> Float64:
-    """Return the potential float64[k] in m²/s², positive, at `points_m` float64[k, 3]; see `PolyhedronGravity`."""
-    return PolyhedronGravity(vertices_m, faces, density_kg_m3).evaluate(points_m).potential_m2_s2
-
-
-def effective_gravity(
-    vertices_m: NDArray, faces: NDArray, density_kg_m3: float, points_m: ArrayLike, *, omega_rad_s: float
-) -> Float64:
-    """Return gravity plus centrifugal term, float64[k, 3] in m/s², of a polyhedron that rotates about +z."""
-    return PolyhedronGravity(vertices_m, faces, density_kg_m3).effective(points_m, omega_rad_s)

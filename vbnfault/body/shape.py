@@ -165,8 +165,8 @@ def check_mesh(vertices: NDArray, faces: NDArray, source: str) -> tuple[Float64,
 def _without_useless_faces(vertices: Float64, faces: NDArray, source: str) -> tuple[NDArray, list[str]]:
     """Drop degenerate, double and loose faces, and return also the list of repairs.
 
-    Of faces with the same corners one stays, or none where the others are closed without them, as on both sides of
-    a sheet within a body. Raises InputError if no face remains.
+    Of faces with the same corners one stays, or none where it would branch off the others, as a sheet within a body
+    with both its sides. Raises InputError if no face remains.
     """
     repairs = []
     sound = _sound_faces(vertices, faces)
@@ -175,14 +175,16 @@ def _without_useless_faces(vertices: Float64, faces: NDArray, source: str) -> tu
         faces = faces[sound]
     if len(faces) == 0:
         raise InputError(f"{source}: mesh has only degenerate faces.")
-    _, first, inverse, copies = np.unique(
-        np.sort(faces, axis=1), axis=0, return_index=True, return_inverse=True, return_counts=True
-    )
-    if len(first) < len(faces):
-        alone = faces[copies[inverse.ravel()] == 1]
-        once = alone if len(alone) and (_undirected_counts(alone) == 2).all() else faces[np.sort(first)]
-        repairs.append(f"dropped {len(faces) - len(once)} double faces")
-        faces = once
+    if (_undirected_counts(faces) > 2).any():
+        _, first, inverse, copies = np.unique(
+            np.sort(faces, axis=1), axis=0, return_index=True, return_inverse=True, return_counts=True
+        )
+        once, alone = faces[np.sort(first)], faces[copies[inverse.ravel()] == 1]
+        if len(alone) and (_undirected_counts(once) > 2).any():
+            once = alone
+        if len(once) < len(faces):
+            repairs.append(f"dropped {len(faces) - len(once)} double faces")
+            faces = once
     loose = _loose_faces(faces)
     if loose.any() and not loose.all():
         repairs.append(f"dropped {int(loose.sum())} loose faces")

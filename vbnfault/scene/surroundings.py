@@ -57,7 +57,9 @@ class SpiceTable(Table):
     """
 
     kernels: tuple[str, ...] = Field(
-        (), max_length=_MOST_KERNELS, description="kernels or meta-kernels; needs the extra 'spice'"
+        (),
+        max_length=_MOST_KERNELS,
+        description="kernels or meta-kernels (paths in these count from their folder); needs the extra 'spice'",
     )
     target: str = Field("CHURYUMOV-GERASIMENKO", description="SPICE name or number")
     frame: str = Field("", description="body-fixed frame; default: pole and period of [body]")
