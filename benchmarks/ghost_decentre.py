@@ -2,12 +2,12 @@
 
     python benchmarks/ghost_decentre.py nikkor_35_f2p8_camera --decentre-mm 0.02 --tilt-arcmin 3
 
-The computation is of first order, with the matrices of paraxial ghosts: a surface that is decentred by δ acts as one
-on the axis and a kick of the slope, -φ δ, with its power φ (a mirror's is 2 c). An element that tilts about its first
-vertex decentres each of its surfaces by the angle times the distance of its centre of curvature from this vertex.
-The kicks at all surfaces of the element that a path meets add up on the sensor, for the ray that still passes the
-middle of the stop. The stop and the other rims do not move, and the flux of a ghost stays as it is: where rims cut a
-ghost, only rays through the decentred lens would give its flux.
+The computation is of first order, with the matrices of paraxial ghosts: a surface of the power φ (of a mirror: 2
+c) that is decentred by δ acts as one on the axis and a kick of the slope, -φ δ. An element that tilts about its
+first vertex decentres each of its surfaces by the angle times the distance of its centre of curvature from this
+vertex. The kicks at all surfaces of the element that a path meets add up on the sensor, for the ray that still
+passes the middle of the stop. The stop and the other rims do not move, and the flux of a ghost stays as it is:
+where rims cut a ghost, only rays through the decentred lens would give its flux.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ import argparse
 import numpy as np
 
 from vbnfault.lens import Prescription, load_lens
-from vbnfault.lens.straylight.paraxial import along, pairs, path_of, transmittance
+from vbnfault.lens.rays import ghost
+from vbnfault.lens.straylight.paraxial import along, pairs, transmittance
 
 _MOST = 8  # ghosts, those with most light
 
@@ -37,7 +38,7 @@ def elements(lens: Prescription) -> list[list[int]]:
 
 def shift_mm(lens: Prescription, pair: tuple[int, int], decentre_mm: dict[int, float]) -> float:
     """Return how far a ghost moves on the sensor where rows are decentred."""
-    path, index = path_of(lens, pair), lens.indices()
+    path, index = ghost(lens, *pair), lens.indices()
     whole, met = along(lens, path)
     at_stop = next(j for j, (row, _) in enumerate(path) if row == lens.stop)
     moved, moved_at_stop, onward = 0.0, 0.0, True
@@ -64,7 +65,7 @@ def main() -> None:
     arguments = parser.parse_args()
     lens = load_lens(arguments.lens)
     tilt, vertex = np.radians(arguments.tilt_arcmin / 60), lens.vertices_mm
-    brightest = sorted(pairs(lens), key=lambda pair: -transmittance(lens, path_of(lens, pair)))[:_MOST]
+    brightest = sorted(pairs(lens), key=lambda pair: -transmittance(lens, ghost(lens, *pair)))[:_MOST]
     print("shift / px of the ghosts of", ", ".join(f"{a}-{b}" for a, b in brightest))
     for rows in elements(lens):
         centres = {row: vertex[row] - vertex[rows[0]] for row in rows}
