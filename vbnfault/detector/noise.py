@@ -22,8 +22,8 @@ F32 = NDArray[np.float32]
 
 # Below this mean the Poisson quantile is summed exactly. Above it an expansion of the form of Giles' is used (2016,
 # ACM TOMS 42, 6, doi 10.1145/2699466). It is wrong by one count in at most 0.2 % of the draws up to 1e4 electrons,
-# and in 0.4 % at 1e5, where float32 rounds. The mean is wrong by at most 0.0005 and 0.005 electrons. Each probability
-# above 1e-6 is right to 1 % up to 1e4 electrons (tests/test_detector.py). The variates have 16 bits, so the
+# and in 0.4 % at 1e5, where float32 rounds. The mean is wrong by at most 0.0005 and 0.005 electrons. Up to 1e4
+# electrons each probability above 1e-6 is right to 1 % (tests/test_detector.py). The variates have 16 bits, so the
 # probability of each drawn count is a multiple of 1.5e-5.
 EXACT_POISSON_BELOW_E = 4.0
 

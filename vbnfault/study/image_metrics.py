@@ -295,8 +295,8 @@ _ALL: dict[str, tuple[Metric, Value]] = {
         _metric(
             "veiling_glare_index",
             "1",
-            "Light that straylight adds to the sunlit ground over all light there, Σ V / Σ (S + V): the standard's ratio "
-            "of the flux of veiling glare to the whole flux, for this scene in place of a uniform field",
+            "Light that straylight adds to the sunlit ground over all light there, Σ V / Σ (S + V): the standard's "
+            "ratio of the flux of veiling glare to the whole flux, for this scene in place of a uniform field",
             _veiling_glare_index,
             "ISO 9358:1994",
         ),
