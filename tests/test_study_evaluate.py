@@ -261,7 +261,7 @@ def test_metrics_are_those_of_their_equations() -> None:
         "mask_area": 1.0,  # half of 100 e are more than 30 DN everywhere
         "ghost_1_flux_e": 3.0,
         "ghost_2_flux_e": np.nan,
-        "veiling_glare_index": 0.0,
+        "veiling_glare_index": 0.25 / 750.25,
         "straylight_over_signal": 300.25 / 800,
         "sun_direct_e": 0.0,
         "ghost_peak_e": np.nan,  # of a model without ghosts of its own

@@ -167,7 +167,8 @@ def _veiling_glare_index(image: LitImage) -> float:
     if not len(image.lit):
         return float("nan")
     kept, added, _ = image.on_lit
-    return _veil_median(image) / float(np.median(kept + added))
+    veil = float(added.sum(dtype=np.float64))
+    return veil / (veil + float(kept.sum(dtype=np.float64)))
 
 
 def _veil_median(image: LitImage) -> float:
@@ -248,7 +249,8 @@ _ALL: dict[str, tuple[Metric, Value]] = {
         _metric(
             "ghost_area",
             "1",
-            "Fraction of pixels to which ghosts alone add more than the noise without straylight, G > √(S₀ + D + r²)",
+            "Fraction of pixels to which ghosts alone add more than the noise without straylight, "
+            "G > √(S₀ + D + r²)",
             _ghosts(_above),
             "EMVA 1288",
         ),
@@ -293,8 +295,8 @@ _ALL: dict[str, tuple[Metric, Value]] = {
         _metric(
             "veiling_glare_index",
             "1",
-            "Veil over the light of the sunlit ground, median of V over the frame / median of S + V over the ground: "
-            "the Sun and the ground stand for the bright field of the standard, the median for its black area",
+            "Light that straylight adds to the sunlit ground over all light there, Σ V / Σ (S + V): the standard's "
+            "ratio of the flux of veiling glare to the whole flux, for this scene in place of a uniform field",
             _veiling_glare_index,
             "ISO 9358:1994",
         ),
