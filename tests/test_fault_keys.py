@@ -74,6 +74,8 @@ def values(f: dataclasses.Field[Any], files: list[str]) -> list[Any]:
         return list(meta["options"])
     if kind in ("text", "path"):
         return {"channels": ["RGBI", "R"], "lens": [files[2], "tessar_50_f2p8"]}.get(f.name, files[:2])
+    if kind == "paths":
+        return [[], files[:1], files[:2]]
     if kind == "rows":
         return [[], [{k: float(np.ceil(lo + 0.05 * (hi - lo))) for k, (lo, hi) in meta["columns"].items()}]]
     lo, hi = meta["limits"]

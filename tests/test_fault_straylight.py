@@ -9,11 +9,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tifffile
 from test_faults_kit import flat_electrons, make, make_context, rng
 
 from vbnfault.core.errors import InputError
+from vbnfault.core.images import write_png
 from vbnfault.core.resources import data_dir
-from vbnfault.faults.straylight import CLOSE, FAR, flare_centres_px, pyramid
+from vbnfault.core.user_files import sha256
+from vbnfault.dataset.identity import _contents_of_fault
+from vbnfault.faults import from_dict
+from vbnfault.faults.straylight import CLOSE, FAR, flare_centres_px, texture
+from vbnfault.scene import config
 
 # The script that draws the packaged textures; it is no part of the package.
 SCRIPT = runpy.run_path(str(Path(__file__).parents[1] / "benchmarks" / "flare_textures.py"))
@@ -90,7 +96,7 @@ def test_texture_axis_follows_the_line() -> None:
 def test_brightness_and_visible_fraction_scale_the_light() -> None:
     context = make_context(256, sun=(60.0, 60.0))
     base = added(context, one(4).draw(context, rng()), one(4))
-    assert base.max() == pytest.approx(1.5 * pyramid("flare_04")[0].max(), rel=0.05)
+    assert base.max() == pytest.approx(1.5 * texture("flare_04").levels[0].max(), rel=0.05)
     bright = one(4, brightness=3.0)
     assert np.allclose(added(context, bright.draw(context, rng()), bright), 2 * base, rtol=1e-5, atol=1e-8)
     half = make_context(256, sun=(60.0, 60.0), visible=0.5)
@@ -101,6 +107,86 @@ def test_brightness_and_visible_fraction_scale_the_light() -> None:
         params = fault.draw(context, rng())
         assert not added(context, params, fault).any()
         assert not fault.footprint(params, context).any()
+
+
+def own(folder: Path, name: str, colour: tuple[float, float, float], shape: tuple[int, int] = (60, 60)) -> str:
+    """A rectangle of one colour, as a user's own texture."""
+    image = np.broadcast_to(np.rint(np.array(colour) * 65535).astype(np.uint16), (*shape, 3))
+    return str(write_png(folder / f"{name}.png", image))
+
+
+def test_own_textures_lie_on_the_line_of_the_sun(tmp_path: Path) -> None:
+    """Their own size, side and colours; the light is brightness · texture, with the Sun's line to the right."""
+    context = make_context(512, sun=(56.0, 256.0))
+    wide = own(tmp_path, "wide", (0.5, 0.25, 0.125), shape=(40, 100))
+    glare = own(tmp_path, "glare", (0.0, 0.0, 0.2))
+    row = {"index": 1, "position": 1.0, "radius": 0.1, "brightness": 1.2}
+    fault = make("straylight", flares=[row], glare=0, far_textures=wide)
+    light = added(context, fault.draw(context, rng()), fault)
+    # from 0.1 · 512 px on either side of the centre of the frame, and 0.4 of this above and below
+    lit = light[..., 0] > 0.3
+    assert np.flatnonzero(lit.any(axis=0))[[0, -1]] == pytest.approx([256 - 51, 256 + 50], abs=1)
+    assert np.flatnonzero(lit.any(axis=1))[[0, -1]] == pytest.approx([256 - 20, 256 + 19], abs=1)
+    np.testing.assert_allclose(light[256, 256], 1.2 * np.array([0.5, 0.25, 0.125]), rtol=1e-4)
+    upright = make_context(512, sun=(256.0, 56.0))  # turned with the line
+    turned = added(upright, fault.draw(upright, rng()), fault)
+    np.testing.assert_allclose(turned, light.swapaxes(0, 1), atol=2e-3)
+
+    fault = make("straylight", count=0, glare=[1, 2], glare_textures=[glare], glare_brightness=1.0)
+    for seed in range(4):  # glare 2 does not exist, so the first stands for it
+        params = fault.draw(context, np.random.default_rng(seed))
+        assert params["glare"]["index"] == 1
+        np.testing.assert_allclose(added(context, params, fault)[256, 56], [0, 0, 0.2], atol=1e-4)
+
+
+def test_own_textures_close_to_the_sun_stay_closer_than_far_ones(tmp_path: Path) -> None:
+    close = [own(tmp_path, f"close_{k}", (0.1 * k, 0, 0)) for k in (1, 2, 3)]
+    far = [own(tmp_path, f"far_{k}", (0, 0.1 * k, 0)) for k in (1, 2)]
+    fault = make("straylight", count=[1, 10], close_textures=close, far_textures=far, glare=0)
+    context, seen = make_context(256, sun=(30.0, 128.0)), set()
+    for seed in range(40):
+        flares = fault.draw(context, np.random.default_rng(seed))["flares"]
+        groups = [f["index"] > 3 for f in flares]
+        assert groups == sorted(groups)
+        assert [f["position"] for f in flares] == sorted(f["position"] for f in flares)
+        assert len({f["index"] for f in flares}) == len(flares)
+        seen |= {f["index"] for f in flares}
+    assert seen == {1, 2, 3, 4, 5}
+    assert from_dict("straylight", fault.to_dict(), source="t") == fault
+    assert not {"close_textures", "glare_textures"} & make("straylight").to_dict().keys()
+
+
+def test_own_textures_that_cannot_be_used_are_refused(tmp_path: Path) -> None:
+    good, bright = own(tmp_path, "good", (0.5, 0.5, 0.5)), tmp_path / "bright.tif"
+    tifffile.imwrite(bright, np.full((8, 8), 1.5, np.float32))
+    for keys, said in (
+        ({"close_textures": [good] * 6, "far_textures": [good] * 5}, "there are 11 textures; must be at most 10"),
+        ({"glare_textures": [good] * 3}, "glare_textures: there are 3 textures; must be at most 2"),
+        ({"close_textures": [good], "index": [2, 5]}, "index leaves 0 textures"),
+        ({"far_textures": [str(tmp_path / "none.png")]}, r"far_textures: .*none\.png: texture file not found"),
+        ({"far_textures": [str(bright)]}, r"far_textures: .*bright\.tif: has values that are .* above white"),
+        (
+            {"far_textures": [good], "flares": [PAPER_EXAMPLE[0]]},
+            r"flares\[0\]\.index = 3: must be a whole number from 1 to 1",
+        ),
+    ):
+        with pytest.raises(InputError, match=said):
+            make("straylight", **keys)
+
+
+def test_a_scene_takes_own_textures_from_its_folder_and_knows_their_contents(tmp_path: Path) -> None:
+    own(tmp_path, "mine", (0.5, 0.5, 0.5))
+    path = tmp_path / "scene.toml"
+    path.write_text('title = "t"\n[faults.straylight]\nclose_textures = ["mine.png"]\n')
+    scene = config.load_scene(path)
+    assert scene.faults["straylight"]["close_textures"] == [str(tmp_path / "mine.png")]
+    table = (fault := from_dict("straylight", scene.faults["straylight"], source="t")).to_dict()
+    _contents_of_fault(table, fault, scene)
+    first = table["close_textures"]
+    own(tmp_path, "mine", (0.5, 0.5, 0.4))
+    table = fault.to_dict()
+    _contents_of_fault(table, fault, scene)
+    assert first != table["close_textures"] == [f"sha256:{sha256((tmp_path / 'mine.png').read_bytes())}"]
 
 
 def test_the_papers_example() -> None:
@@ -181,7 +267,7 @@ def test_bad_tables_are_refused() -> None:
 @pytest.mark.parametrize("name", list(TEXTURES))
 def test_texture_can_be_made_again(name: str) -> None:
     made = make_texture(name).astype(np.int64)
-    stored = np.rint(pyramid(name)[0].astype(np.float64) * 65535).astype(np.int64)
+    stored = np.rint(texture(name).levels[0].astype(np.float64) * 65535).astype(np.int64)
     # another machine's exp and cos may round a value over a step's edge
     assert np.abs(made - stored).max() <= STEP
     assert (made != stored).mean() < 1e-3
@@ -200,7 +286,7 @@ def test_sources_name_every_texture_with_its_hash() -> None:
 
 @pytest.mark.parametrize("name", list(TEXTURES))
 def test_flares_are_translucent_and_halvings_keep_the_light(name: str) -> None:
-    levels = pyramid(name)
+    levels = texture(name).levels
     if name.startswith("flare"):
         assert 0.05 < levels[0].max() < 0.35
     means = [level.mean(axis=(0, 1), dtype=np.float64) for level in levels]

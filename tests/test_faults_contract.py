@@ -96,6 +96,7 @@ def test_wrong_types_and_unknown_keys_are_refused(
     with pytest.raises(InputError, match=rf"faults\.{name}\.colour_of_the_moon: unknown key"):
         from_dict(name, base | {"colour_of_the_moon": 1}, source="test.toml")
     wrong = {"number": "a lot", "flag": 1, "choice": "sideways", "text": 3, "path": 3, "rows": [{"nothing": 1}]}
+    wrong |= {"paths": [3]}
     for f in dataclasses.fields(registry()[name][model]):
         if f.metadata["kind"] in wrong:
             with pytest.raises(InputError, match=rf"faults\.{name}\.{f.name}"):

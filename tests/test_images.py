@@ -185,6 +185,7 @@ def test_other_tiff_is_refused_in_a_sentence(capfd: pytest.CaptureFixture[str]) 
     assert done
     scale = '<GDALMetadata><Item name="SCALE" sample="0" role="scale">0.1</Item></GDALMetadata>'
     good = tiff(grey)
+    predictor = [struct.pack("<HHIH", tag, 3, 1, 2) for tag in (65000, 317)]
     cases: list[tuple[bytes, str]] = [
         (tiff(np.stack([grey] * 4, axis=-1), photometric="separated"), "colours of the kind SEPARATED"),
         (tiff(np.stack([grey] * 5, axis=-1), photometric="minisblack", planarconfig="contig"), "with 5 bands"),
@@ -196,6 +197,7 @@ def test_other_tiff_is_refused_in_a_sentence(capfd: pytest.CaptureFixture[str]) 
         (by_jpeg.tobytes(), "the compression JPEG; must be none, LZW, PackBits, deflate or LZMA"),
         (tiff(grey, extratags=[(42113, "s", 0, "50", True)]), "marks 3500 of its values as missing"),
         (tiff(grey, extratags=[(42112, "s", 0, scale, True)]), "a scale or an offset"),
+        (tiff(grey, extratags=[(65000, "H", 1, 2, True)]).replace(*predictor), "differences along its rows"),
         (good[:-9], "ends before its last pixel"),
         (good[:20], "damaged TIFF"),
         (tiff(iter([zlib.compress(bytes(3000))]), shape=(50, 70), dtype="u1", compression=8), "damaged TIFF"),

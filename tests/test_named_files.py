@@ -23,6 +23,10 @@ KEYS = {
     "plugins": ("py", 'plugins = ["{}"]'),
     "faults.pixel_overwriting: texture_file": ("png", '[faults.pixel_overwriting]\ntexture_file = "{}"'),
     **{
+        f"faults.straylight: {key}": ("png", f'[faults.straylight]\n{key} = ["{{}}"]')
+        for key in ("close_textures", "far_textures", "glare_textures")
+    },
+    **{
         f"faults.{name}: lens": ("toml", f'[faults.{name}]\nmodel = "{model}"\nlens = "{{}}"')
         for name, model in (
             ("dust_on_optics", "defocused"),

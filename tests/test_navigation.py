@@ -261,6 +261,10 @@ def test_directions_behind_the_fold_of_the_distortion_have_no_pixel() -> None:
     np.testing.assert_array_equal(np.isfinite(pixels[:, 0]), [True, True, False, False])
     beyond = INTRINSICS[2:] + INTRINSICS[:2] * [0.9, 0]  # t - 0.2 t³ is at most 0.861
     assert np.isnan(view.slopes(beyond[None])).all()
+    inside = INTRINSICS[2:] + np.random.default_rng(1).uniform(-50, 50, (20, 2))
+    for first, second in ((inside, inside + beyond), (inside + beyond, inside)):
+        with pytest.raises(InputError, match="farther from the centre than the distortion of their view reaches"):
+            navigation.relative_pose(navigation.Matches(first_xy=first, second_xy=second), view, view)
     with pytest.raises(InputError, match=r"view\.valid_to_deg = 0: must be above 0"):
         navigation.CameraView(
             intrinsics=INTRINSICS, camera_from_T=np.eye(3), camera_position_T_m=np.zeros(3), valid_to_deg=0

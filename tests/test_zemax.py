@@ -279,6 +279,14 @@ def test_missing_rims_let_the_beams_of_the_file_pass(tmp_path: Path, named: str,
     assert f"DIAM of SURF {listed} from the paraxial beams of " in lens.source
 
 
+def test_a_missing_rim_stays_within_its_ball(tmp_path: Path) -> None:
+    """A paraxial beam may be wider than a ball lens in glass, whose rim then lies just inside the equator."""
+    ball = "SURF 1\n CURV 0.2\n DISZ 10\n GLAS N-BK7 0 0 1.5168 64.17\nSURF 2\n CURV -0.2\n DISZ 2\n"
+    text = HEAD.replace("ENPD 10", "ENPD 12") + OBJECT + ball + "SURF 3\n STOP\n CURV 0\n DISZ 1\nSURF 4\n CURV 0\n"
+    table, _, _ = read_lens(written(tmp_path, text))
+    assert table["surface"][0]["diameter_mm"] == pytest.approx(9.99)
+
+
 def test_a_stop_of_no_known_width_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="SURF 2: DIAM: the semi-diameter is missing, and neither ENPD, FNUM nor"):
         load_lens(written(tmp_path, without(TRIPLET, "DIAM", "CLAP", "ENPD")))

@@ -113,6 +113,8 @@ def _check_kind(page: TiffPage) -> None:
         wrong = "inverted or indexed values that are signed or no whole numbers"
     elif page.fillorder != 1 and page.compression != _NONE:
         wrong = "packed bits in reverse order; save it with deflate"
+    elif page.predictor != 1 and page.compression in (_NONE, _PACKBITS):  # libtiff does not undo them
+        wrong = "differences along its rows, which its compression does not know; save it with deflate"
     elif extra < 0 or is_grey_and_more:
         wrong = f"{page.samplesperpixel} bands that it does not call red, green and blue; say so in it, or save one"
     elif re.search('role="(scale|offset)"', str(page.tags.valueof(_GDAL_METADATA, ""))):
@@ -206,7 +208,9 @@ def _unpredicted(page: TiffPage, block: Bytes, wide: int, together: int) -> NDAr
     """Return a block's numbers, [y, x, sample], from its bytes [y, byte], which may be differences along a row."""
     bits, kind = page.bitspersample, {1: "u", 2: "i", 3: "f"}[page.sampleformat]
     rows, order = len(block), page.parent.byteorder
-    if page.predictor == 3:  # of floating-point numbers: differences of bytes, the first byte of all numbers first
+    if (
+        page.predictor == 3 and kind == "f"
+    ):  # of floating-point numbers: differences of bytes, the first byte of all numbers first
         steps = block.reshape(rows, -1, together).cumsum(axis=1, dtype=np.uint8)
         planes = steps.reshape(rows, bits // 8, wide * together)
         values = np.ascontiguousarray(np.moveaxis(planes, 1, -1)).view(f">f{bits // 8}")

@@ -158,7 +158,9 @@ def _needs_sun(cls: type[Fault], faults: Mapping[str, Fault]) -> bool:
 def _contents_of_fault(table: dict[str, Any], fault: Fault, scene: Scene) -> None:
     """Replace each path in the table of a fault by a digest of the file's contents."""
     for f in dataclasses.fields(fault):
-        if f.metadata["kind"] == "path" and table[f.name]:
+        if f.metadata["kind"] == "paths" and f.name in table:
+            table[f.name] = [_digest(path, f.metadata["content"]) for path in table[f.name]]
+        elif f.metadata["kind"] == "path" and table[f.name]:
             content, packaged, path = f.metadata["content"], f.metadata["packaged"], table[f.name]
             if content == "lens":
                 table[f.name] = _lens_digest(path)

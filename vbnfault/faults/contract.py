@@ -260,6 +260,8 @@ class Fault:
                 value = [value.lo, value.hi]
             elif f.metadata.get("kind") == "rows":
                 value = [dict(row) for row in value]
+            elif f.metadata.get("kind") == "paths":
+                value = list(value) or None
             if value is not None:  # TOML has no null, so a missing number stays out
                 plain[f.name] = value
         return plain

@@ -163,6 +163,11 @@ def path(*, content: str = "data", packaged: str = "", doc: str) -> Any:
     return field(default="", metadata={"kind": "path", "content": content, "packaged": packaged, "doc": doc})
 
 
+def paths(*, content: str = "data", doc: str) -> Any:
+    """Declare a list of paths of files, each as `path` declares one; empty by default. One path needs no list."""
+    return field(default=(), metadata={"kind": "paths", "content": content, "packaged": "", "doc": doc})
+
+
 def rows(columns: Mapping[str, tuple[float, float]], *, doc: str) -> Any:
     """Declare a list of tables with the given numeric columns and their limits.
 
@@ -180,6 +185,8 @@ def parse_field(value: Any, f: dataclasses.Field[Any], where: str) -> Any:
     # the numbers stay as they were given, 1 a whole number
     if kind == "rows":
         return tuple(dict(row) for row in value)
+    if kind == "paths":
+        return (value,) if isinstance(value, str) else tuple(value)
     if kind == "bounds":
         return Interval(*value) if isinstance(value, list | tuple) else Interval(value, value)
     return value
@@ -215,6 +222,8 @@ def _type_of(meta: Mapping[str, Any]) -> Any:
             return one_of[meta["options"]]
         case "text" | "path":
             return StrictStr
+        case "paths":
+            return StrictStr | list_of[StrictStr]
         case "rows":
             columns: dict[str, Any] = {name: (_number(*limits), ...) for name, limits in meta["columns"].items()}
             return list_of[create_model("Row", __base__=tables.Table, **columns)]

@@ -289,7 +289,7 @@ def path_fields(fault_class: str) -> dict[str, str]:
         f.name: f.metadata["packaged"]
         for cls in registry().get(fault_class, {}).values()
         for f in dataclasses.fields(cls)
-        if f.metadata["kind"] == "path"
+        if f.metadata["kind"] in ("path", "paths")
     }
 
 

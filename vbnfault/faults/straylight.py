@@ -21,6 +21,8 @@ Choices where the paper says nothing:
 - Position, radius and brightness are drawn uniformly within the bounds of the paper's table. (The paper's remark on
   positions beyond (0, 1) explains why the table ends at 2: farther flares leave the frame.) The radius refers to
   the width of the image. A draw without a flare in the frame is repeated, up to 256 times.
+- A user's own textures (`close_textures`, `far_textures`, `glare_textures`) take the place of the packaged ones.
+  They are numbered in the order given, close ones first, and `radius` is then that of half their longer side.
 - One of two glares, or none, with equal probability, is at the Sun, if the Sun is in the frame or so near that the
   glare reaches into it. Its bounds, radius 0.2-0.45 and brightness 0.8-1.6, are ours.
 - The mask holds the pixels of the image that change. The footprint holds the pixels to which the textures add at
@@ -29,9 +31,10 @@ Choices where the paper says nothing:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -46,7 +49,7 @@ from ..core.resources import data_dir
 from ..core.user_files import read_input
 from .context import FaultContext, Params
 from .contract import Fault
-from .fields import Interval, Severity, bounds, number, rows
+from .fields import Interval, Severity, bounds, number, paths, rows
 from .planes import intensity_dn, plus, reaches
 
 # Radius of a flare's outline over half the side of its texture, as `benchmarks/flare_textures.py` draws it.
@@ -54,6 +57,8 @@ FILL = 0.9
 CLOSE = (1, 2, 3, 4, 5)
 FAR = (6, 7, 8, 9, 10)
 GLARES = (1, 2)
+TYPES = (".png", ".tif", ".tiff")
+_SIDES = 64  # an own texture gets a border up to a multiple of this, so that it can be halved
 MAX_DRAWS = 256
 LARGEST_VALUES = 2**26  # of a texture, 256 MiB while it is decoded
 
@@ -103,6 +108,13 @@ class TextureStraylight(Fault):
         unit="DN of 255",
         doc="the mask holds the pixels that the noise-free image changes in by at least this much",
     )
+    close_textures: tuple[str, ...] = paths(
+        content="texture",
+        doc="your own flares near the Sun, up to ten with the far ones, in place of the packaged ones: PNG or TIFF "
+        "files, linear, black where nothing is added, their right side away from the Sun",
+    )
+    far_textures: tuple[str, ...] = paths(content="texture", doc="your own flares far from the Sun")
+    glare_textures: tuple[str, ...] = paths(content="texture", doc="your own glares at the Sun, up to two")
     flares: tuple[Mapping[str, float], ...] = rows(
         {"index": (1, 10), "position": (-20, 20), "radius": (1e-3, 5), "brightness": (0, 1000)},
         doc="the flares themselves, in place of a draw of count, index, position, radius and brightness",
@@ -115,12 +127,34 @@ class TextureStraylight(Fault):
 
     def validate(self) -> None:
         """Raise ValueError if there are fewer textures than flares or an index is not a whole number."""
-        choices = int(self.index.hi) - int(self.index.lo) + 1
+        names, glares, _ = self._textures()
+        for key, most, all_of_them in (
+            ("far_textures" if self.far_textures else "close_textures", FAR[-1], names),
+            ("glare_textures", GLARES[-1], glares),
+        ):
+            if len(all_of_them) > most:
+                raise ValueError(f"{key}: there are {len(all_of_them)} textures; must be at most {most}")
+        for key in ("close_textures", "far_textures", "glare_textures"):
+            for path in getattr(self, key):
+                try:
+                    texture(path)
+                except InputError as error:
+                    raise ValueError(f"{key}: {error}") from None
+        choices = max(min(int(self.index.hi), len(names)) - int(self.index.lo) + 1, 0)
         if self.count.lo > choices:
             raise ValueError(f"count = {list(self.count)}: index leaves {choices} textures, each used once")
         for i, row in enumerate(self.flares):
-            if not float(row["index"]).is_integer():
-                raise ValueError(f"flares[{i}].index = {row['index']}: must be a whole number from 1 to 10")
+            if not float(row["index"]).is_integer() or row["index"] > len(names):
+                raise ValueError(
+                    f"flares[{i}].index = {row['index']}: must be a whole number from 1 to {len(names)}"
+                )
+
+    def _textures(self) -> tuple[tuple[str, ...], tuple[str, ...], int]:
+        """Return names or paths of all flares and of all glares, and how many flares are close to the Sun."""
+        flares, close = self.close_textures + self.far_textures, len(self.close_textures)
+        if not flares:
+            flares, close = tuple(f"flare_{k:02d}" for k in (*CLOSE, *FAR)), len(CLOSE)
+        return flares, self.glare_textures or tuple(f"glare_{k}" for k in GLARES), close
 
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
         """Return `flares`, `glare`, the centre of the image in px and the mask level.
@@ -149,10 +183,11 @@ class TextureStraylight(Fault):
 
     def _draw_flares(self, rng: np.random.Generator) -> list[dict[str, Any]]:
         """Return the tables of drawn flares, sorted by position and radius."""
-        textures = np.arange(int(self.index.lo), int(self.index.hi) + 1)
+        names, _, close = self._textures()
+        textures = np.arange(int(self.index.lo), min(int(self.index.hi), len(names)) + 1)
         count = min(self.count.integer(rng), len(textures))
         chosen = rng.permutation(textures)[:count]
-        chosen = np.concatenate([chosen[chosen <= CLOSE[-1]], chosen[chosen > CLOSE[-1]]])
+        chosen = np.concatenate([chosen[chosen <= close], chosen[chosen > close]])
         position = np.sort(self.position.uniform(rng, count))
         radius = np.sort(self.radius.uniform(rng, count))
         brightness = self.brightness.uniform(rng, count)
@@ -163,7 +198,7 @@ class TextureStraylight(Fault):
 
     def _draw_glare(self, context: FaultContext, rng: np.random.Generator) -> dict[str, Any] | None:
         """Return the table of the drawn glare, or None if there is none in the frame."""
-        index = self.glare.integer(rng)
+        index = min(self.glare.integer(rng), len(self._textures()[1]))
         radius = self.glare_radius.uniform(rng)
         brightness = self.glare_brightness.uniform(rng)
         if index == 0 or context.sun_xy_px is None:
@@ -174,7 +209,7 @@ class TextureStraylight(Fault):
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
         """Return the expected electrons plus flares and glare."""
-        layer = _layer_once(params, context, quantity.white_e)
+        layer = self._layer_once(params, context, quantity.white_e)
         return quantity if layer is None else quantity.with_array(plus(quantity.array, layer))
 
     def reach_rows(self, params: Params) -> int:
@@ -183,21 +218,29 @@ class TextureStraylight(Fault):
 
     def apply_to_rows(self, quantity: Any, rows: slice, params: Params, context: FaultContext) -> Any:
         """Return the expected electrons of some rows plus flares and glare."""
-        layer = _layer_once(params, context, quantity.white_e)
+        layer = self._layer_once(params, context, quantity.white_e)
         return quantity if layer is None else quantity.with_array(plus(quantity.array, layer[rows]))
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
         """Return the pixels where any channel gains at least `mask_level_dn`, bool[y, x]."""
         white = context.camera.detector.white_e
-        layer = _layer_once(params, context, white)
+        layer = self._layer_once(params, context, white)
         if layer is None:
             return np.zeros(context.shape, dtype=bool)
         return reaches(layer, white * np.float32(params["mask_level_dn"] / 255))
 
     def soft(self, params: Params, context: FaultContext) -> NDArray[np.float32]:
         """Return the intensity of flares and glare, float32[y, x] in DN of 255."""
-        layer = _layer_once(params, context, context.camera.detector.white_e)
+        layer = self._layer_once(params, context, context.camera.detector.white_e)
         return np.zeros(context.shape, np.float32) if layer is None else intensity_dn(layer, context.camera)
+
+    def _layer_once(
+        self, params: Params, context: FaultContext, white_e: NDArray[np.float32]
+    ) -> NDArray[np.float32] | None:
+        """Return all flares and the glare, computed once for each sample and white level."""
+        white = np.asarray(white_e, dtype=np.float32)
+        name = f"straylight.layer {white.tobytes().hex()}"
+        return context.once(name, params, lambda: _layer(params, context, white, *self._textures()[:2]))
 
 
 def flare_centres_px(params: Params, sun_xy_px: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -224,14 +267,13 @@ def _reaches_frame(xy: NDArray[np.float64], radius_px: float, shape: tuple[int, 
     return bool(np.hypot(*(nearest - xy)) < radius_px)
 
 
-def _layer_once(params: Params, context: FaultContext, white_e: NDArray[np.float32]) -> NDArray[np.float32] | None:
-    """Return all flares and the glare, computed once for each sample and white level."""
-    white = np.asarray(white_e, dtype=np.float32)
-    name = f"straylight.layer {white.tobytes().hex()}"
-    return context.once(name, params, lambda: _layer(params, context, white))
-
-
-def _layer(params: Params, context: FaultContext, white_e: NDArray[np.float32]) -> NDArray[np.float32] | None:
+def _layer(
+    params: Params,
+    context: FaultContext,
+    white_e: NDArray[np.float32],
+    flares: Sequence[str],
+    glares: Sequence[str],
+) -> NDArray[np.float32] | None:
     """Return all flares and the glare, electrons float32[y, x, channel]; None if there is nothing to add."""
     visible = 1.0 if context.sun_visible_fraction is None else float(context.sun_visible_fraction)
     if context.sun_xy_px is None or visible <= 0:
@@ -242,11 +284,11 @@ def _layer(params: Params, context: FaultContext, white_e: NDArray[np.float32]) 
     angle = float(np.arctan2(along[1], along[0])) if along.any() else 0.0
 
     stamps = [
-        (f"flare_{f['index']:02d}", centre, f)
+        (flares[f["index"] - 1], centre, f)
         for f, centre in zip(params["flares"], flare_centres_px(params, sun), strict=True)
     ]
     if params["glare"]:
-        stamps.append((f"glare_{params['glare']['index']}", sun, params["glare"]))
+        stamps.append((glares[params["glare"]["index"] - 1], sun, params["glare"]))
     colours = np.stack([_COLOURS[channel] for channel in context.camera.detector.channels])
     layer = None
     for name, centre, f in stamps:
@@ -289,12 +331,12 @@ def _stamp(
     Pixel centres are at +0.5 in the image and in the texture. The pixel of index i shows the texel of index S/2 -
     0.5 + Rᵀ(i + 0.5 - centre) / s, where S is the size of the texture and s the width of a texel in px.
     """
-    half = radius_px / FILL
+    levels, fill = texture(name)
+    half = radius_px / fill
     x0, y0 = (max(0, int(np.floor(v - half))) for v in centre)
     x1, y1 = (min(size, int(np.ceil(v + half))) for v, size in zip(centre, shape[::-1], strict=True))
     if x0 >= x1 or y0 >= y1:
         return None
-    levels = pyramid(name)
     # use a level whose texels are about as wide as a pixel, so that thin rings do not alias
     texels_per_px = len(levels[0]) / (2 * half)
     level = levels[int(np.clip(round(np.log2(texels_per_px)), 0, len(levels) - 1))]
@@ -318,26 +360,48 @@ def _stamp(
     return (slice(y0, y1), slice(x0, x1)), np.asarray(stamp, dtype=np.float32).reshape(*stamp.shape[:2], -1)
 
 
-@cached_with_contents(maxsize=16)
-def pyramid(name: str) -> tuple[NDArray[np.float32], ...]:
-    """Return a packaged texture, RGB float32[y, x, 3] in [0, 1], and smaller copies made by 2×2 means.
+class Texture(NamedTuple):
+    """Hold a texture, RGB float32[y, x, 3] in [0, 1], and smaller copies made by 2×2 means; read-only.
 
-    The arrays are read-only.
+    `fill` is the radius of its outline over half its side.
+    """
+
+    levels: tuple[NDArray[np.float32], ...]
+    fill: float
+
+
+@cached_with_contents(maxsize=16)
+def texture(name: str) -> Texture:
+    """Return a packaged texture, or a user's own by its path.
 
     Raises
     ------
+    InputError
+        A user's texture is missing, is no PNG or TIFF image, or has values that are not from 0 to 1 of white.
     VbnfaultError
-        The texture's file is damaged.
+        A packaged texture is damaged.
     """
-    path = data_dir("textures") / f"{name}.png"
+    is_own = Path(name).suffix != ""
+    path = Path(name) if is_own else data_dir("textures") / f"{name}.png"
+    data, fill = read_input(path, "texture", types=TYPES), FILL
     try:
-        colours, _ = decoded_image(read_input(path, "texture"), LARGEST_VALUES)
+        colours, alpha = decoded_image(data, LARGEST_VALUES)
+        if not (colours.min() >= 0 and colours.max() <= 1):  # NaN is neither
+            raise InputError("has values that are negative or above white")
     except InputError as error:
+        if is_own:
+            raise InputError(f"{path}: {error}") from None
         raise VbnfaultError(f"{path}: {error}; install vbnfault again") from None
+    if is_own:
+        light = np.broadcast_to(colours, (*colours.shape[:2], 3)) * (1 if alpha is None else alpha[..., None])
+        longer = max(light.shape[:2])
+        side = -(-longer // _SIDES) * _SIDES
+        border = [(n // 2, n - n // 2) for n in (side - light.shape[0], side - light.shape[1])]
+        colours, fill = np.pad(light, (*border, (0, 0))), longer / side
     levels = [np.ascontiguousarray(colours)]
     while levels[-1].shape[0] % 2 == 0 and levels[-1].shape[0] > 6:
         half = levels[-1].shape[0] // 2
         levels.append(levels[-1].reshape(half, 2, half, 2, 3).mean(axis=(1, 3), dtype=np.float32))
     for level in levels:
         level.flags.writeable = False
-    return tuple(levels)
+    return Texture(tuple(levels), fill)

@@ -26,19 +26,22 @@ CLAP, FLAP  circular aperture, whose outer radius is then the rim; its inner rad
 GLAS        glass by name, or by nd and vd
 ==========  ==========================================================================================
 
+Rims that are missing come from paraxial beams (`_with_rims`), and `source` says so.
+
 A glass is looked up in the catalogues, then among the registered glasses. If it is in neither, nd and vd of its
 GLAS record serve; older files have 1.5 and 40 there for every glass, which is refused. Surfaces in one medium
 without stop and aperture only set distances and are left out.
 
 Records that change the light's path and are not read (COORDBRK and other surface types, mirrors, apertures that are
-not circular or not centred) are refused in a sentence. Fields, wavelengths, pick-ups, solves, tolerances, drawing
-and coatings are ignored: `camera.lens_coating` coats all surfaces. So is the distance of the object, which `source`
+not circular or not centred) are refused in a sentence. Wavelengths, pick-ups, solves, tolerances, drawing and
+coatings are ignored: `camera.lens_coating` coats all surfaces. So is the distance of the object, which `source`
 then gives; `camera.focus_distance_m` sets it.
 
 **Glass catalogues.** NM begins a glass: name, number of the dispersion formula, and more. CD has the coefficients,
 IT internal transmittances: wavelength in µm, fraction, thickness in mm. A line that begins with a number goes on
-with the record before it. All other records are ignored; indices are relative to air at the catalogue's reference
-temperature. The formulas are those of Zemax, OpticStudio user guide, "Using glass catalogs".
+with the record before it. All other records are ignored. A glass is refused if its formula gives another index at
+the d line than NM prints, by more than 0.001: one of the two is wrong. Indices are relative to air at the
+catalogue's reference temperature. The formulas are those of Zemax, OpticStudio user guide, "Using glass catalogs".
 """
 
 from __future__ import annotations
@@ -75,6 +78,8 @@ _REFUSED = {
 _OF_BEAMS = ("ENPD", "FNUM", "FTYP", "XFLN", "YFLN")
 _FAR_MM = 1e7  # distance of the object from which on it counts as infinite; some files write 1e10 for infinity
 _NOT_RECORDED = (1.5, 40.0)  # nd and vd that older files have for every glass of a catalogue
+
+_WITHIN = 0.999
 
 # Makers print four decimals or more, some those of another melt: at most 5e-5 apart in the catalogues of 17 makers.
 _SAME_INDEX = 1e-3
@@ -417,7 +422,12 @@ def _with_rims(
                 f"{surface.where}: DIAM: the semi-diameter is missing, and neither ENPD, FNUM nor other surfaces "
                 "give it; write it into the file"
             )
-        surface.semi_diameter = float(rim)
+        widest = (
+            math.inf
+            if surface.conic <= -1
+            else 1 / max(abs(surface.curvature) * math.sqrt(1 + surface.conic), 1e-99)
+        )
+        surface.semi_diameter = min(float(rim), _WITHIN * widest)  # paraxial heights may exceed a ball
     names = ", ".join(str(surfaces[1 + k].number) for k in missing)
     return f"; DIAM of SURF {names} from the paraxial beams of {cause}"
 

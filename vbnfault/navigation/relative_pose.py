@@ -96,6 +96,10 @@ def relative_pose(matches: Matches, first: CameraView, second: CameraView) -> Re
     if len(matches) < _LEAST_MATCHES:
         return RelativePose(reason=f"{len(matches)} matches, and a pose needs {_LEAST_MATCHES}")
     a, b = first.slopes(matches.first_xy), second.slopes(matches.second_xy)
+    if not (np.isfinite(a).all() and np.isfinite(b).all()):
+        raise InputError(
+            "matches: some pixels lie farther from the centre than the distortion of their view reaches"
+        )
     inlier = _INLIER_PX / float(np.mean([first.intrinsics[:2], second.intrinsics[:2]]))
     motions, distances = [], []
     for candidate in _candidates(a, b, inlier):

@@ -265,6 +265,8 @@ def _anchor_paths(table: dict[str, Any], folder: Path, overrides: Collection[str
         key = where.rsplit(".", 1)[-1]
         if isinstance(node, dict) and isinstance(node.get(key), str) and node[key] not in ("", *built_in):
             node[key] = anchored(node[key], where)
+        elif isinstance(node, dict) and isinstance(node.get(key), list):
+            node[key] = [anchored(path, where) if isinstance(path, str) and path else path for path in node[key]]
 
     def anchor_file(node: Any, where: str) -> None:
         key = where.rsplit(".", 1)[-1]
@@ -279,11 +281,7 @@ def _anchor_paths(table: dict[str, Any], folder: Path, overrides: Collection[str
     anchor_file(table.get("camera"), "camera.lens")
     anchor_file(table.get("camera"), "camera.detector")
     anchor(table.get("trajectory"), "trajectory.file")
-    kernels = table.get("spice")
-    if isinstance(kernels, dict) and isinstance(kernels.get("kernels"), list):
-        kernels["kernels"] = [
-            anchored(k, "spice.kernels") if isinstance(k, str) and k else k for k in kernels["kernels"]
-        ]
+    anchor(table.get("spice"), "spice.kernels")
     plugins, faults = table.get("plugins"), table.get("faults")
     if not plugins and not faults:
         return
