@@ -5,8 +5,9 @@ its light. Such a body is rendered in a frame of its own that it fills: a close-
 truth as any other image. Each pixel of it lies within one pixel of the frame and adds its part of the area to it.
 So the light of a body is that of some `_ACROSS`² pixels, whatever its size in the frame.
 
-Float32 resolves 2⁻²³ of the camera's distance, which may be more than the body's size. The close-up is therefore
-taken from at most `_FARTHEST` radii, on the same line of sight. This changes directions by 1e-4 at most.
+Float32 resolves 2⁻²³ of the distance of the camera, which may be more than the size of the body. So the close-up is
+taken from at most `_FARTHEST` radii, on the same line of sight, and its rays start just before the body. This turns
+them by 1e-4 at most.
 """
 
 from __future__ import annotations
@@ -169,6 +170,7 @@ def close_up(surface: TerrainMesh, view: View, margin_m: float = 0.0) -> CloseUp
             intrinsics=np.concatenate([focal, middle * per_px - first - towards[:2] / towards[2] * focal]),
             width_px=_ACROSS,
             height_px=_ACROSS,
+            start_m=max(nearer * distance - 2 * radius, 0.0),
         ),
         ground=ground,
         vehicle=surface,

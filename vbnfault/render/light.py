@@ -179,8 +179,9 @@ class Light:
         lit &= ~self.world.occluded(hit.shadow_rays(towards), lit, coherent=coherent)
         return towards, lit
 
-    def only_shown(self, hit: Any) -> Any:
+    def seen(self, hit: Any) -> Any:
         """Return the hits of camera rays without those on ground that the image does not show."""
+        hit.start_m = self.optics.start_m
         if not self.scene.shows_ground:
             hit.valid &= hit.on_vehicle
         return hit
@@ -290,7 +291,7 @@ class Direct(Light):
     def terms(self, strata: Strata) -> list[Any]:
         """Return what each sample adds to each term."""
         rays = self.optics.camera_rays(strata)
-        hit = self.only_shown(self.world.intersect(rays))
+        hit = self.seen(self.world.intersect(rays))
         point = strata.disc(SUN_DIMENSION)
         towards, lit = self.lit(hit, point)
 

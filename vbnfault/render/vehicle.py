@@ -170,7 +170,7 @@ class VehicleHit:
     """Hold hits of which some are on the vehicle and the others on the ground."""
 
     def __init__(self, ground: Hit, nearer: Any, distance_m: Any, normal: Any, material: Any, rays: Any) -> None:
-        self._ground, self._rays = ground, rays
+        self._ground, self._rays, self.start_m = ground, rays, 0.0
         self.on_vehicle, self.material = nearer, material
         self.valid = ground.valid | nearer
         self.distance_m = dr.select(nearer, distance_m, ground.distance_m)
@@ -185,6 +185,11 @@ class VehicleHit:
     def point(self) -> Any:
         """Return the positions of the hits in L."""
         return self._rays(self.distance_m)
+
+    @property
+    def range_m(self) -> Any:
+        """Return the distance from the camera, whose rays start at its pupil."""
+        return self.distance_m
 
     def shading_normal(self, detail: Detail | None, dither: Any) -> Any:
         """Return the ground's shading normal; the vehicle has no finer relief."""
