@@ -25,12 +25,17 @@ RADIUS_M = 500.0
 
 
 def poses(
-    widths_px: tuple[float, ...], pointings: int, phase_deg: float, diameter_m: float
+    widths_px: tuple[float, ...],
+    pointings: int,
+    phase_deg: float,
+    diameter_m: float,
+    fov_deg: float = FOV_DEG,
+    reach_px: float = 4.0,
 ) -> dict[str, list[Any]]:
     """Return a table of poses from which the body has these widths, several for each."""
-    pixel_rad = np.radians(FOV_DEG) / PIXELS
+    pixel_rad = 2 * np.tan(np.radians(fov_deg) / 2) / PIXELS
     phase = np.radians(phase_deg)
-    shifts = np.random.default_rng(1).uniform(-4, 4, (pointings, 2))
+    shifts = np.random.default_rng(1).uniform(-reach_px, reach_px, (pointings, 2))
     rows = []
     for width in widths_px:
         distance = diameter_m / (width * pixel_rad)

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from .atmosphere import TOP_SCALE_HEIGHTS, Air, air_light
     from .bounces import indirect
     from .cells import Cells, direct_in_cells
-    from .close_up import CloseUp, close_up
     from .detail import FineRelief
     from .earth import EarthAlbedo
     from .integrate import radiance
@@ -33,6 +32,7 @@ if TYPE_CHECKING:
     from .runtime import set_threads
     from .sun_heights import heights_towards_sun
     from .surface import TerrainMesh
+    from .unresolved import CloseUp, close_up
     from .vehicle import Vehicle
 
 # public name → the module that defines it, which loads Mitsuba
@@ -40,7 +40,7 @@ _HOMES = {
     "Air": "atmosphere",
     "AlbedoMap": "albedo",
     "Cells": "cells",
-    "CloseUp": "close_up",
+    "CloseUp": "unresolved",
     "EarthAlbedo": "earth",
     "FineRelief": "detail",
     "Sampled": "light",
@@ -48,7 +48,7 @@ _HOMES = {
     "TerrainMesh": "surface",
     "Vehicle": "vehicle",
     "air_light": "atmosphere",
-    "close_up": "close_up",
+    "close_up": "unresolved",
     "direct": "light",
     "first_ground": "resolve",
     "direct_by_sample": "light",

@@ -6,11 +6,11 @@ from dataclasses import replace
 
 from ..core.quantities import Radiance, Truth
 from .bounces import indirect
-from .close_up import close_up
 from .description import RenderInput
 from .layers import truth
 from .light import direct
 from .surface import TerrainMesh
+from .unresolved import close_up
 
 
 def radiance(surface: TerrainMesh, scene: RenderInput, guide: Truth | None = None) -> Radiance:
