@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from .cells import Cells, direct_in_cells
     from .detail import FineRelief
     from .earth import EarthAlbedo
+    from .facets import thin_parts
     from .integrate import radiance
     from .layers import truth
     from .light import Sampled, direct, direct_by_sample, sun_in_view
@@ -64,6 +65,7 @@ _HOMES = {
     "sun_in_view": "light",
     "sun_visible_fraction": "resolve",
     "sunlit_ground": "resolve",
+    "thin_parts": "facets",
     "truth": "layers",
 }
 
@@ -138,5 +140,6 @@ __all__ = [
     "sun_in_view",
     "sun_visible_fraction",
     "sunlit_ground",
+    "thin_parts",
     "truth",
 ]

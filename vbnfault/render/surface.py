@@ -157,6 +157,7 @@ class Hit:
 
     material: Any = None
     on_vehicle: Any = None
+    facet: Any = None  # of the vehicle
     start_m: Any = 0.0
 
     def __init__(self, surface: TerrainMesh, rays: Any, intersection: Any) -> None:

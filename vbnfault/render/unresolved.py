@@ -119,14 +119,11 @@ class CloseUp:
         # defocus shifts the light of each point of the aperture
         depth_m = float((self.ground.centre_m - frame.position_L_m) @ frame.L_from_C[:, 2])
         slopes = (slopes + self._lens_m * (1 / frame.focus_distance_m - 1 / depth_m))[lit]
-        fx, fy = frame.intrinsics[:2]
-        solid_sr = 1 / (fx * fy * self.per_px**2 * (1 + (slopes**2).sum(axis=1)) ** 2)  # cos⁴θ dx dy / (fx fy)
         return FineLight.of(
-            pixels=slopes * frame.intrinsics[:2] + frame.intrinsics[2:],
-            area_px=self.per_px**-2.0,
-            radiance=values[:, lit],
             slopes=slopes,
-            power=values[:, lit] * solid_sr.astype(np.float32),
+            area_px=np.full(len(slopes), self.per_px**-2.0),
+            radiance=values[:, lit],
+            intrinsics=frame.intrinsics,
             shape=(frame.height_px, frame.width_px),
         )
 
