@@ -34,23 +34,28 @@ class FineLight:
     mean: F32
 
     @classmethod
-    def of(
-        cls, *, pixels: F64, area_px: float, radiance: F32, slopes: F64, power: F32, shape: tuple[int, int]
-    ) -> FineLight:
-        """Return the light of points at positions x, y in a frame of (height, width) pixels.
+    def of(cls, *, slopes: F64, area_px: F64, radiance: F32, intrinsics: F64, shape: tuple[int, int]) -> FineLight:
+        """Return the light of points in a pinhole's frame of (height, width) pixels.
 
         Parameters
         ----------
-        pixels
-            float64[point, 2]: positions in pixels; points beyond the frame are kept for the lens.
+        slopes
+            float64[point, 2]: tangents in C. Points beyond the frame are kept for the lens.
         area_px
-            Area of each point in pixels.
+            float64[point]: area of each point in pixels.
         radiance
             float32[band, point].
+        intrinsics
+            fx, fy, cx and cy in pixels.
         """
+        light = radiance * area_px.astype(np.float32)
+        # cos⁴θ / (fx fy) is the projected solid angle of a pixel
+        solid_sr = 1 / (intrinsics[0] * intrinsics[1] * (1 + (slopes**2).sum(axis=1)) ** 2)
+        power = light * solid_sr.astype(np.float32)
+        pixels = slopes * intrinsics[:2] + intrinsics[2:]
         column, row = np.floor(pixels).astype(np.int64).T
         inside = (column >= 0) & (column < shape[1]) & (row >= 0) & (row < shape[0])
-        column, row, values = column[inside], row[inside], radiance[:, inside]
+        column, row, values = column[inside], row[inside], light[:, inside]
         rows, columns = ((int(v.min()), int(v.max()) + 1) if len(v) else (0, 1) for v in (row, column))
         height, width = rows[1] - rows[0], columns[1] - columns[0]
         index = (row - rows[0]) * width + column - columns[0]
@@ -60,7 +65,27 @@ class FineLight:
             power=power,
             rows=slice(*rows),
             columns=slice(*columns),
-            mean=(mean.reshape(-1, height, width) * area_px).astype(np.float32),
+            mean=mean.reshape(-1, height, width).astype(np.float32),
+        )
+
+    def joined(self, other: FineLight | None) -> FineLight:
+        """Return the light of both."""
+        if other is None:
+            return self
+        rows, columns = (
+            slice(min(a.start, b.start), max(a.stop, b.stop))
+            for a, b in ((self.rows, other.rows), (self.columns, other.columns))
+        )
+        mean = np.zeros((len(self.mean), rows.stop - rows.start, columns.stop - columns.start), np.float32)
+        for part in (self, other):
+            top, left = part.rows.start - rows.start, part.columns.start - columns.start
+            mean[:, top : top + part.mean.shape[1], left : left + part.mean.shape[2]] += part.mean
+        return FineLight(
+            slopes=np.concatenate([self.slopes, other.slopes]),
+            power=np.concatenate([self.power, other.power], axis=1),
+            rows=rows,
+            columns=columns,
+            mean=mean,
         )
 
     def scaled(self, factor: float) -> FineLight:

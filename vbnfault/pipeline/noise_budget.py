@@ -90,11 +90,14 @@ def sample_to_noise(
     indirect = None
     if guide is not None and scene.bounces:
         indirect = render.indirect(spec.terrain.surface, scene, guide)
+    fine = render.thin_parts(spec.terrain.surface, scene)
     if body is not None:
-        indirect = body[0].added_to(np.zeros_like(sampled.radiance.array) if indirect is None else indirect)
+        fine = body[0].joined(fine)
         sampled = replace(sampled, error=sampled.error + body[1])
+    if fine is not None:
+        indirect = fine.added_to(np.zeros_like(sampled.radiance.array) if indirect is None else indirect)
     light = sampled.radiance.array.copy() if indirect is None else _sum_of(sampled.radiance.array, indirect)
-    whole = replace(sampled.radiance, array=light.view(), fine=None if body is None else body[0])
+    whole = replace(sampled.radiance, array=light.view(), fine=fine)
     sampled = replace(sampled, radiance=whole)  # a copy in all bands takes 37 MB for a frame of 1024 pixels
     release_unused(_CELLS_BYTES)  # samples in cells have wavefronts of other sizes
     exposure = foreseen_exposure_s(spec.scene, camera, truth, scene.view, whole)

@@ -87,9 +87,7 @@ def render_view(spec: SampleSpec, pose: Pose) -> Rendering:
     body = body_of_few_pixels(spec, pose, scene)
     shown = scene if body is None else replace(scene, shows_ground=False)
     if spec.scene.render.noise_fraction is None:
-        image = render.radiance(surface, shown, guide)
-        if body is not None:
-            image = replace(image, array=body.light.added_to(image.array), fine=body.light)
+        image = render.radiance(surface, shown, guide, None if body is None else body.light)
         sampled = SampledRadiance(radiance=image, samples_per_pixel=float(scene.samples_per_pixel))
     else:
         extra = None if body is None else (body.light, body.error)

@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     from .atmosphere import TOP_SCALE_HEIGHTS, Air, air_light
     from .bounces import indirect
     from .cells import Cells, direct_in_cells
-    from .close_up import CloseUp, close_up
     from .detail import FineRelief
     from .earth import EarthAlbedo
+    from .facets import thin_parts
     from .integrate import radiance
     from .layers import truth
     from .light import Sampled, direct, direct_by_sample, sun_in_view
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from .runtime import set_threads
     from .sun_heights import heights_towards_sun
     from .surface import TerrainMesh
+    from .unresolved import CloseUp, close_up
     from .vehicle import Vehicle
 
 # public name → the module that defines it, which loads Mitsuba
@@ -41,7 +42,7 @@ _HOMES = {
     "Air": "atmosphere",
     "AlbedoMap": "albedo",
     "Cells": "cells",
-    "CloseUp": "close_up",
+    "CloseUp": "unresolved",
     "EarthAlbedo": "earth",
     "FineRelief": "detail",
     "Sampled": "light",
@@ -49,7 +50,7 @@ _HOMES = {
     "TerrainMesh": "surface",
     "Vehicle": "vehicle",
     "air_light": "atmosphere",
-    "close_up": "close_up",
+    "close_up": "unresolved",
     "direct": "light",
     "first_ground": "resolve",
     "first_hit_m": "resolve",
@@ -66,6 +67,7 @@ _HOMES = {
     "sun_in_view": "light",
     "sun_visible_fraction": "resolve",
     "sunlit_ground": "resolve",
+    "thin_parts": "facets",
     "truth": "layers",
 }
 
@@ -141,5 +143,6 @@ __all__ = [
     "sun_in_view",
     "sun_visible_fraction",
     "sunlit_ground",
+    "thin_parts",
     "truth",
 ]

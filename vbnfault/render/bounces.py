@@ -117,9 +117,9 @@ class _Indirect(Light):
     def guide(self) -> tuple[_Guide, NDArray[np.uint32]]:
         """Return the guide of the view, and the pixels that see the spacecraft."""
         rays = self.optics.centre_rays()
-        hit = self.world.hit(rays, self._first)
+        hit = self.seen(self.world.hit(rays, self._first))
         normal, (x, y, z) = facing(hit.normal, -rays.d), self.optics.axes
-        in_camera = (dr.dot(normal, x), dr.dot(normal, y), dr.dot(normal, z), hit.distance_m * dr.dot(rays.d, z))
+        in_camera = (dr.dot(normal, x), dr.dot(normal, y), dr.dot(normal, z), hit.range_m * dr.dot(rays.d, z))
         record = dr.ravel(mi.Vector4f(*(dr.select(hit.valid, value, 0) for value in in_camera)))
         on_vehicle = mi.Bool(False) if hit.on_vehicle is None else hit.on_vehicle
         dr.eval(record, on_vehicle)
@@ -163,7 +163,7 @@ class _Indirect(Light):
         first = dr.gather(type(self._first), self._first, strata.pixel, strata.inside)
         hit = self.world.hit(rays, first)
         hit.valid &= strata.inside
-        hit = self.only_shown(hit)
+        hit = self.seen(hit)
         total, carried = None, None
         for bounce in range(self.scene.bounces):
             dimension = _FIRST_BOUNCE + 3 * bounce

@@ -42,7 +42,7 @@ class Reflection:
             spacing = 1 / (float(scene.view.intrinsics[0]) * scene.samples_per_pixel**0.5)
             ground = GroundPoints(
                 point_L_m=hit.point,
-                footprint_m=hit.distance_m * spacing,
+                footprint_m=hit.range_m * spacing,
                 valid=hit.valid,
                 view_L=view,
                 sun_L=SunDisc(scene.sun).direction,

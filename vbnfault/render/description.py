@@ -26,6 +26,8 @@ class View:
         Size of the image.
     aperture_radius_m, focus_distance_m
         An aperture of 0 is a pinhole; the focus distance may be inf.
+    start_m
+        Distance from the camera at which its rays start. Before a far body, they keep the precision of float32.
     """
 
     position_L_m: F64
@@ -35,6 +37,7 @@ class View:
     height_px: int
     aperture_radius_m: float = 0.0
     focus_distance_m: float = float("inf")
+    start_m: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

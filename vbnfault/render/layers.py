@@ -47,8 +47,9 @@ def truth(
     shape = (view.height_px, view.width_px) if slopes is None else slopes.shape[:2]
     rays = optics.centre_rays() if slopes is None else optics.rays_of(slopes)
     hit = surface.seen_from(view).intersect(rays)
+    hit.start_m = optics.start_m
     boresight = optics.axes[2]
-    depth = dr.select(hit.valid, hit.distance_m * dr.dot(rays.d, boresight), dr.inf)
+    depth = dr.select(hit.valid, hit.range_m * dr.dot(rays.d, boresight), dr.inf)
     normal = facing(hit.normal, -rays.d)
     in_camera = [dr.select(hit.valid, dr.dot(normal, axis), 0) for axis in optics.axes]
     centre = SunDisc(sun).direction
@@ -82,7 +83,7 @@ def truth(
 
 def _albedo_factor(albedo: AlbedoMap | EarthAlbedo, view: View, hit: Any, rays: Any, sun_L: Any) -> Any:
     """Return the factor of a map of the albedo, in the reference band, where the rays of pixels hit."""
-    spacing_m = hit.distance_m / float(view.intrinsics[0])
+    spacing_m = hit.range_m / float(view.intrinsics[0])
     return albedo.at_reference(
         GroundPoints(point_L_m=hit.point, footprint_m=spacing_m, valid=hit.valid, view_L=-rays.d, sun_L=sun_L)
     )

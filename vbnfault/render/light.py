@@ -179,8 +179,9 @@ class Light:
         lit &= ~self.world.occluded(hit.shadow_rays(towards), lit, coherent=coherent)
         return towards, lit
 
-    def only_shown(self, hit: Any) -> Any:
+    def seen(self, hit: Any) -> Any:
         """Return the hits of camera rays without those on ground that the image does not show."""
+        hit.start_m = self.optics.start_m
         if not self.scene.shows_ground:
             hit.valid &= hit.on_vehicle
         return hit
@@ -206,6 +207,8 @@ class Direct(Light):
         super().__init__(surface, scene, banded=has_bands(surface, scene))
         sun, model = scene.sun, scene.reflectance
         self.limb = Limb(sun)
+        thin = None if surface.vehicle is None else surface.vehicle.thin_in(scene.view)
+        self._thin = None if thin is None or not thin.any() else mi.Bool(thin)
         if self.banded:
             self.weights = np.diag(sun.irradiance_W_m2_nm)
         else:
@@ -287,10 +290,20 @@ class Direct(Light):
         """Return the signal of each sample: the sum of its terms with factors float64[term]."""
         return sum((t * dr.opaque(mi.Float, float(s)) for t, s in zip(terms, factors, strict=True)), mi.Float(0))
 
-    def terms(self, strata: Strata) -> list[Any]:
-        """Return what each sample adds to each term."""
-        rays = self.optics.camera_rays(strata)
-        hit = self.only_shown(self.world.intersect(rays))
+    def terms(self, strata: Strata, rays: Any = None, facet: Any = None) -> list[Any]:
+        """Return what each sample adds to each term.
+
+        These are samples of the pixels, without facets of the spacecraft that are narrower than a pixel. With
+        `rays`, they are samples of its facets `facet`.
+        """
+        if rays is None:
+            rays = self.optics.camera_rays(strata)
+            hit = self.seen(self.world.intersect(rays))
+            if self._thin is not None:
+                hit.valid &= ~(hit.on_vehicle & dr.gather(mi.Bool, self._thin, hit.facet, hit.on_vehicle))
+        else:
+            hit = self.world.intersect(rays, coherent=False)
+            hit.valid &= hit.on_vehicle & (hit.facet == facet)
         point = strata.disc(SUN_DIMENSION)
         towards, lit = self.lit(hit, point)
 

@@ -194,6 +194,7 @@ class Optics:
         fx, fy, cx, cy = (float(v) for v in view.intrinsics)
         self.scale = opaque_vector(mi.Vector2f, np.array([1 / fx, 1 / fy]))
         self.centre = opaque_vector(mi.Vector2f, np.array([cx, cy]))
+        self.start_m = dr.opaque(mi.Float, view.start_m) if view.start_m else 0.0
         self.aperture = view.aperture_radius_m
         self._radius = dr.opaque(mi.Float, view.aperture_radius_m)
         self._inverse_focus = dr.opaque(mi.Float, 1.0 / view.focus_distance_m)
@@ -211,7 +212,8 @@ class Optics:
             lx, ly = on_aperture.x * self._radius, on_aperture.y * self._radius
             origin = origin + lx * ax + ly * ay
             cx, cy = cx - lx * self._inverse_focus, cy - ly * self._inverse_focus
-        return origin, dr.normalize(cx * ax + cy * ay + az)
+        direction = dr.normalize(cx * ax + cy * ay + az)
+        return (origin if isinstance(self.start_m, float) else origin + self.start_m * direction), direction
 
     def camera_rays(self, strata: Strata) -> Any:
         """Return one ray per stratum, through the thin lens."""
@@ -233,7 +235,8 @@ class Optics:
         """Return one ray from the lens's centre for each pair of tangents x/z and y/z in C, float64[y, x, 2]."""
         across, down = (mi.Float(np.ascontiguousarray(slopes[..., k], np.float32).ravel()) for k in (0, 1))
         ax, ay, az = self.axes
-        return mi.Ray3f(self.origin, dr.normalize(across * ax + down * ay + az))
+        direction = dr.normalize(across * ax + down * ay + az)
+        return mi.Ray3f(self.origin + self.start_m * direction, direction)
 
 
 def opaque_vector(kind: Any, values: np.ndarray) -> Any:

@@ -146,7 +146,9 @@ class Hit:
     Attributes
     ----------
     valid, distance_m
-        Whether there is a hit, and its distance.
+        Whether there is a hit, and its distance from the origin of the ray.
+    start_m
+        Distance from the camera at which the ray starts; `range_m` is that of the hit.
     normal
         Unit outward normal for shading, interpolated over the facet unless it is flat.
     material, on_vehicle
@@ -155,6 +157,8 @@ class Hit:
 
     material: Any = None
     on_vehicle: Any = None
+    facet: Any = None  # of the vehicle
+    start_m: Any = 0.0
 
     def __init__(self, surface: TerrainMesh, rays: Any, intersection: Any) -> None:
         self.valid = intersection.is_valid()
@@ -182,12 +186,17 @@ class Hit:
         """Return the positions of the hits in L."""
         return self._rays(self.distance_m)
 
+    @property
+    def range_m(self) -> Any:
+        """Return the distance from the camera, for hits of its own rays."""
+        return self.distance_m if isinstance(self.start_m, float) else self.distance_m + self.start_m
+
     def shading_normal(self, detail: Detail | None, dither: Any) -> Any:
         """Return the normal turned by the relief finer than facets; `dither` in [0, 1) is one number per pixel."""
         if detail is None:
             return self.normal
         point = self._rays(self.distance_m)
-        return detail.turned(self.normal, point, self._rays.d, self.distance_m, self.dust, dither)
+        return detail.turned(self.normal, point, self._rays.d, self.range_m, self.dust, dither)
 
     def shadow_rays(self, direction: Any) -> Any:
         """Return rays from the hits in a direction.

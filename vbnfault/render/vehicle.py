@@ -28,6 +28,9 @@ _OFFSET_M = 5e-4
 # Rays that start this close to the camera's centre, or within its aperture, are rays of the camera.
 _AT_CAMERA_M = 1e-6
 
+# Facets narrower than this are sampled by themselves, if they are wholly farther than so many metres.
+_THIN_PX, _NEAREST_M = 1.0, 0.05
+
 
 class Vehicle:
     """Hold a spacecraft of diffuse facets in B, which are visible and reflect on both sides.
@@ -66,6 +69,23 @@ class Vehicle:
         """Return the normal in B and the material of facets."""
         record = dr.gather(mi.Vector4f, self._facets, index, active)
         return mi.Vector3f(record.xyz), mi.UInt32(record.w)
+
+    def thin_in(self, view: View) -> NDArray[np.bool_]:
+        """Return which facets before the camera are narrower than a pixel in a view, bool[m]."""
+        corners = self._corners_m
+        z = np.maximum(corners[..., 2], _NEAREST_M)
+        x, y = (corners[..., k] / z * view.intrinsics[k] for k in (0, 1))
+        sides = [(np.roll(x, -1, axis=1) - x), (np.roll(y, -1, axis=1) - y)]
+        twice_area = np.abs(sides[0][:, 0] * sides[1][:, 1] - sides[0][:, 1] * sides[1][:, 0])
+        longest = np.hypot(*sides).max(axis=1)
+        half = np.array([view.width_px, view.height_px]) / 2 + np.abs(view.intrinsics[2:])
+        inside = (np.abs(x).min(axis=1) < half[0]) & (np.abs(y).min(axis=1) < half[1])
+        before = (corners[..., 2] > _NEAREST_M).all(axis=1)
+        return np.asarray((twice_area < _THIN_PX * longest) & before & inside)
+
+    def corners_of(self, facets: NDArray[np.intp]) -> NDArray[np.float64]:
+        """Return the corners of facets in B, float64[n, corner, 3]."""
+        return self._corners_m[facets]
 
     def slopes_in(self, view: View) -> NDArray[np.float64]:
         """Return bounds of x/z and y/z in B beyond which no ray of a camera meets a part, float64[2, axis].
@@ -135,7 +155,7 @@ class World:
         normal, material = self.vehicle.facet(on_vehicle.prim_index, nearer)
         normal = self._in_L(normal)
         normal = dr.mulsign(normal, -dr.dot(normal, rays.d))  # towards the viewer
-        return VehicleHit(ground, nearer, on_vehicle.t, normal, material, rays)
+        return VehicleHit(ground, nearer, on_vehicle, normal, material, rays)
 
     def occluded(self, rays: Any, active: Any, *, coherent: bool = True) -> Any:
         """Return whether anything lies along the rays."""
@@ -169,11 +189,11 @@ class World:
 class VehicleHit:
     """Hold hits of which some are on the vehicle and the others on the ground."""
 
-    def __init__(self, ground: Hit, nearer: Any, distance_m: Any, normal: Any, material: Any, rays: Any) -> None:
-        self._ground, self._rays = ground, rays
-        self.on_vehicle, self.material = nearer, material
+    def __init__(self, ground: Hit, nearer: Any, on_vehicle: Any, normal: Any, material: Any, rays: Any) -> None:
+        self._ground, self._rays, self.start_m = ground, rays, 0.0
+        self.on_vehicle, self.material, self.facet = nearer, material, on_vehicle.prim_index
         self.valid = ground.valid | nearer
-        self.distance_m = dr.select(nearer, distance_m, ground.distance_m)
+        self.distance_m = dr.select(nearer, on_vehicle.t, ground.distance_m)
         self.normal = dr.select(nearer, normal, ground.normal)
 
     @cached_property
@@ -185,6 +205,11 @@ class VehicleHit:
     def point(self) -> Any:
         """Return the positions of the hits in L."""
         return self._rays(self.distance_m)
+
+    @property
+    def range_m(self) -> Any:
+        """Return the distance from the camera, whose rays start at its pupil."""
+        return self.distance_m
 
     def shading_normal(self, detail: Detail | None, dither: Any) -> Any:
         """Return the ground's shading normal; the vehicle has no finer relief."""

@@ -42,6 +42,8 @@ _ORIGINS = 100
 _LARGEST_FACET_M, _RADIUS_M = 1e6, (1.0, 1e8)
 # Distances are rounded down to a power of this, so that poses at nearly the same distance share a terrain.
 _STEP = 2**0.5
+# A body of fewer pixels is rendered in a close-up, which shows facets of a pixel of the frame.
+_FEWEST_PX = 64
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,9 +129,11 @@ def _rounded(length_m: float) -> float:
 def _whole_body(scene: Scene, body: Body, pose: FlownPose) -> GroundDetail | None:
     """Return the terrain that is even all over the body, or None if it would take too many triangles.
 
-    Its origin is the vertex with the largest x in T, the same for all poses.
+    Its origin is the vertex with the largest x in T, the same for all poses. From so far away that the body is less
+    than `_FEWEST_PX` pixels wide, the terrain stays as it is at this distance.
     """
     nearest_m = float(np.linalg.norm(body.vertices_m - pose.camera_position_T_m, axis=1).min())
+    nearest_m = min(nearest_m, float(np.ptp(body.vertices_m, axis=0).max()) / (_FEWEST_PX * pixel_rad(scene)))
     facet_m = max(scene.patch.facet_m, scene.patch.facet_px * pixel_rad(scene) * _rounded(nearest_m))
     if body.area_m2 > _EVEN_FRACTION * scene.patch.max_triangles * _TRIANGLE * facet_m**2:
         return None

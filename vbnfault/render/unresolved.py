@@ -5,8 +5,9 @@ its light. Such a body is rendered in a frame of its own that it fills: a close-
 truth as any other image. Each pixel of it lies within one pixel of the frame and adds its part of the area to it.
 So the light of a body is that of some `_ACROSS`² pixels, whatever its size in the frame.
 
-Float32 resolves 2⁻²³ of the camera's distance, which may be more than the body's size. The close-up is therefore
-taken from at most `_FARTHEST` radii, on the same line of sight. This changes directions by 1e-4 at most.
+Float32 resolves 2⁻²³ of the distance of the camera, which may be more than the size of the body. So the close-up is
+taken from at most `_FARTHEST` radii, on the same line of sight, and its rays start just before the body. This turns
+them by 1e-4 at most.
 """
 
 from __future__ import annotations
@@ -118,14 +119,11 @@ class CloseUp:
         # defocus shifts the light of each point of the aperture
         depth_m = float((self.ground.centre_m - frame.position_L_m) @ frame.L_from_C[:, 2])
         slopes = (slopes + self._lens_m * (1 / frame.focus_distance_m - 1 / depth_m))[lit]
-        fx, fy = frame.intrinsics[:2]
-        solid_sr = 1 / (fx * fy * self.per_px**2 * (1 + (slopes**2).sum(axis=1)) ** 2)  # cos⁴θ dx dy / (fx fy)
         return FineLight.of(
-            pixels=slopes * frame.intrinsics[:2] + frame.intrinsics[2:],
-            area_px=self.per_px**-2.0,
-            radiance=values[:, lit],
             slopes=slopes,
-            power=values[:, lit] * solid_sr.astype(np.float32),
+            area_px=np.full(len(slopes), self.per_px**-2.0),
+            radiance=values[:, lit],
+            intrinsics=frame.intrinsics,
             shape=(frame.height_px, frame.width_px),
         )
 
@@ -169,6 +167,7 @@ def close_up(surface: TerrainMesh, view: View, margin_m: float = 0.0) -> CloseUp
             intrinsics=np.concatenate([focal, middle * per_px - first - towards[:2] / towards[2] * focal]),
             width_px=_ACROSS,
             height_px=_ACROSS,
+            start_m=max(nearer * distance - 2 * radius, 0.0),
         ),
         ground=ground,
         vehicle=surface,
