@@ -11,7 +11,8 @@ _ABOUT_MASKS = {
     "footprint": ("- Masks: `footprint`. `mask` is that of the store, by the rules of the table below.",),
     "effect": (
         f"- Masks: `effect`. What is called `mask` here is `mask_effect` of the store, not the footprint of the "
-        f"table below: {EFFECT_RULE}. `mask_any` is the union of these masks.",
+        f"table below: {EFFECT_RULE}. `mask_any` unites these masks and what several "
+        "faults change together.",
     ),
 }
 

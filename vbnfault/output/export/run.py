@@ -265,11 +265,8 @@ def _with_masks(store: Store, sample: Sample, layer: str) -> Sample:
     """Return a sample whose masks, and the union of them, are those of another layer of masks."""
     masks = sample.layers[layer]
     of_masks = {"mask": masks, "mask_any": mask_union(store.spec, masks)}
-    if store.spec.mask_any_joint and "mask_any" in sample.layers:
-        # a pixel that several faults turn into the same value is in the effect of none of them; every format with
-        # this layer has image and clean, too
-        changed = (sample.layers["image"] != sample.layers["clean"]).any(axis=-1)
-        of_masks["mask_any"] |= sample.layers["mask_any"] & changed
+    if "mask_any" in sample.layers:  # what several faults turn into the same value is in no mask and no effect
+        of_masks["mask_any"] |= sample.layers["mask_any"] & ~mask_union(store.spec, sample.layers["mask"])
     layers = {name: of_masks.get(name, values) for name, values in sample.layers.items() if name != layer}
     return replace(sample, layers=layers)
 
