@@ -2,7 +2,8 @@
 
 The radiance of a view is read. Its pose follows from the plan, and what is stored of its truth is used as it is.
 The terrain is made only for what is not stored: the parts of the Sun's disc that ground or spacecraft hide, truth
-for a lens that maps the pixels to other directions, and the coarse surroundings that scene straylight needs.
+for a lens that maps the pixels to other directions, where a body of few pixels and thin parts of the spacecraft lie
+within pixels, and the coarse surroundings that scene straylight needs.
 """
 
 from __future__ import annotations
@@ -237,7 +238,8 @@ def _rendering(spec: SampleSpec, pose: Pose, stored: StoredView) -> Rendering:
 
     scene, camera = describe(spec, pose), spec.camera
     truth = _stored_truth(spec, stored)
-    body = body_of_few_pixels(spec, pose, scene) if _may_be_small(spec, scene) else None
+    needs_body = (truth is None or camera.lens.resamples) and _may_be_small(spec, scene)
+    body = body_of_few_pixels(spec, pose, scene) if needs_body else None
     radiance = _radiance(spec, scene, stored)
     if camera.lens.resamples and (body is not None or spec.terrain.vehicle is not None):
         parts = render.thin_parts(
