@@ -331,7 +331,8 @@ def test_terrain_is_whole_from_afar_and_shared_and_a_patch_near_the_ground(tmp_p
 
     far = detail((0, 0, 60e3), (61e3, 0, 0), (0, -59e3, 0))
     assert far[0] == far[1] == far[2]  # all sides
-    assert far[0].facet_m == pytest.approx(60e3 * ground.pixel_rad(scene), rel=0.3)
+    # 23 pixels wide, it has the terrain of a body of 64
+    assert far[0].facet_m == pytest.approx(2 * RADIUS_M / 64, rel=0.3)
     assert far[0].radius_m >= 1.99 * RADIUS_M  # even over the whole body
     one, other = detail((0, 0, 503.0), (0, 0, -503.0))
     assert one != other  # two sides of a small body, from near: each has its own

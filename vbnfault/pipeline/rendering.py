@@ -101,7 +101,7 @@ def render_view(spec: SampleSpec, pose: Pose) -> Rendering:
     return Rendering(
         scene=scene,
         light=SceneLight(lens=camera.lens, rendered=rendered),
-        truth=truth if body is None else _with_body(truth, body, camera.projection),
+        truth=truth if body is None else with_body(truth, body, camera.projection),
         open_sky=guide.semantic == SKY if stars and guide is not None else None,
         samples_per_pixel=sampled.samples_per_pixel,
         noise_fraction_p99=sampled.noise_fraction_p99,
@@ -163,7 +163,7 @@ def body_of_few_pixels(spec: SampleSpec, pose: Pose, scene: RenderInput) -> FewP
     return FewPixels(near=near, light=near.light(light), error=error, truth=truth)
 
 
-def _with_body(truth: Truth, body: FewPixels, projection: Projection) -> Truth:
+def with_body(truth: Truth, body: FewPixels, projection: Projection) -> Truth:
     """Return truth in which a body smaller than a pixel has the pixel in which its middle is visible.
 
     That pixel has the depth, the normal and the angles of the middle.

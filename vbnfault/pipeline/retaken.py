@@ -2,7 +2,8 @@
 
 The radiance of a view is read. Its pose follows from the plan, and what is stored of its truth is used as it is.
 The terrain is made only for what is not stored: the parts of the Sun's disc that ground or spacecraft hide, truth
-for a lens that maps the pixels to other directions, and the coarse surroundings that scene straylight needs.
+for a lens that maps the pixels to other directions, where a body of few pixels and thin parts of the spacecraft lie
+within pixels, and the coarse surroundings that scene straylight needs.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from ..world import assemble
 from ..world.aiming import aimed_view
 from ..world.spacecraft import SpacecraftMesh
 from .record import to_sample
-from .rendering import ANGLE_LAYERS, describe, far_sources, surroundings
+from .rendering import ANGLE_LAYERS, body_of_few_pixels, describe, far_sources, surroundings, with_body
 from .resolve import references_L
 from .session import Session
 from .sight import in_local_frame
@@ -41,6 +42,7 @@ if TYPE_CHECKING:
 # The recomputed attitude is that of the store but for the rounding of a quaternion. Another one means that the
 # store was planned by other code.
 _SAME_ATTITUDE = 1e-9
+_FEW_PX = 128  # a body wider than this, seen from its nearest vertex, needs no close-up
 TRUTH_LAYERS = ("depth_m", "normal", "semantic")
 
 
@@ -240,6 +242,15 @@ def _rendering(spec: SampleSpec, pose: Pose, stored: StoredView) -> Rendering:
 
     scene, camera = describe(spec, pose), spec.camera
     truth = _stored_truth(spec, stored)
+    needs_body = (truth is None or camera.lens.resamples) and _may_be_small(spec, scene)
+    body = body_of_few_pixels(spec, pose, scene) if needs_body else None
+    radiance = _radiance(spec, scene, stored)
+    if camera.lens.resamples and (body is not None or spec.terrain.vehicle is not None):
+        parts = render.thin_parts(
+            spec.terrain.surface, scene if body is None else replace(scene, shows_ground=False)
+        )
+        light = None if body is None else body.light
+        radiance = replace(radiance, fine=light if parts is None else parts.joined(light))
     if truth is None:
         angles = bool(ANGLE_LAYERS & set(spec.scene.dataset.layers))
         slopes = camera.seen_slopes if camera.lens.resamples else None
@@ -247,6 +258,7 @@ def _rendering(spec: SampleSpec, pose: Pose, stored: StoredView) -> Rendering:
         truth = render.truth(
             spec.terrain.surface, scene.view, scene.sun, angles=angles, slopes=slopes, projection=projection
         )
+        truth = truth if body is None else with_body(truth, body, camera.projection)
     open_sky = None
     if spec.scene.sky.stars != "off":
         on_grid = truth
@@ -255,7 +267,7 @@ def _rendering(spec: SampleSpec, pose: Pose, stored: StoredView) -> Rendering:
         open_sky = on_grid.semantic == SKY
     return Rendering(
         scene=scene,
-        light=SceneLight(lens=camera.lens, rendered=_radiance(spec, scene, stored)),
+        light=SceneLight(lens=camera.lens, rendered=radiance),
         truth=truth.frozen(),
         open_sky=open_sky,
         samples_per_pixel=float(stored.scalars["samples_per_pixel"]),
@@ -263,6 +275,14 @@ def _rendering(spec: SampleSpec, pose: Pose, stored: StoredView) -> Rendering:
         surroundings=surroundings(spec, scene),
         far_sources=far_sources(spec, pose),
     )
+
+
+def _may_be_small(spec: SampleSpec, scene: RenderInput) -> bool:
+    """Return whether the body may have so few pixels that it needs a close-up, from its shape alone."""
+    vertices, site, view = spec.terrain.body.vertices_m, spec.terrain.site, scene.view
+    camera_T_m = site.position_T_m + site.T_from_L @ view.position_L_m
+    distance_m = float(np.linalg.norm(vertices - camera_T_m, axis=1).min())
+    return bool(np.ptp(vertices, axis=0).max() * view.intrinsics[0] < _FEW_PX * distance_m)
 
 
 def _stored_truth(spec: SampleSpec, stored: StoredView) -> Truth | None:

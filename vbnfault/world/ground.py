@@ -130,12 +130,17 @@ def _whole_body(scene: Scene, body: Body, pose: FlownPose) -> GroundDetail | Non
     """Return the terrain that is even all over the body, or None if it would take too many triangles.
 
     Its origin is the vertex with the largest x in T, the same for all poses. From so far away that the body is less
-    than `_FEWEST_PX` pixels wide, the terrain stays as it is at this distance.
+    than `_FEWEST_PX` pixels wide, the terrain stays as it is at this distance, or as fine as it may be.
     """
     nearest_m = float(np.linalg.norm(body.vertices_m - pose.camera_position_T_m, axis=1).min())
-    nearest_m = min(nearest_m, float(np.ptp(body.vertices_m, axis=0).max()) / (_FEWEST_PX * pixel_rad(scene)))
-    facet_m = max(scene.patch.facet_m, scene.patch.facet_px * pixel_rad(scene) * _rounded(nearest_m))
-    if body.area_m2 > _EVEN_FRACTION * scene.patch.max_triangles * _TRIANGLE * facet_m**2:
+    pixel, budget = pixel_rad(scene), _EVEN_FRACTION * scene.patch.max_triangles * _TRIANGLE
+    few_px_m = float(np.ptp(body.vertices_m, axis=0).max()) / (_FEWEST_PX * pixel)
+    wanted_m, close_m = (
+        max(scene.patch.facet_m, scene.patch.facet_px * pixel * _rounded(distance))
+        for distance in (nearest_m, min(nearest_m, few_px_m))
+    )
+    facet_m = min(wanted_m, max(close_m, 1.001 * float(np.sqrt(body.area_m2 / budget))))
+    if body.area_m2 > budget * facet_m**2:
         return None
     origin = body.vertices_m[np.argmax(body.vertices_m[:, 0])]
     return _detail(scene, origin, facet_m, float(np.linalg.norm(body.vertices_m - origin, axis=1).max()))
