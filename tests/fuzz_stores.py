@@ -163,8 +163,15 @@ def look(path: str) -> None:
 # --- the ways -------------------------------------------------------------------------------------------------
 
 
+def _content(path: Path) -> bytes:
+    """Return the content of a file, which an earlier way may have made too large to be read."""
+    if path.stat().st_size > 1 << 27:
+        raise ValueError("too large")
+    return path.read_bytes()
+
+
 def _attributes(store: Path) -> dict[str, Any]:
-    table: dict[str, Any] = json.loads((store / "zarr.json").read_bytes())["attributes"]
+    table: dict[str, Any] = json.loads(_content(store / "zarr.json"))["attributes"]
     return table
 
 
@@ -173,7 +180,7 @@ def _write(store: Path, attributes: dict[str, Any]) -> None:
     from vbnfault.store import layout
 
     attributes = layout.sealed(attributes)
-    root = json.loads((store / "zarr.json").read_bytes())
+    root = json.loads(_content(store / "zarr.json"))
     (store / "spare/zarr.json").write_bytes(layout.to_bytes(layout.group_document(attributes)))
     (store / "zarr.json").write_bytes(layout.to_bytes({**root, "attributes": attributes}))
 
@@ -212,7 +219,7 @@ def _attribute(store: Path, rng: random.Random, _: Path) -> None:
         _write(store, attributes)
         return
     path = rng.choice(sorted(store.glob("*/zarr.json")))
-    path.write_text(json.dumps(changed(json.loads(path.read_bytes()), rng)))
+    path.write_text(json.dumps(changed(json.loads(_content(path)), rng)))
 
 
 def _resize(store: Path, rng: random.Random, _: Path) -> None:
@@ -278,7 +285,7 @@ def _index(store: Path, rng: random.Random, _: Path) -> None:
 
     spec = open_store(store).spec
     file = rng.choice([p for p in _files(store) if p.parent.name != "c" and "image" in p.parts and "c" in p.parts])
-    data = bytearray(file.read_bytes())
+    data = bytearray(_content(file))
     table = np.frombuffer(bytes(data[-16 * spec.shard_samples - 4 : -4]), "<u8").copy()
     table[rng.randrange(len(table))] = rng.choice((0, 1, 2**31, 2**40, 2**63, 2**64 - 1, len(data)))
     data[-16 * spec.shard_samples - 4 :] = table.tobytes() + struct.pack("<I", google_crc32c.value(table.tobytes()))

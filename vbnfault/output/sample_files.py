@@ -67,7 +67,7 @@ def write_frame(frame: Frame, folder: Path) -> list[Path]:
         write_json(own(path), _scalars(sample))
         return [*files, path]
     except OSError as error:
-        raise unwritable(folder, error) from None
+        raise unwritable(error.filename2 or error.filename or folder, error) from None
 
 
 def annotated(frame: Frame, fault: str) -> NDArray[np.uint8]:

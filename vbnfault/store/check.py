@@ -190,9 +190,10 @@ def _chunks(store: Store, number: int, finished: list[int]) -> tuple[dict[str, d
 
 def _layers(
     store: Store, number: int, i: int, chunks: Mapping[str, Mapping[int, bytes]], crcs: NDArray[np.uint32]
-) -> tuple[list[tuple[int, Problem]], dict[str, bytes]]:
+) -> tuple[list[tuple[int, Problem]], dict[str, Any]]:
     """Return the problems of one sample, each with the index of its layer, and the decoded bytes of its layers."""
-    problems, layers = [], {}
+    problems: list[tuple[int, Problem]] = []
+    layers: dict[str, Any] = {}
     for k, name in enumerate(store.spec.pixel_layers):
         if store.spec.empty(name):
             layers[name] = b""
