@@ -34,7 +34,7 @@ PEAK = 64  # rays across a box, to locate the peak
 _TOGETHER = 1 << 22  # rays traced at a time, to limit memory
 _SHARP = 1e-3  # default width of soft edges while boxes are located
 _LEAST_SPREAD = 0.25  # fraction of a ghost's image that is magnified less than `Arrivals.magnification`
-_SPECTRUM = 4  # rays across a ghost whose spectrum is computed
+_SPECTRUM = 6  # rays across a ghost whose spectrum is computed
 _SPECTRUM_AT_ONCE = 1 << 20
 _LEAST_SHARE = 1e-2  # of a ghost's light in a band that a wavelength must have to be drawn in it
 _UNEVEN = 2.0  # ratio of the areas of neighbouring cells above which the image is uneven
@@ -400,16 +400,21 @@ class GhostSpectra:
     traced: F64
 
     @classmethod
-    def of(cls, made: Tracer, rays: Rays, reach_mm: float = np.inf) -> GhostSpectra:
-        """Return the spectra of bundles; rays that arrive farther than `reach_mm` from the axis count less."""
+    def of(cls, made: Tracer, rays: Rays, reach_mm: float = np.inf, step: int = 1) -> GhostSpectra:
+        """Return the spectra of bundles; rays that arrive farther than `reach_mm` from the axis count less.
+
+        The light of the rays is computed at every `step`-th wavelength of the tracer and is linear between these.
+        """
         nm, count = made.wavelength_nm, len(rays)
         if made.bands is None:
             none = np.ones((count, len(nm)))
             return cls(bands=None, traced_nm=nm, true=none, traced=none)
         lit = made.light_nm
         nearest = np.rint(np.interp(lit, nm, np.arange(len(nm)))).astype(np.int64)
-        wavelength = np.concatenate([nearest, np.arange(len(nm))])
-        light = np.concatenate([np.arange(len(lit)), np.arange(-len(nm), 0)])
+        nodes = np.arange(0, len(nm), step)
+        wavelength = np.concatenate([nearest, nodes])
+        # the mean light around the tracer's wavelengths is before that of the bands
+        light = np.concatenate([np.arange(len(lit)), nodes - len(nm)])
         parts = []
         together = max(1, _SPECTRUM_AT_ONCE // (len(light) * _SPECTRUM**2))
         for first in range(0, count, together):
@@ -421,7 +426,8 @@ class GhostSpectra:
             )
             parts.append(_arriving(made.trace(each, _SPECTRUM, centred=True), reach_mm).reshape(len(part), -1))
         spectra = np.concatenate(parts) if parts else np.zeros((0, len(light)))
-        return cls(bands=made.bands, traced_nm=nm, true=spectra[:, : len(lit)], traced=spectra[:, len(lit) :])
+        traced = np.einsum("gk,kn->gn", spectra[:, len(lit) :], hat_weights(nm[nodes], nm))
+        return cls(bands=made.bands, traced_nm=nm, true=spectra[:, : len(lit)], traced=traced)
 
     def take(self, chosen: NDArray[Any]) -> GhostSpectra:
         """Return the spectra of some of the bundles."""
@@ -470,8 +476,8 @@ def _arriving(spots: Spots, reach_mm: float) -> F64:
     dr = be.dr
     away = (spots.x_mm * spots.x_mm + spots.y_mm * spots.y_mm) * dr.opaque(be.Float, reach_mm**-2)
     # where no ray passes the rims, those that nearly pass decide
-    passes = dr.select(spots.radius <= 1, 1, 1e-6 / (1 + spots.radius**8))
-    weight = passes / (1 + away * away)
+    nearly = 1e-6 / (1 + spots.radius**8)
+    weight = (_inside(spots.radius, _SPECTRUM) + nearly) / (1 + away * away)
     total = dr.block_sum(be.Float64(spots.fraction * weight), _SPECTRUM**2)
     return np.asarray(total.numpy() / dr.block_sum(be.Float64(weight), _SPECTRUM**2).numpy())
 

@@ -376,12 +376,11 @@ class FlareModel:
             raise InputError(f"sun_deg = {sun_deg:g}: must be from 0 to below 90")
         turn = float(np.radians(azimuth_deg))
         made, rays, arrivals = self._boxes(sun_deg, turn)
-        shown = self._in_frame(arrivals) & (arrivals.peak > _LEAST)
+        shown = self._in_frame(arrivals)
         if only is not None:
             shown &= named(made, rays, [only])
-        rays, arrivals = rays.take(shown), arrivals.take(shown)
+        rays, arrivals, spectra = self._bright(made, rays.take(shown), arrivals.take(shown), self._reach_mm)
         detail = self._details(self._fainter(rays, arrivals), self._spread(arrivals, rays.route))
-        spectra = GhostSpectra.of(made, rays, self._reach_mm)
         sums = Sums(self.canvas)
         cosine = float(np.cos(np.radians(sun_deg)))
         sampled = detail.sampled[rays.route]
@@ -434,7 +433,8 @@ class FlareModel:
             each = np.repeat(np.arange(len(rays)), len(nodes))
             at_nodes = replace(rays.take(each), wavelength=np.tile(nodes, len(rays)))
             traced_mm2 = fluxes_mm2(made, at_nodes, sun_deg, across).reshape(len(rays), len(nodes))
-            by_band = np.einsum("gk,gkb->gb", traced_mm2, GhostSpectra.of(made, rays).weights(_SUBDIVISIONS))
+            spectra = GhostSpectra.of(made, rays, step=_SUBDIVISIONS)
+            by_band = np.einsum("gk,gkb->gb", traced_mm2, spectra.weights(_SUBDIVISIONS))
             for route, own in zip(rays.route, by_band, strict=True):
                 flux[name_of(made.routes[route])] += own
         return flux
@@ -449,10 +449,11 @@ class FlareModel:
         """
         turn = float(np.radians(azimuth_deg))
         made, rays, arrivals = self._boxes(sun_deg, turn)
-        rays = rays.take(self._in_frame(arrivals) & (arrivals.peak > _LEAST))
+        shown = self._in_frame(arrivals)
+        rays, _, spectra = self._bright(made, rays.take(shown), arrivals.take(shown), np.inf)
         if not len(rays):
             return ()
-        weights = GhostSpectra.of(made, rays).weights(_SUBDIVISIONS).mean(axis=2)
+        weights = spectra.weights(_SUBDIVISIONS).mean(axis=2)
         of_name = {name_of(made.routes[route]): own for route, own in zip(rays.route, weights, strict=True)}
         by_name: dict[tuple[int, ...], list[tuple[float, Ghost]]] = {}
         for k in range(len(self.nodes_nm)):
@@ -461,6 +462,19 @@ class FlareModel:
         peak = {name: sum(part * g.peak_irradiance_fraction for part, g in of) for name, of in by_name.items()}
         highest = sorted(sorted(by_name), key=lambda name: -peak[name])[:most]
         return tuple(mean_ghost(by_name[name]) for name in sorted(highest))
+
+    def _bright(
+        self, made: Tracer, rays: Rays, arrivals: Arrivals, reach_mm: float
+    ) -> tuple[Rays, Arrivals, GhostSpectra]:
+        """Return the ghosts that are bright enough to show, and their spectra.
+
+        The peaks of the arrivals become those in the band in which each ghost is brightest. They were traced at the
+        first wavelength, where coatings may reflect much more or less, and with whole coatings.
+        """
+        spectra = GhostSpectra.of(made, rays, reach_mm, _SUBDIVISIONS)
+        arrivals = replace(arrivals, peak=arrivals.peak * spectra.of_bands(0).max(axis=1))
+        bright = arrivals.peak > (_LEAST if self._whole is None else 0)
+        return rays.take(bright), arrivals.take(bright), spectra.take(bright)
 
     def _fainter(self, rays: Rays, arrivals: Arrivals) -> NDArray[np.int64]:
         """Return the levels to add where edges are too faint to show in the sum of all ghosts, by route."""
