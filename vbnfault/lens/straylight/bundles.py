@@ -5,11 +5,8 @@ Each path is a table of steps, so that the rays of all ghosts run side by side t
 of a ray is relative to the vertex of the surface that the ray has just met. If the boxes of the bundles are
 symmetric about the plane of axis and Sun, the code traces only one side of this plane.
 
-Directions of rays vary slowly with wavelength, and are traced at few wavelengths. The light that surfaces reflect
-and transmit varies fast: the product of two coatings' reflectances changes tenfold within 50 nm. So a tracer of bands
-has two kinds of fractions of light: those of every other nanometre of the bands, and means around the wavelengths at
-which rays are traced. `ghosts.GhostSpectra` compares both with few rays.
-
+Coatings vary faster with wavelength than directions of rays: a tracer of bands has the fractions of light of every
+other nanometre and means around the wavelengths that it traces. `ghosts.GhostSpectra` compares both with few rays.
 A route is the sequence of reflecting surfaces, which are numbered by their row in the prescription. The path of a
 route is the sequence of all surfaces that a ray meets; each of them is one step.
 
@@ -43,9 +40,7 @@ from .steps import Step, StopBlades, arrived, meet
 
 F64 = NDArray[np.float64]
 
-# Nodes of the reflectance tables: of a single wavelength, and of the many in a tracer of bands. Between the latter,
-# reflectances are off by less than 0.1 % of themselves up to 80 degrees.
-_COSINES, _COSINES_OF_BANDS = 256, 64
+_COSINES, _COSINES_OF_BANDS = 256, 64  # nodes of the reflectance tables, of single wavelengths and of bands
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -64,8 +59,7 @@ class Rays:
         float64[bundle]: semi-axis, in half widths of the box, of the ellipse to which a lattice is rounded. The
         outer rays of this lattice then follow a rim. With 0, the lattice stays rectangular.
     light
-        int[bundle]: index into the wavelengths of the tracer's bands, whose light the bundle has. Default: the mean
-        around `wavelength`.
+        int[bundle]: index into `Tracer.light_nm` of its light. Default: the mean around `wavelength`.
     """
 
     route: NDArray[np.int64]
@@ -174,7 +168,7 @@ def routes(lens: Prescription, reflections: int = 2) -> tuple[tuple[int, ...], .
 def name_of(route: Sequence[int]) -> tuple[int, ...]:
     """Return the name of a ghost: its reflecting rows in pairs; the first row of a pair is nearer the front.
 
-    Each pair is one reflection backwards and the next reflection forwards. The row that reflects forwards is first.
+    Each pair is a reflection backwards and the next one forwards; the row that reflects forwards is first.
     """
     return tuple(row for back, forth in zip(route[::2], route[1::2], strict=True) for row in (forth, back))
 
@@ -296,11 +290,10 @@ def _aspheric_terms(lens: Prescription) -> F64:
 class Tracer:
     """Trace rays through a lens; the constructor computes tables of paths, indices and reflectances once.
 
-    `reflections` is 2, or 4 to include the paths of four reflections. `bands` are the bands whose light the rays
-    carry; by default each wavelength has its own light.
+    `reflections` is 2, or 4 to include the paths of four reflections. `bands` are those whose light rays may carry.
 
-    A ray is lost (clipped) outside `rims_mm`, float64[row]: the semi-diameter of each round rim, and infinity for
-    the sensor. `steps.meet` clips at these rims. `irradiance.ParaxialTracer` clips paraxial rays at the same rims.
+    A ray is lost (clipped) outside `rims_mm`, float64[row]: the semi-diameter of each round rim; the sensor's is
+    infinite. `steps.meet` clips at these rims. `irradiance.ParaxialTracer` clips paraxial rays at the same rims.
     A stop with blades does not use `rims_mm` but `steps.StopBlades`. `paraxial.paraxial_ghosts` has separate rims.
     From `rims_mm`, `ghosts` also computes first boxes and `irradiance` the widths of soft edges.
     """
@@ -353,8 +346,8 @@ class Tracer:
         flat = [s.curvature_per_mm for s in lens.surfaces] + [0.0]
         conic = [1 + s.conic for s in lens.surfaces] + [1.0]
         ratio = index[:, medium] / index[:, steps.other]
+        curvature, per_rim = np.array(flat)[rows], (1 / self.rims_mm)[rows]
         # each step fetches few but wide records, because fetches take most of the time
-        curvature, per_rim = (np.array(flat)[rows], (1 / self.rims_mm)[rows])
         self._look_up_word = ((rows * 3 + use) * self._cosines * 2 + steps.mirror.astype(np.int64)).astype(
             np.uint32
         )
@@ -420,8 +413,7 @@ class Tracer:
     def _fractions(self, bare: bool = False) -> F64:
         """Return the fractions reflected from the front, reflected from behind, and transmitted, of each surface.
 
-        The result is float64[light, row, 3, cosine], the mean of both polarisations. The cosine is that of the angle
-        in the medium of lower index.
+        The result is float64[light, row, 3, cosine], the mean of both polarisations; cosines in the thinner medium.
         """
         lens = self.lens
         out = np.zeros((len(self.light_nm), len(lens.surfaces) + 1, 3, self._cosines))
@@ -438,8 +430,8 @@ class Tracer:
         """Return means around every wavelength of the tracer, and behind them the values at all of the bands."""
         if self.bands is None:
             return values
-        reach = self.bands.nodes_nm[1] - self.bands.nodes_nm[0]
-        hats = np.maximum(1 - np.abs(self.light_nm - self.wavelength_nm[:, None]) / reach, 0)
+        away = np.abs(self.light_nm - self.wavelength_nm[:, None])
+        hats = np.maximum(1 - away / (self.bands.nodes_nm[1] - self.bands.nodes_nm[0]), 0)
         return np.concatenate([np.tensordot(hats / hats.sum(axis=1, keepdims=True), values, 1), values])
 
     def trace(
@@ -584,6 +576,9 @@ class Tracer:
         sharpness, word = _unpaired(edge, step)
         word = dr.reinterpret_array(be.UInt32, word)
         row = dr.gather(be.UInt32, t["row"], step) if self._special else None
+        absorption = None
+        if self._absorbs:
+            absorption = dr.gather(be.Float, t["absorption"], media + dr.gather(be.UInt32, t["medium"], step))
 
         def passed(cosine: Any) -> Any:
             at = cosine * (self._cosines - 1)
@@ -603,9 +598,7 @@ class Tracer:
             stop=dr.gather(be.UInt32, t["stop"], step) == 1 if self._bladed else False,
             conic=dr.gather(be.Float, t["conic"], row) if self._special else 1.0,
             aspheric=[dr.gather(be.Float, a, row) for a in t["aspheric"]],
-            absorption=dr.gather(be.Float, t["absorption"], media + dr.gather(be.UInt32, t["medium"], step))
-            if self._absorbs
-            else None,
+            absorption=absorption,
             passed=passed,
         )
 

@@ -444,8 +444,8 @@ class GhostSpectra:
     def weights(self, step: int) -> F64:
         """Return the weights of rays at every `step`-th wavelength, float64[bundle, wavelength, band].
 
-        The light of a ghost in a band is the sum of the light of its rays times these weights: each is the mean over
-        the band of true light times the hat function of the wavelength, over the light of the rays.
+        The light of a ghost in a band is the sum of the light of its rays times these weights: each is the mean
+        over the band of true light times the hat function of the wavelength, over the light of the rays.
         """
         if self.bands is None:
             return np.ones((*self.true.shape, 1)) / self.true.shape[1]
