@@ -27,6 +27,7 @@ import cv2
 import numpy as np
 
 from vbnfault.core.array_files import FOLDER_VARIABLE
+from vbnfault.core.spectra import Bands
 from vbnfault.lens import ThinLens, load_lens, paraxial_properties
 from vbnfault.lens.straylight import ghost_response
 from vbnfault.lens.straylight.bundles import Tracer
@@ -134,7 +135,8 @@ def compare(size: int, within: int = 2, across: int = 64) -> None:
     pitch_mm = efl_mm / focal_px
     scene = SceneInLens(
         lens=lens,
-        nodes_nm=np.array([550.0]),
+        bands=Bands.lines(550.0),
+        of_nodes=np.eye(1),
         sensor=SensorGrid(shape=(size, size), pitch_mm=pitch_mm),
         render=RenderGrid(shape=(size, size), focal_px=focal_px),
         image=ThinLens(focal_length_mm=efl_mm, f_number=2.8),
@@ -144,7 +146,7 @@ def compare(size: int, within: int = 2, across: int = 64) -> None:
     row, column = (np.mgrid[:size, :size] + 0.5) / size
     lit = (np.hypot(column - 0.65, row - 0.4) < 0.12) * np.clip((column - 0.65) / 0.12, 0, 1)
     found = scene.straylight(lit[None].astype(np.float32), np.eye(1)).ghosts[0]
-    made, halves = Tracer(lens, scene.nodes_nm), np.zeros((2, size * size))
+    made, halves = Tracer(lens, scene.bands.nodes_nm), np.zeros((2, size * size))
     offsets, rng = (np.arange(within) + 0.5) / within, np.random.default_rng(1)
     for i, j in zip(*np.nonzero(lit), strict=True):
         for point in range(within**2):

@@ -2,7 +2,7 @@
 
     python -m pytest benchmarks/test_flares.py --benchmark-only -n 0
 
-The lens is scaled to a field of 65° on 1024 pixels (`--size`), with eight bands.
+The lens is scaled to a field of 65° on 1024 pixels (`--size`), in the channels of the three-colour detector.
 """
 
 from __future__ import annotations
@@ -15,11 +15,14 @@ from workload import clock
 
 from vbnfault.core import spectra
 from vbnfault.core.resources import packaged
+from vbnfault.core.spectra import Bands
+from vbnfault.detector import ThreeColourDetector
 from vbnfault.lens import load_lens, scaled_to_focal_length
 from vbnfault.lens.straylight.irradiance import FlareModel
 from vbnfault.lens.straylight.settings import SensorGrid
 
 SIDE_MM = 5.632
+NM = np.linspace(400.0, 700.0, 301)
 
 
 @pytest.mark.parametrize("sun_deg", [5.0, 14.0, 25.0])
@@ -29,7 +32,7 @@ def test_flare(benchmark: Any, rounds: int, request: pytest.FixtureRequest, name
     size = request.config.getoption("--size")
     model = FlareModel(
         scaled_to_focal_length(load_lens(name), SIDE_MM / 2 / np.tan(np.radians(32.5))),
-        spectra.band_nodes_nm(400.0, 700.0, 8),
+        Bands.of(NM, ThreeColourDetector().electron_rates(NM) * spectra.solar_irradiance_W_m2_nm(NM)),
         SensorGrid(shape=(size, size), pitch_mm=SIDE_MM / size),
         sun_radius_rad=4.65e-3,
     )

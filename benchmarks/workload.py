@@ -16,6 +16,7 @@ from vbnfault import dataset, pipeline, render, store
 from vbnfault.body import Patch
 from vbnfault.core import frames, spectra
 from vbnfault.core.quantities import Sample
+from vbnfault.core.spectra import Bands
 from vbnfault.lens import load_lens, scaled_to_focal_length
 from vbnfault.lens.straylight.irradiance import FlareModel
 from vbnfault.lens.straylight.settings import SensorGrid
@@ -46,6 +47,7 @@ SUN_ELEVATION_DEG = 24.0
 
 FLARE_LENS = "nikkor_35_f2p8"
 FLARE_SUN_DEG = 16.0
+NM = np.linspace(400.0, 700.0, 301)
 
 
 def clock(function: Callable[[], Any]) -> tuple[float, Any]:
@@ -162,12 +164,12 @@ class Workload:
 
     @cached_property
     def flares(self) -> FlareModel:
-        """The model of all ghosts of an 11-surface lens at eight wavelengths, on the camera's sensor."""
+        """The model of all ghosts of an 11-surface lens in the channels of the camera, on the camera's sensor."""
         camera = self.session.base_camera
         lens = scaled_to_focal_length(load_lens(FLARE_LENS), camera.lens.focal_length_mm)
         return FlareModel(
             lens,
-            spectra.band_nodes_nm(400.0, 700.0, 8),
+            Bands.of(NM, camera.detector.electron_rates(NM) * spectra.solar_irradiance_W_m2_nm(NM)),
             SensorGrid(shape=(camera.height_px, camera.width_px), pitch_mm=camera.detector.pixel_pitch_um * 1e-3),
             sun_radius_rad=self.scene.sun.angular_radius_rad,
         )

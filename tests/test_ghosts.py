@@ -12,6 +12,7 @@ from test_lens import BACK, GLASS, STOP
 
 from vbnfault.core import llvm
 from vbnfault.core.errors import InputError, VbnfaultError
+from vbnfault.core.spectra import Bands
 from vbnfault.lens import load_lens, paraxial_properties, parse_lens, scaled_to_focal_length
 from vbnfault.lens.glass import D_NM
 from vbnfault.lens.prescription import Prescription
@@ -270,8 +271,8 @@ def test_blades_bound_the_beam() -> None:
 def model(lens: Prescription, **more: Any) -> FlareModel:
     given: dict[str, Any] = {"shape": (160, 200), "pitch_mm": 0.2, "sun_radius_rad": 2e-3} | more
     sensor = SensorGrid(shape=given.pop("shape"), pitch_mm=given.pop("pitch_mm"))
-    wavelength, radius = given.pop("wavelength_nm", np.array([D_NM])), given.pop("sun_radius_rad")
-    return FlareModel(lens, wavelength, sensor, sun_radius_rad=radius, settings=GhostSettings(**given))
+    bands, radius = given.pop("bands", Bands.lines(D_NM)), given.pop("sun_radius_rad")
+    return FlareModel(lens, bands, sensor, sun_radius_rad=radius, settings=GhostSettings(**given))
 
 
 @pytest.mark.parametrize(("kind", "worst"), [("traced", 0.05), ("paraxial", 0.01)])
@@ -353,7 +354,7 @@ def test_a_ghost_that_aberrations_spread_is_drawn_as_its_rays_fall(
     side, of_frame_mm, ghost = 512, 5.632, (4, 8)
     lens = scaled_to_focal_length(load_lens("biotar_100_f1p4"), of_frame_mm / 2 / np.tan(np.radians(field_deg / 2)))
     sensor = SensorGrid(shape=(side, side), pitch_mm=of_frame_mm / side)
-    made = FlareModel(lens, np.array([500.0]), sensor, sun_radius_rad=4.65e-3)
+    made = FlareModel(lens, Bands.lines(500.0), sensor, sun_radius_rad=4.65e-3)
     tracer, rays, _ = made._boxes(sun_deg, 0.0)
     rays = rays.take(ghosts.named(tracer, rays, [ghost]))
     assert len(rays) == 1
@@ -385,7 +386,7 @@ def test_a_ghost_that_aberrations_spread_is_drawn_as_its_rays_fall(
 
 
 def test_threads_do_not_change_a_bit() -> None:
-    made = model(load_lens("tessar_50_f2p8"), wavelength_nm=np.linspace(400, 700, 3))
+    made = model(load_lens("tessar_50_f2p8"), bands=Bands.sunlit(np.linspace(400, 700, 3)))
     pictures = []
     for count in (1, 2, 2):
         with render_threads(count):
@@ -395,7 +396,7 @@ def test_threads_do_not_change_a_bit() -> None:
 
 def test_parts_do_not_change_a_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     """Ghosts are drawn in parts to bound memory; each part has lattices of all sizes, as their sum would round."""
-    made = model(load_lens("nikkor_35_f2p8"), wavelength_nm=np.linspace(400, 700, 2))
+    made = model(load_lens("nikkor_35_f2p8"), bands=Bands.sunlit(np.linspace(400, 700, 2)))
     draw, sizes, pictures = Sums.draw, [], []
 
     def counted(self: Sums, spots: Spots, *more: Any) -> None:
@@ -424,9 +425,9 @@ def test_bands_differ_by_colour_alone() -> None:
         ),
     )
     nodes = np.array([400.0, 550.0, 700.0])
-    bands = model(grey, wavelength_nm=nodes, diffraction=False).image(8.0)
+    bands = model(grey, bands=Bands.lines(*nodes), diffraction=False).image(8.0)
     np.testing.assert_allclose(bands[0], bands[2], rtol=1e-5, atol=1e-9 * bands.max())
-    bands = model(lens, wavelength_nm=nodes).image(8.0)
+    bands = model(lens, bands=Bands.lines(*nodes)).image(8.0)
     assert np.abs(bands[0] - bands[2]).max() > 0.05 * bands[1].max()
 
 
@@ -449,7 +450,7 @@ def test_ghosts_far_inside_a_wide_edge_are_drawn_coarsely(monkeypatch: pytest.Mo
     for widest in (1.0, irradiance._WIDEST):
         monkeypatch.setattr(irradiance, "_WIDEST", widest)
         sensor = SensorGrid(shape=(1024, 1024), pitch_mm=0.0055)
-        made = FlareModel(lens, np.array([450.0, 600.0]), sensor, sun_radius_rad=1.55e-3)
+        made = FlareModel(lens, Bands.lines(450.0, 600.0), sensor, sun_radius_rad=1.55e-3)
         drawn.append(0)
         pictures.append(made.image(10.0, 30.0).astype(float))
     assert drawn[1] < 0.5 * drawn[0]
@@ -494,7 +495,7 @@ def test_a_sun_that_cannot_be() -> None:
 @pytest.mark.parametrize("kind", ["traced", "paraxial"])
 def test_the_brightest_ghosts_are_listed(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """They are those of the list of all ghosts, to the last digit, and each wavelength is traced once."""
-    made = model(load_lens("nikkor_28_f2p8"), wavelength_nm=np.array([450.0, 550.0, 650.0]), model=kind)
+    made = model(load_lens("nikkor_28_f2p8"), bands=Bands.lines(450.0, 550.0, 650.0), model=kind)
     lattices: list[Any] = []
     traced = type(made._tracer).trace
 
@@ -510,7 +511,7 @@ def test_the_brightest_ghosts_are_listed(kind: str, monkeypatch: pytest.MonkeyPa
         assert [ghost.pair for ghost in every] == sorted(ghost.pair for ghost in every)
         lattices.clear()
         few = lens.ghosts(11.0, 20.0, most=6)
-        assert lattices == [48] * 3  # the boxes are known
+        assert lattices == [4, 48, 48, 48]  # the spectra; the boxes are known
         highest = sorted(every, key=lambda g: -g.peak_irradiance_fraction)[:6]
         assert few == tuple(sorted(highest, key=lambda g: g.pair))
         assert lens.ghosts(11.0, 20.0, most=1000) == every
@@ -518,7 +519,7 @@ def test_the_brightest_ghosts_are_listed(kind: str, monkeypatch: pytest.MonkeyPa
 
 def test_the_peak_of_a_ghost_is_that_of_its_densest_cell() -> None:
     """Light over area of the cells whose corners pass all rims, from the traced rays, bundle by bundle."""
-    made = model(load_lens("nikkor_28_f2p8"), wavelength_nm=np.array([550.0]))
+    made = model(load_lens("nikkor_28_f2p8"), bands=Bands.lines(550.0))
     tracer, rays, _ = made._boxes(11.0, 0.0)
     side = 48
     spots = tracer.trace(rays, side, centred=True)

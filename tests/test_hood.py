@@ -11,6 +11,7 @@ from test_scene_straylight import SINGLET, behind
 
 from vbnfault.core import llvm
 from vbnfault.core.errors import VbnfaultError
+from vbnfault.core.spectra import Bands
 from vbnfault.lens import load_lens
 from vbnfault.lens.prescription import Hood, Prescription
 from vbnfault.lens.prescription_file import parse_lens, to_table
@@ -86,7 +87,7 @@ def test_ghosts_of_rays_past_the_hood(hooded: Prescription) -> None:
     def light(lens: Prescription, slope: float) -> tuple[float, float, float]:
         sun = SunSource(angle_deg=float(np.degrees(np.arctan(slope))), radius_rad=2e-3)
         settings = StraylightSettings(cleanliness=Cleanliness(roughness_nm=1.0, level=100))
-        of = SunlightInLens.of(lens, wavelength_nm=np.array([550.0]), sensor=sensor, sun=sun, settings=settings)
+        of = SunlightInLens.of(lens, bands=Bands.lines(550.0), sensor=sensor, sun=sun, settings=settings)
         total = of.total()
         return tuple(float(v.sum()) for v in (total.ghosts, total.glare, total.veil))  # type: ignore[return-value]
 
@@ -113,7 +114,7 @@ def test_a_scene_past_the_hood(hooded: Prescription) -> None:
     angles = np.array([0.0, 0.4, 1.02 * (RADIUS + RIM) / LENGTH])
     np.testing.assert_allclose(scene._lit(angles), [1.0, overlap(LENGTH * 0.4), 0.0], atol=1e-9)
     keys = {
-        ghost_response.response_key(lens, (550.0,), response.cells, scene.settings.ghosts, 0.0)
+        ghost_response.response_key(lens, Bands.lines(550.0), response.cells, scene.settings.ghosts, 0.0)
         for lens in (hooded, replace(hooded, hood=None), replace(hooded, hood=Hood(length_mm=41, radius_mm=RADIUS)))
     }
     assert len(keys) == 3

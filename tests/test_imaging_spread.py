@@ -11,6 +11,7 @@ from lens_kit import PITCH_UM, SIDE_PX, bundle, camera, chief_px, real
 from scipy.signal import convolve2d
 from scipy.special import ndtr
 
+from vbnfault.core import spectra
 from vbnfault.core.quantities import Radiance
 from vbnfault.lens import (
     imaging,
@@ -85,7 +86,8 @@ def test_points_land_where_the_camera_has_them_with_all_their_light(sigma: float
         assert place is not None
         left, top = (max(int(v) - 20, 0) for v in place)
         _, area = bundle(lens, slope, D_NM)
-        for band, passed in enumerate(lens.transmittance(nodes)):
+        in_bands = spectra.band_means(lens.transmittance(spectra.fine_nodes_nm(nodes)), nodes)
+        for band, passed in enumerate(in_bands):
             window = image.array[band, top : top + 41, left : left + 41].astype(float)
             total = window.sum()
             x = (window.sum(axis=0) * (np.arange(window.shape[1]) + left + 0.5)).sum() / total

@@ -15,6 +15,7 @@ from test_zemax import TRIPLET
 
 from vbnfault.core import llvm
 from vbnfault.core.errors import VbnfaultError
+from vbnfault.core.spectra import Bands
 from vbnfault.lens import Prescription, load_lens, paraxial_properties, parse_lens
 from vbnfault.lens.coating import mean_reflectance
 from vbnfault.lens.glass import C_NM, D_NM, F_NM, from_abbe
@@ -353,7 +354,7 @@ def test_traced_ghosts_against_the_sequential_trace(name: str, sun_deg: float) -
     from vbnfault.lens.straylight.ghosts import traced_ghosts
 
     lens, wavelength = load_lens(name), WAVELENGTH_NM.get(name, D_NM)
-    traced = traced_ghosts(lens, sun_deg, azimuth_deg=AZIMUTH_DEG, wavelength_nm=wavelength, only=PAIRS[name])
+    traced = traced_ghosts(lens, sun_deg, azimuth_deg=AZIMUTH_DEG, bands=Bands.lines(wavelength), only=PAIRS[name])
     ghosts = {g.pair: g for g in traced}
     far = {}
     for pair in PAIRS[name]:

@@ -108,7 +108,7 @@ def test_a_flares_progress_has_as_many_steps_as_it_says() -> None:
     for model in ("paraxial", "texture"):
         steps.clear()
         flare_images.compute(replace(request, model=model), steps.append)
-        assert sum(steps) == replace(request, model=model).steps == {"paraxial": 3, "texture": 1}[model]
+        assert sum(steps) == replace(request, model=model).steps == {"paraxial": 9, "texture": 1}[model]
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ import vbnfault
 from vbnfault.core import array_files, llvm, spectra
 from vbnfault.core.errors import InputError, VbnfaultError
 from vbnfault.core.quantities import Electrons, Radiance
+from vbnfault.core.spectra import Bands
 from vbnfault.faults import FaultContext, from_dict
 from vbnfault.lens import ThinLens, load_lens, paraxial_properties
 from vbnfault.lens.halo import Halo
@@ -63,7 +64,8 @@ def behind(
     focal_px = size / 2 / np.tan(np.radians(fov_deg / 2))
     return SceneInLens(
         lens=lens,
-        nodes_nm=nodes,
+        bands=Bands.lines(*nodes),
+        of_nodes=np.eye(len(nodes)),
         sensor=SensorGrid(shape=(size, size), pitch_mm=efl_mm / focal_px),
         render=RenderGrid(shape=(size + 2 * guard, size + 2 * guard), focal_px=float(focal_px)),
         image=ThinLens(focal_length_mm=efl_mm, f_number=2.8),
@@ -99,9 +101,9 @@ def ghosts_of_every_pixel(
     scene: SceneInLens, radiance: F32, across: int = 64, within: int = 2, grid: RenderGrid | None = None
 ) -> F64:
     """Ghosts of points in all lit pixels, by exact rays that are counted in the pixels that they meet."""
-    made = Tracer(scene.lens, scene.nodes_nm)
+    made = Tracer(scene.lens, scene.bands.nodes_nm)
     (height, width), pitch = scene.sensor.shape, scene.sensor.pitch_mm
-    bands = len(scene.nodes_nm)
+    bands = len(scene.bands)
     out, rng = np.zeros((bands, height * width)), np.random.default_rng(1)
     for x, y, irradiance in points(grid or scene.render, radiance, within):
         slope, azimuth = np.hypot(x, y), np.arctan2(y, x)
@@ -129,7 +131,7 @@ def scattered_of_every_pixel(
     scene: SceneInLens, radiance: F32, within: int = 2, grid: RenderGrid | None = None
 ) -> tuple[F64, F64]:
     """Glare and veil of points in all lit pixels, each computed as that of a Sun."""
-    glare = np.zeros((len(scene.nodes_nm), *scene.sensor.shape))
+    glare = np.zeros((len(scene.bands), *scene.sensor.shape))
     veil = np.zeros_like(glare)
     for x, y, irradiance in points(grid or scene.render, radiance, within):
         sun = SunSource(
@@ -137,7 +139,7 @@ def scattered_of_every_pixel(
         )
         light = SunlightInLens.of(
             scene.lens,
-            wavelength_nm=scene.nodes_nm,
+            bands=scene.bands,
             sensor=scene.sensor,
             sun=sun,
             settings=scene.settings,
@@ -188,7 +190,7 @@ def wings_of(scene: SceneInLens, points: list[tuple[float, float, F64]], width_p
             radius_rad=float(np.pi**-0.5 * width_px / scene.render.focal_px),
         )
         path = DirectPath(transmittance=scene.passed, admitted_mm2=1.0)
-        light = SunlightInLens.of(scene.lens, wavelength_nm=NODES, sensor=scene.sensor, sun=sun, path=path)
+        light = SunlightInLens.of(scene.lens, bands=scene.bands, sensor=scene.sensor, sun=sun, path=path)
         shorter = 1 / np.sqrt(1 + x * x + y * y)
         away = np.hypot(side * cosine - x * shorter, side[:, None] * cosine - y * shorter)
         fade = np.clip((away * efl_mm / pitch - POINT_SPREAD_PX + 1) / 2, 0, 1)
@@ -256,7 +258,7 @@ def test_wings_lie_around_the_image_of_a_lens_that_distorts() -> None:
 
 
 def test_the_tables_of_wings_are_made_once_and_not_for_dark_sources(monkeypatch: pytest.MonkeyPatch) -> None:
-    lens, nodes = with_blades(0), np.array([450.0, 650.0])
+    lens, nodes = with_blades(0), Bands.lines(450.0, 650.0)
     assert starburst_of_source(lens, nodes, 1e-3) is starburst_of_source(lens, nodes, 1e-3)
     # a narrower disc would have rings that the tables do not resolve: at least three Airy units of the longest wave
     airy_rad = 650e-6 / paraxial_properties(lens).entrance_pupil_diameter_mm
@@ -270,19 +272,19 @@ def test_the_tables_of_wings_are_made_once_and_not_for_dark_sources(monkeypatch:
 def test_the_image_loses_what_the_stop_diffracts() -> None:
     """Light in the frame and beyond it, beyond 7 px, is the fraction that the image loses, but for the fade-in."""
     scene = replace(behind(with_blades(6), 96, 20.0), diffraction=True)
-    burst = starburst_of_source(scene.lens, NODES, 1 / scene.render.focal_px)
+    burst = starburst_of_source(scene.lens, scene.bands, 1 / scene.render.focal_px)
     point = np.zeros((1, 96, 96), dtype=np.float32)
     point[0, 48, 48] = 1
     irradiance = scene.render.irradiance(point)
     inside = (
         scene.starburst([(scene.render, irradiance)], np.eye(1)).sum(dtype=np.float64) * scene.sensor.pitch_mm**2
     )
-    frame = StarburstFrame(sun_xy_mm=(0.0, 0.0), wavelength_nm=NODES, sensor=scene.sensor)
+    frame = StarburstFrame(sun_xy_mm=(0.0, 0.0), bands=scene.bands, sensor=scene.sensor)
     passed_mm2 = (
         0.8 * irradiance.sum() * np.pi / 4 * paraxial_properties(scene.lens).entrance_pupil_diameter_mm ** 2
     )
     beyond = 0.8 * irradiance.sum() * burst.beyond_mm2(frame)[0]
-    lost = wing_fraction(burst, NODES, scene.sensor)[0]
+    lost = wing_fraction(burst, scene.bands, scene.sensor)[0]
     assert (inside + beyond) / passed_mm2 == pytest.approx(lost, rel=0.03)
 
 
@@ -294,7 +296,7 @@ def test_the_response_has_the_flux_of_the_traced_ghosts(singlet: Prescription) -
     pupil_mm2 = np.pi / 4 * paraxial_properties(singlet).entrance_pupil_diameter_mm ** 2
     for ring in (0, 1, 2, 3):
         angle_deg = float(np.degrees(np.arctan(slopes[ring])))
-        ghosts = traced_ghosts(singlet, angle_deg, wavelength_nm=550.0)
+        ghosts = traced_ghosts(singlet, angle_deg, bands=Bands.lines(550.0))
         flux_mm2 = sum(g.flux_fraction for g in ghosts) * pupil_mm2 * np.cos(np.radians(angle_deg))
         # the flux falls between neighbouring rings, over which a ring is the mean, by about 1 %
         assert response.flux_mm2[0, ring] == pytest.approx(flux_mm2, rel=0.02)
@@ -305,7 +307,7 @@ def test_sources_without_ghosts_on_the_sensor(singlet: Prescription) -> None:
     scene = behind(singlet, 8, 1.0)
     scene = replace(scene, around=surrounding_grids(scene.render))
     table = scene.response.table
-    (ghost,) = paraxial_ghosts(singlet, 0.0, wavelength_nm=550.0)
+    (ghost,) = paraxial_ghosts(singlet, 0.0, bands=Bands.lines(550.0))
     # near the axis exact rays are paraxial; rings are sums over few rays each
     irradiance = table[0, 0, :, 0].mean() / scene.response.cells.azimuths
     assert irradiance == pytest.approx(ghost.peak_irradiance_fraction, rel=0.01)
@@ -459,7 +461,7 @@ def test_what_changes_a_response_changes_its_key(singlet: Prescription) -> None:
         lens: Prescription = singlet, nm: float = 550.0, loss: float = 0.0, of: Any = scene, **keys: Any
     ) -> str:
         settings = replace(scene.settings.ghosts, **keys)
-        return ghost_response.response_key(lens, (nm,), of.response.cells, settings, loss)
+        return ghost_response.response_key(lens, Bands.lines(nm), of.response.cells, settings, loss)
 
     first, *others = singlet.surfaces
     changed = [

@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 from scipy.special import j0, j1
 
+from vbnfault.core import spectra
 from vbnfault.core.errors import InputError
+from vbnfault.core.spectra import Bands
 from vbnfault.lens import Prescription, load_lens, paraxial_properties, parse_lens, scaled_to_focal_length
 from vbnfault.lens.straylight.settings import SensorGrid
 from vbnfault.lens.straylight.starburst import StarburstFrame, StopDefects, fraunhofer_psf, starburst
@@ -47,10 +49,20 @@ def frame_at(
     """Return a frame with the Sun's image at a position in mm from its middle."""
     return StarburstFrame(
         sun_xy_mm=(float(sun_xy_mm[0]), float(sun_xy_mm[1])),
-        wavelength_nm=wavelength_nm,
+        bands=bands_of(wavelength_nm, half_width_nm),
         sensor=SensorGrid(shape=shape, pitch_mm=pitch_mm),
-        half_width_nm=half_width_nm,
     )
+
+
+def bands_of(nodes_nm: F64, half_width_nm: float | None) -> Bands:
+    """Lines for a width of 0, triangles of this half width, or those between the nodes, all in even light."""
+    if half_width_nm == 0:
+        return Bands.lines(*nodes_nm)
+    if half_width_nm is None:
+        nm = spectra.fine_nodes_nm(nodes_nm)
+        return Bands.of(nm, spectra.hat_weights(nodes_nm, nm))
+    nm = np.linspace(nodes_nm[0] - half_width_nm, nodes_nm[-1] + half_width_nm, 601)
+    return Bands.of(nm, np.maximum(1 - np.abs(nm - nodes_nm[:, None]) / half_width_nm, 0))
 
 
 def airy(v: F64) -> F64:
@@ -431,5 +443,3 @@ def test_what_does_not_fit_is_refused() -> None:
         StopDefects(scratch_length_mm=np.array([1.0]))
     with pytest.raises(InputError, match="across = 2048"):
         fraunhofer_psf(lens_with().surfaces[0], 5.0, 100.0, NM, across=2048)
-    with pytest.raises(InputError, match=r"wavelength_nm = \[600.0, 500.0\]"):
-        frame_at((0, 0), np.array([600.0, 500.0]), (8, 8), 0.01)

@@ -15,6 +15,7 @@ from vbnfault.camera import Camera
 from vbnfault.core import llvm, resources, spectra
 from vbnfault.core.errors import VbnfaultError
 from vbnfault.core.quantities import Electrons, Radiance
+from vbnfault.core.spectra import Bands
 from vbnfault.detector import ThreeColourDetector
 from vbnfault.faults import FaultContext, act, from_dict, registry
 from vbnfault.lens import (
@@ -41,7 +42,7 @@ F64 = NDArray[np.float64]
 
 NODES = np.array([450.0, 550.0, 650.0])
 SIZE = 128
-WEIGHTS = np.array([[0.2, 0.7, 3.0], [1.0, 2.0, 0.5]])  # of two channels
+RATES = np.array([0.2, 0.7, 3.0])
 # A biconvex lens of an absorbing glass behind its stop.
 ABSORBING: dict[str, Any] = {
     "name": "absorbing",
@@ -68,10 +69,10 @@ def flux(layer: NDArray[Any], pitch_mm: float) -> F64:
 # --- the direct image --------------------------------------------------------------------------------------------
 
 
-def transmitted(lens: Prescription) -> F64:
+def transmitted(lens: Prescription, wavelength_nm: F64 = NODES) -> F64:
     """Along the axis, surface by surface."""
     out = []
-    for nm in NODES:
+    for nm in wavelength_nm:
         index, share = lens.indices(nm), 1.0
         for k, surface in enumerate(lens.surfaces):
             share *= 1 - float(mean_reflectance(surface.coating, index[k], index[k + 1], 1.0, nm))
@@ -90,8 +91,9 @@ def test_a_flares_direct_image_has_the_lens_transmission(sun_deg: float) -> None
     )
     pupil = np.pi / 4 * paraxial_properties(lens).entrance_pupil_diameter_mm ** 2 * np.cos(np.radians(sun_deg))
     direct = flux(flare_images.layers(replace(view, model="texture"))["sun"], view.pitch_mm)
-    assert transmitted(lens).max() / transmitted(lens).min() > 1.2  # bands differ
-    np.testing.assert_allclose(direct, pupil * transmitted(lens), rtol=1e-5)  # sums of float32
+    passed = view.bands.mean(transmitted(lens, view.bands.wavelength_nm))
+    assert passed.max() / passed.min() > 1.15  # bands differ
+    np.testing.assert_allclose(direct, pupil * passed, rtol=1e-5)  # sums of float32
     left = flux(flare_images.layers(view)["sun"], view.pitch_mm)
     assert (left < direct).all()
     assert (left > 0.93 * direct).all()
@@ -149,7 +151,7 @@ def test_starburst_glare_and_veil_come_from_the_direct_light(sun_deg: float) -> 
     for size in (SIZE, 9 * SIZE):
         light = SunlightInLens.of(
             lens,
-            wavelength_nm=NODES,
+            bands=Bands.lines(*NODES),
             sensor=SensorGrid(shape=(size, size), pitch_mm=pitch),
             sun=SunSource(angle_deg=sun_deg, azimuth_deg=20.0, radius_rad=spectra.sun_angular_radius_rad(1.0)),
             settings=StraylightSettings(
@@ -157,10 +159,10 @@ def test_starburst_glare_and_veil_come_from_the_direct_light(sun_deg: float) -> 
             ),
         )
         found = light.total()
-        clear = light.clear_light(WEIGHTS)
-        planes, left_of_it = light.in_channels(WEIGHTS, clear, light.glare_samples(), exposure_s=0.5)
-        # 4e-6: each value is a sum of 3 bands and 4 parts, rounded to 6e-8 some twenty times
-        expected = 0.5 * np.tensordot(WEIGHTS, found.total.astype(np.float64), 1)
+        clear = light.clear_light(RATES)
+        planes, left_of_it = light.in_channels(RATES, clear, light.glare_samples(), exposure_s=0.5)
+        # 4e-6: each value is a sum of 4 parts, rounded to 6e-8 some ten times
+        expected = 0.5 * RATES[:, None, None] * found.total.astype(np.float64)
         np.testing.assert_allclose(planes, expected, rtol=4e-6)
         np.testing.assert_allclose(left_of_it, found.direct_fraction, rtol=1e-6)
         strayed = sum(flux(layer, pitch) for layer in (found.starburst, found.glare, found.veil))
@@ -209,8 +211,8 @@ def direct_sun(where: FaultContext, sun_deg: float) -> tuple[Electrons, F64]:
     assert where.sun_xy_px is not None
     pitch_mm = detector.pixel_pitch_um * 1e-3
     area = float(lens.pupil_area_mm2(np.tan(np.radians(sun_deg)))) * np.cos(np.radians(sun_deg))
-    power = where.sun_irradiance_W_m2_nm * lens.transmittance(NODES) * area / pitch_mm**2
-    electrons = detector.electron_rate_weights(NODES) @ power * where.camera.exposure_s
+    power = where.sun_irradiance_W_m2_nm * area / pitch_mm**2
+    electrons = where.camera.electron_rate_weights(NODES) @ power * where.camera.exposure_s
     past = np.zeros((SIZE, SIZE, 3), dtype=np.float32)
     past[int(where.sun_xy_px[1]), int(where.sun_xy_px[0])] = electrons
     scene = np.broadcast_to(0.5 * detector.white_e, past.shape).astype(np.float32)
@@ -245,9 +247,11 @@ def test_a_frame_with_all_straylight_holds_what_enters(camera: str, sun_deg: flo
     lens = where.frame.prescription(params["lens"], params["coating"])
     area = where.camera.lens.pupil_area_mm2([np.tan(np.radians(sun_deg)), 0.0])
     assert where.sun_xy_px is not None
+    nm = spectra.fine_nodes_nm(NODES)
+    sensed = where.camera.detector.electron_rates(nm) * spectra.solar_irradiance_W_m2_nm(nm)
     found = SunlightInLens.of(
         lens,
-        wavelength_nm=NODES,
+        bands=Bands.of(nm, sensed),
         sensor=SensorGrid(shape=where.shape, pitch_mm=pitch_mm),
         sun=SunSource(
             angle_deg=sun_deg,
@@ -256,16 +260,14 @@ def test_a_frame_with_all_straylight_holds_what_enters(camera: str, sun_deg: flo
         ),
         settings=StraylightSettings(cleanliness=Cleanliness(level=200.0, roughness_nm=1.0), veil_fraction=0.02),
         path=DirectPath(
-            transmittance=where.camera.lens.transmittance(NODES),
+            transmittance=where.camera.lens.transmittance(nm),
             admitted_mm2=float(area[0] * np.cos(np.radians(sun_deg))),
             beam_fraction=float(area[0] / area[1]),
         ),
     ).total()
-    assert where.sun_irradiance_W_m2_nm is not None
-    to_e = where.camera.detector.electron_rate_weights(NODES) * where.sun_irradiance_W_m2_nm
-    to_e *= where.camera.exposure_s / pitch_mm**2
-    gone = to_e @ found.beyond_mm2
-    ghosts = to_e @ flux(found.ghosts, pitch_mm)
+    to_e = np.trapezoid(sensed, nm, axis=1) * where.camera.exposure_s / pitch_mm**2
+    gone = to_e * found.beyond_mm2
+    ghosts = to_e * flux(found.ghosts, pitch_mm)
     total = after.past_rims.sum(axis=(0, 1), dtype=np.float64) + gone - scene_e * (1 - kept) * caught
     paid = ghosts if camera == "real" else 0 * ghosts
     np.testing.assert_allclose(total - paid, sun_e, rtol=1e-3)

@@ -187,7 +187,8 @@ def test_a_lens_images_the_power_that_it_admits(camera: Callable[[int], Camera],
         light = c.lens.image_of_sun(radiance, c.detector.pixel_pitch_um)
         got = light.array.sum(axis=(1, 2), dtype=float) * (c.detector.pixel_pitch_um * 1e-3) ** 2
         slope = float(np.hypot(sx, sy))
-        admitted = c.lens.transmittance(nodes) * c.lens.pupil_area_mm2(slope) * direction[2]
+        passed = spectra.band_means(c.lens.transmittance(spectra.fine_nodes_nm(nodes)), nodes)
+        admitted = passed * c.lens.pupil_area_mm2(slope) * direction[2]
         # the beam's area is a table over 65 angles, linear here and cubic there, and bends over the disc
         np.testing.assert_allclose(got, admitted, rtol=1e-3)
         peak = np.unravel_index(np.argmax(light.array[1]), light.array[1].shape)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import buffers
+from ..core import buffers, spectra
 from ..core.quantities import Electrons, Irradiance, Radiance
 from ..core.sundisc import Projection
 from ..detector import Detector, MosaicDetector
@@ -59,6 +59,16 @@ class Camera:
         of_scene = electrons(self.lens.image(scene))
         direct = electrons(self.lens.image_of_sun(sun, self.detector.pixel_pitch_um))
         return replace(of_scene, past_rims=direct.array)
+
+    def electron_rates(self, wavelength_nm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return electrons per second and pixel for 1 W m⁻² before the lens's losses, float64[channel, n]."""
+        return self.detector.electron_rates(wavelength_nm) * self.lens.transmittance(wavelength_nm)
+
+    def electron_rate_weights(self, wavelength_nm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the same for 1 W m⁻² nm⁻¹ in each band, float64[channel, band]."""
+        passed = self.lens.transmittance(spectra.fine_nodes_nm(wavelength_nm))
+        weights = self.detector.electron_rate_weights(wavelength_nm, passed).astype(np.float64)
+        return weights * spectra.band_means(passed, wavelength_nm)
 
     @property
     def width_px(self) -> int:

@@ -107,9 +107,14 @@ class Radiance(Quantity):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Irradiance(Quantity):
-    """Hold the spectral irradiance on the sensor plane at the band nodes `wavelength_nm` float64[band]."""
+    """Hold the spectral irradiance on the sensor plane at the band nodes `wavelength_nm` float64[band].
+
+    `transmittance` float64[n] at `spectra.fine_nodes_nm` is that of the lens: in every band, the light has the
+    spectrum of sunlight behind it. None: that of sunlight.
+    """
 
     wavelength_nm: NDArray[np.float64]
+    transmittance: NDArray[np.float64] | None = None
     unit = "W m-2 nm-1"
     axes = ("band", "y", "x")
 

@@ -70,9 +70,9 @@ class QuantumEfficiency:
             known[name] = np.interp(wavelength_nm, curve.wavelength_nm, curve.value, left=0.0, right=0.0)
         return np.stack([known[name] for name in self.channels])
 
-    def electron_weights(self, nodes_nm: F64) -> F64:
+    def electron_weights(self, nodes_nm: F64, transmittance: F64 | None = None) -> F64:
         """Return `spectra.electron_weights` of the channels, float64[channel, band], in electrons nm / J."""
-        return spectra.electron_weights(self.at, nodes_nm)
+        return spectra.electron_weights(self.at, nodes_nm, transmittance)
 
 
 @lru_cache(maxsize=16)

@@ -83,8 +83,16 @@ class Detector(Protocol):
     def white_e(self) -> F32:
         """Return the signal of each channel in electrons that the 8 bit image shows as 255, float32[channel]."""
 
-    def electron_rate_weights(self, wavelength_nm: NDArray[np.float64]) -> F32:
-        """Return electrons per second and pixel for 1 W m⁻² nm⁻¹ in each band, float32[channel, band]."""
+    def electron_rate_weights(
+        self, wavelength_nm: NDArray[np.float64], transmittance: NDArray[np.float64] | None = None
+    ) -> F32:
+        """Return electrons per second and pixel for 1 W m⁻² nm⁻¹ in each band, float32[channel, band].
+
+        `transmittance` is as in `Irradiance`.
+        """
+
+    def electron_rates(self, wavelength_nm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return electrons per second and pixel for 1 W m⁻² at each wavelength, float64[channel, n]."""
 
     def electrons_expected(self, irradiance: Irradiance, exposure_s: float) -> Electrons:
         """Return the expected photo-electrons per pixel and channel, noise-free and not clipped."""

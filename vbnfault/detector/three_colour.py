@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from ..core.errors import InputError
 from ..core.quantities import RGBI, Electrons, Irradiance, RawDN
+from ..core.spectra import per_joule
 from . import compiled
 from .blocks import blockwise
 from .display import with_luminance
@@ -123,13 +124,20 @@ class ThreeColourDetector:
         """Return the signal of R, G, B in electrons that the 8 bit image shows as 255, float32[3]."""
         return np.asarray(self.full_well_e / self.gain / self.white_balance, dtype=np.float32)
 
-    def electron_rate_weights(self, wavelength_nm: NDArray[np.float64]) -> F32:
+    def electron_rate_weights(
+        self, wavelength_nm: NDArray[np.float64], transmittance: NDArray[np.float64] | None = None
+    ) -> F32:
         """Return electrons per second and pixel for 1 W m⁻² nm⁻¹ in each band, float32[3, band]."""
-        return electron_rate_weights(self.efficiency, self.pixel_pitch_um, wavelength_nm)
+        return electron_rate_weights(self.efficiency, self.pixel_pitch_um, wavelength_nm, transmittance)
+
+    def electron_rates(self, wavelength_nm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return electrons per second and pixel for 1 W m⁻² at each wavelength, float64[channel, n]."""
+        return self.efficiency.at(wavelength_nm) * per_joule(wavelength_nm) * (self.pixel_pitch_um * 1e-6) ** 2
 
     def electrons_expected(self, irradiance: Irradiance, exposure_s: float) -> Electrons:
         """Return the expected photo-electrons per pixel and colour, noise-free and not clipped."""
-        weights = self.electron_rate_weights(irradiance.wavelength_nm) * np.float32(exposure_s)
+        weights = self.electron_rate_weights(irradiance.wavelength_nm, irradiance.transmittance)
+        weights = weights * np.float32(exposure_s)
         return Electrons(array=electrons_of(irradiance, weights), white_e=self.white_e)
 
     def electrons(self, expected: Electrons, exposure_s: float, noise: Noise | None) -> Electrons:
@@ -263,11 +271,14 @@ def curve_of(detector: ThreeColourDetector, exposure_s: float) -> compiled.Curve
 
 
 def electron_rate_weights(
-    efficiency: QuantumEfficiency, pixel_pitch_um: float, wavelength_nm: NDArray[np.float64]
+    efficiency: QuantumEfficiency,
+    pixel_pitch_um: float,
+    wavelength_nm: NDArray[np.float64],
+    transmittance: NDArray[np.float64] | None = None,
 ) -> F32:
     """Return electrons per second and pixel for 1 W m⁻² nm⁻¹ in each band, float32[channel, band]."""
     area_m2 = (pixel_pitch_um * 1e-6) ** 2
-    return np.asarray(efficiency.electron_weights(wavelength_nm) * area_m2, dtype=np.float32)
+    return np.asarray(efficiency.electron_weights(wavelength_nm, transmittance) * area_m2, dtype=np.float32)
 
 
 def electrons_of(irradiance: Irradiance, weights: F32) -> F32:

@@ -36,6 +36,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from ..core import buffers, spectra
+from ..core.spectra import Bands
 from ..lens import Prescription
 from ..lens.coating import mean_reflectance
 from ..lens.footprint import ImageFrame
@@ -192,15 +193,16 @@ def colours(params: Params, context: FaultContext) -> F64:
         nodes = spectra.band_nodes_nm(400.0, 700.0, 8)
         sun = spectra.solar_band_irradiance_W_m2_nm(nodes, 1.0)
     lens = context.frame.prescription(params["lens"], params["coating"])
-    passes = worn(lens, nodes, params["coating_loss"]) * browned(
+    nm = spectra.fine_nodes_nm(nodes)
+    passes = worn(lens, nm, params["coating_loss"]) * browned(
         lens,
-        nodes,
+        nm,
         dose_krad=params["dose_krad"],
         per_mm_krad=params["browning_per_mm_krad"],
         exponent=params["browning_exponent"],
     )
-    weights = context.camera.detector.electron_rate_weights(nodes) * sun
-    return np.asarray(weights @ passes / np.maximum(weights.sum(axis=1), 1e-300))
+    sunlight = Bands.of(nm, context.camera.electron_rates(nm) * spectra.sunlike(sun, nodes))
+    return sunlight.mean(passes)
 
 
 # --- scattered light -------------------------------------------------------------------------------------------

@@ -433,9 +433,8 @@ def _glow(params: Params, context: FaultContext) -> F32 | None:
     lit = _lit(params, context, grains)
     assert lit is not None
     core = lit * _in_suns_beam(params, context, grains, sun) * grains.taken
-    passes = camera.lens.transmittance(sun.wavelength_nm)
-    light = sun.irradiance * passes / camera.lens.focal_length_mm**2
-    to_e = camera.detector.electron_rate_weights(sun.wavelength_nm) * camera.exposure_s * light
+    light = sun.irradiance / camera.lens.focal_length_mm**2
+    to_e = camera.electron_rate_weights(sun.wavelength_nm) * camera.exposure_s * light
     pixel_rad = camera.detector.pixel_pitch_um * 1e-3 / camera.lens.focal_length_mm
     sun = sun._replace(radius_rad=float(np.hypot(sun.radius_rad, pixel_rad / np.sqrt(np.pi))))
     own, factor, common, reflected = _lobes(grains.radius_mm, core, sun, _stretch(lens, params["surface"]))

@@ -296,8 +296,7 @@ def _electrons_per_irradiance(context: FaultContext, sun: _Sunlight, reddening_p
     """Return the electrons for an irradiance of 1 W/m² of grains' light on a pixel, float64[channel]."""
     camera, total = context.camera, sun.total(reddening_per_100nm)
     shape = sun.reflected(reddening_per_100nm) / max(total, 1e-300)
-    weights = camera.detector.electron_rate_weights(sun.wavelength_nm).astype(np.float64)
-    return np.asarray(weights @ (shape * camera.lens.transmittance(sun.wavelength_nm))) * camera.exposure_s
+    return np.asarray(camera.electron_rate_weights(sun.wavelength_nm) @ shape) * camera.exposure_s
 
 
 def _pupil_per_pixel(context: FaultContext, slopes: F64) -> F64:

@@ -36,8 +36,9 @@ from numpy.typing import NDArray
 from ..core import spectra
 from ..core.quantities import Radiance
 from ..core.shared_results import SharedResults
+from ..core.spectra import Bands
 from ..lens.straylight.scatter import CLEANLINESS_LIMITS, ROUGHNESS_NM_LIMITS, Cleanliness
-from ..lens.straylight.scene import PointSources, RenderGrid, SceneInLens, surrounding_grids
+from ..lens.straylight.scene import PointSources, RenderGrid, SceneInLens, in_channels, surrounding_grids
 from ..lens.straylight.scene_diffraction import starburst_of_source, wing_fraction
 from ..lens.straylight.settings import Baffle, DirectPath, GhostSettings, SensorGrid, StraylightSettings, SunSource
 from ..lens.straylight.total import ClearLight, SunlightInLens, scene_veil_fraction, veil_per_px
@@ -81,23 +82,16 @@ class LensSunlight:
     Attributes
     ----------
     light
-        The Sun's light in the lens, over the Sun's irradiance at the entrance.
-    irradiance_W_m2_nm
-        float64[band]: irradiance of the visible part of the Sun.
-    weights
-        float64[channel, band]: spectrum of the electrons of each channel under sunlight, with the sum 1.
+        The Sun's light in the lens, over the Sun's irradiance at the entrance; its bands are the channels.
+    rates
+        float64[channel]: electrons per second and pixel that the irradiance of the visible part of the Sun gives.
     scene_lost
         float64[channel]: fraction of the scene's image that becomes veil.
     """
 
     light: SunlightInLens
-    irradiance_W_m2_nm: F64
-    weights: F64
+    rates: F64
     scene_lost: F64
-
-    def channel_mean(self, fraction: F64) -> F64:
-        """Return the mean of a fraction float64[band] in each channel, float64[channel]."""
-        return np.asarray(self.weights @ fraction)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -241,14 +235,13 @@ class _LensStraylight(LensFault):
             lost = self.scene_lost(params, context)
             return _Light(added=scene, direct_left=1 - lost, scene_lost=lost, scene_added=True)
         camera, light = context.camera, source.light
-        weights = camera.detector.electron_rate_weights(light.nodes_nm) * source.irradiance_W_m2_nm
-        clear = _clear_light(light, weights, context)
+        clear = _clear_light(light, source.rates, context)
         samples = context.of_view.once("glare", light.glare_samples_key, light.glare_samples)
-        planes, direct_fraction = light.in_channels(weights, clear, samples, camera.exposure_s)
+        planes, direct_left = light.in_channels(source.rates, clear, samples, camera.exposure_s)
         added = cv2.merge(list(planes)).reshape(*context.shape, len(planes))
         return _Light(
             added=added if scene is None else plus(added, scene),
-            direct_left=source.channel_mean(direct_fraction),
+            direct_left=direct_left,
             scene_lost=source.scene_lost,
             scene_added=scene is not None,
         )
@@ -260,18 +253,20 @@ class _LensStraylight(LensFault):
             return None
         array, nodes = _without_sun(radiance), radiance.wavelength_nm
         render = RenderGrid(shape=(int(array.shape[1]), int(array.shape[2])), focal_px=camera.focal_length_px)
+        rates = camera.detector.electron_rates(spectra.fine_nodes_nm(nodes)) * camera.exposure_s
+        bands, of_nodes, weights = in_channels(rates, nodes)
         in_lens = SceneInLens(
             lens=context.frame.prescription(params["lens"], params["coating"]),
-            nodes_nm=nodes,
+            bands=bands,
+            of_nodes=of_nodes,
             sensor=_sensor_grid(context),
             render=render,
             around=surrounding_grids(render)[: len(context.surroundings)],
             image=camera.lens,
             settings=self._settings(params, context),
-            passed=camera.lens.transmittance(nodes),
+            passed=camera.lens.transmittance(bands.wavelength_nm),
             diffraction=_diffracts(params, context),
         )
-        weights = camera.detector.electron_rate_weights(nodes).astype(np.float64) * camera.exposure_s
         around = [_without_sun(one) for one in context.surroundings]
         total = in_lens.straylight(array, weights, around, _far_points(context, in_lens.reach)).total
         return np.ascontiguousarray(total.transpose(1, 2, 0))
@@ -283,16 +278,16 @@ class _LensStraylight(LensFault):
             return None
         theta, azimuth = sun
         camera = context.camera
-        nodes, irradiance = _sunlight(context)
+        bands, rates = _channel_bands(context)
         sensor = _sensor_grid(context)
         assert context.sun_xy_px is not None
         middle = np.array([camera.width_px / 2, camera.height_px / 2])
         x, y = (np.asarray(context.sun_xy_px) - middle) * sensor.pitch_mm
-        passed = camera.lens.transmittance(nodes)
+        passed = camera.lens.transmittance(bands.wavelength_nm)
         area_mm2, axial_mm2 = camera.lens.pupil_area_mm2([np.tan(np.radians(theta)), 0.0])
         light = SunlightInLens.of(
             context.frame.prescription(params["lens"], params["coating"]),
-            wavelength_nm=nodes,
+            bands=bands,
             sensor=sensor,
             sun=SunSource(
                 angle_deg=theta,
@@ -310,8 +305,7 @@ class _LensStraylight(LensFault):
         visible = 1.0 if context.sun_visible_fraction is None else float(context.sun_visible_fraction)
         return LensSunlight(
             light=light,
-            irradiance_W_m2_nm=irradiance * visible,
-            weights=_channel_weights(context),
+            rates=rates * visible,
             scene_lost=self.scene_lost(params, context),
         )
 
@@ -330,19 +324,19 @@ class _LensStraylight(LensFault):
         settings = self._settings(params, context)
         lost = scene_veil_fraction(
             context.frame.prescription(params["lens"], params["coating"]),
-            _sunlight(context)[0],
+            _bands_behind_lens(context),
             cleanliness=settings.cleanliness,
             veil_fraction=settings.veil_fraction,
         )
         if _diffracts(params, context):
             lost = 1 - (1 - lost) * (1 - self._diffracted(params, context))
-        return np.asarray(_channel_weights(context) @ lost)
+        return lost
 
     def _diffracted(self, params: Params, context: FaultContext) -> F64:
-        """Return the fraction of the scene's light that the stop diffracts far enough, float64[band]."""
-        lens, nodes = context.frame.prescription(params["lens"], params["coating"]), _sunlight(context)[0]
-        burst = starburst_of_source(lens, nodes, 1 / context.camera.focal_length_px)
-        return wing_fraction(burst, nodes, _sensor_grid(context))
+        """Return the fraction of the scene's light that the stop diffracts far enough, float64[channel]."""
+        lens, bands = context.frame.prescription(params["lens"], params["coating"]), _bands_behind_lens(context)
+        burst = starburst_of_source(lens, bands, 1 / context.camera.focal_length_px)
+        return wing_fraction(burst, bands, _sensor_grid(context))
 
     def _ghosts(self, params: Params, context: FaultContext) -> list[dict[str, Any]]:
         """Return the brightest ghosts in the frame as plain data."""
@@ -356,7 +350,7 @@ class _LensStraylight(LensFault):
         pitch_mm = sensor.pitch_mm
         key = (
             context.frame.prescription(params["lens"], params["coating"]),
-            tuple(float(v) for v in _sunlight(context)[0]),
+            _channel_bands(context)[0],
             sensor,
             _sun_radius_rad(context),
             GhostSettings(model=self.model, reflections=params["reflections"]),
@@ -385,18 +379,18 @@ def _shared_while_new(context: FaultContext) -> SharedResults:
     return SharedResults() if context.coating_loss else context.of_view
 
 
-def _clear_light(light: SunlightInLens, weights: F64, context: FaultContext) -> ClearLight:
+def _clear_light(light: SunlightInLens, rates: F64, context: FaultContext) -> ClearLight:
     """Return ghosts and starburst of the Sun, which the samples of a view share, in electrons per second."""
-    shared, key = _shared_while_new(context), (*light.clear_key, weights.tobytes())
-    return shared.once("ghosts and starburst", key, lambda: _new_clear_light(light, weights, context))
+    shared, key = _shared_while_new(context), (*light.clear_key, rates.tobytes())
+    return shared.once("ghosts and starburst", key, lambda: _new_clear_light(light, rates, context))
 
 
-def _new_clear_light(light: SunlightInLens, weights: F64, context: FaultContext) -> ClearLight:
+def _new_clear_light(light: SunlightInLens, rates: F64, context: FaultContext) -> ClearLight:
     """Return ghosts and starburst; the starburst does not depend on the coatings, whose wear differs by sample."""
     if not context.coating_loss:
-        return light.clear_light(weights)  # whole coatings: the sum is shared
-    key = *light.burst_key, weights.tobytes()
-    return light.clear_light(weights, context.of_view.once("starburst", key, lambda: light.burst(weights)))
+        return light.clear_light(rates)  # whole coatings: the sum is shared
+    key = *light.burst_key, rates.tobytes()
+    return light.clear_light(rates, context.of_view.once("starburst", key, lambda: light.burst(rates)))
 
 
 def _diffracts(params: Params, context: FaultContext) -> bool:
@@ -463,15 +457,21 @@ def _sensor_grid(context: FaultContext) -> SensorGrid:
     return SensorGrid(shape=context.shape, pitch_mm=context.camera.detector.pixel_pitch_um * 1e-3)
 
 
-def _channel_weights(context: FaultContext) -> F64:
-    """Return the spectrum of each channel's electrons under sunlight, float64[channel, band], with the sum 1.
+def _channel_bands(context: FaultContext) -> tuple[Bands, F64]:
+    """Return the bands in which the channels sense sunlight, and its electrons per second, float64[channel]."""
+    nodes, irradiance = _sunlight(context)
+    nm = spectra.fine_nodes_nm(nodes)
+    spectrum = context.camera.detector.electron_rates(nm) * spectra.sunlike(irradiance, nodes)
+    return Bands.of(nm, spectrum), np.asarray(np.trapezoid(spectrum, nm, axis=1))
 
-    The scene and the Sun's image both have the spectrum of sunlight that the lens transmits.
+
+def _bands_behind_lens(context: FaultContext) -> Bands:
+    """Return the bands in which the channels sense the sunlight that the lens transmits.
+
+    The scene and the Sun's image both have its spectrum.
     """
-    camera, (nodes, irradiance) = context.camera, _sunlight(context)
-    weights = camera.detector.electron_rate_weights(nodes) * irradiance * camera.lens.transmittance(nodes)
-    weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1e-300)
-    return np.asarray(weights)
+    bands, _ = _channel_bands(context)
+    return bands.behind(context.camera.lens.transmittance(bands.wavelength_nm))
 
 
 def _sunlight(context: FaultContext) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

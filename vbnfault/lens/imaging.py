@@ -3,7 +3,8 @@
 The input is a render on the grid of a pinhole camera, with a guard band around the frame. Per band, in this order:
 
 1. resample the radiance to where the lens images it (distortion, lateral colour);
-2. multiply by transmission and solid angle, which gives irradiance;
+2. multiply by transmission and solid angle, which gives irradiance (the transmission is the mean over the band in
+   sunlight; its spectrum goes with the irradiance, as a filter sees only a part of a band);
 3. spread each pixel's light by the point spread function.
 
 The geometry behind the steps:
@@ -33,12 +34,13 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..core import spectra
 from ..core.errors import InputError
 from ..core.fine_light import splat
 from ..core.quantities import Irradiance, Radiance
 from ..core.sundisc import Floats, add_mean, pixel_sums
 from .distortion import RadialModel
-from .glass import D_NM
+from .glass import D_NM, RANGE_NM
 from .mapping import ChiefHeights, FieldMap, camera_model, chief_heights, field_map
 from .paraxial import paraxial_properties
 from .point_spread import REACH_PX, PointSpreads, Tiles, kernels_of_spots
@@ -167,8 +169,16 @@ class RealLens:
         return float(self.transmittance(np.array([D_NM]))[0])
 
     def transmittance(self, wavelength_nm: F64) -> F64:
-        """Return the fraction of the axial light that coatings and glass transmit, float64[band]."""
-        return axial_transmittance(self.prescription, wavelength_nm)
+        """Return the fraction of the axial light that coatings and glass transmit, float64 like `wavelength_nm`."""
+        return axial_transmittance(self.prescription, np.clip(wavelength_nm, *RANGE_NM))
+
+    def _passed(self, nodes_nm: F64) -> F64:
+        """Return the fraction of the axial sunlight in each band that the lens transmits, float64[band]."""
+        return spectra.band_means(self._spectrum(nodes_nm), nodes_nm)
+
+    def _spectrum(self, nodes_nm: F64) -> F64:
+        """Return `Irradiance.transmittance` for bands."""
+        return self.transmittance(spectra.fine_nodes_nm(nodes_nm))
 
     def pupil_area_mm2(self, slope: ArrayLike) -> F64:
         """Return the area of the beam that passes all rims, in the plane of the first vertex.
@@ -179,16 +189,14 @@ class RealLens:
         return np.asarray(np.interp(np.asarray(slope, dtype=np.float64), self._beams.slope, self._beams.area_mm2))
 
     def axial_solid_angle_sr(self, wavelength_nm: F64) -> F64:
-        """Return irradiance over radiance on the axis, T A / f², float64[band].
+        """Return irradiance over radiance on the axis in bands of sunlight, T A / f², float64[band].
 
         It is π T / (4 N²) at the paraxial focus.
         """
         return np.asarray(
             [
                 passed * self._beams.area_mm2[0] / self._map(wavelength).rise_mm[0] ** 2
-                for passed, wavelength in zip(
-                    self.transmittance(wavelength_nm), wavelength_nm.tolist(), strict=True
-                )
+                for passed, wavelength in zip(self._passed(wavelength_nm), wavelength_nm.tolist(), strict=True)
             ]
         )
 
@@ -422,7 +430,11 @@ class RealLens:
     def on_axis(self, radiance: Radiance) -> Irradiance:
         """Return the irradiance that a radiance gives on the axis; the pixels' positions do not matter."""
         factor = self.axial_solid_angle_sr(radiance.wavelength_nm).astype(np.float32)
-        return Irradiance(array=radiance.array * factor[:, None, None], wavelength_nm=radiance.wavelength_nm)
+        return self._irradiance(radiance.array * factor[:, None, None], radiance.wavelength_nm)
+
+    def _irradiance(self, array: F32, nodes_nm: F64) -> Irradiance:
+        """Return irradiance behind the lens."""
+        return Irradiance(array=array, wavelength_nm=nodes_nm, transmittance=self._spectrum(nodes_nm))
 
     def spread(self, light: F32, wavelength_nm: float) -> F32:
         """Return light on the pixels of the frame, float32[y, x], after the point spread of one wavelength.
@@ -455,7 +467,7 @@ class RealLens:
 
         with ThreadPoolExecutor(2) as pool:
             list(pool.map(image_band, range(len(array))))
-        return Irradiance(array=array, wavelength_nm=radiance.wavelength_nm)
+        return self._irradiance(array, radiance.wavelength_nm)
 
     def image_of_sun(self, radiance: Radiance, pixel_pitch_um: float) -> Irradiance:
         """Return the irradiance of the Sun's direct image, whose power is E☉ T A(θ) cos θ.
@@ -468,7 +480,7 @@ class RealLens:
             return self.image(radiance)
         bands, disc = _key(radiance.wavelength_nm), radiance.disc
         spreads = _spreads(self, bands)
-        passes = self.transmittance(radiance.wavelength_nm)
+        passes = self._passed(radiance.wavelength_nm)
         array = np.zeros((len(bands), self.height_px, self.width_px), dtype=np.float32)
         shape = self.height_px + 2 * REACH_PX, self.width_px + 2 * REACH_PX
         pixel_mm2 = (self.pixel_pitch_um * 1e-3) ** 2
@@ -482,7 +494,7 @@ class RealLens:
 
         with ThreadPoolExecutor(2) as pool:
             list(pool.map(image_band, range(len(array))))
-        return Irradiance(array=array, wavelength_nm=radiance.wavelength_nm)
+        return self._irradiance(array, radiance.wavelength_nm)
 
     def on_frame(self, radiance: Radiance) -> Radiance:
         """Return a render, without its guard band, on the grid of the image.
@@ -596,7 +608,7 @@ def _tables(lens: RealLens, wavelength_nm: tuple[float, ...]) -> RadialTables:
     """Return the tables of all bands."""
     distance = table_distances(lens._most_px) / lens.focal_length_px
     stretch, solid = [], []
-    for wavelength, passed in zip(wavelength_nm, lens.transmittance(np.array(wavelength_nm)), strict=True):
+    for wavelength, passed in zip(wavelength_nm, lens._passed(np.array(wavelength_nm)), strict=True):
         mapped = lens._map(wavelength)
         slope = mapped.slope_at(distance * lens.focal_length_mm)
         stretch.append(slope / distance)

@@ -76,7 +76,7 @@ class Lens(Protocol):
         """Return the object distance in focus, in m; inf: focused at infinity."""
 
     def transmittance(self, wavelength_nm: F64) -> F64:
-        """Return the fraction of the axial light that the lens transmits, float64[band]."""
+        """Return the fraction of the axial light that the lens transmits, float64 like `wavelength_nm`."""
 
     def pupil_area_mm2(self, slope: ArrayLike) -> F64:
         """Return the area of the beam that passes, float64 like `slope`, the tangents of its field angles."""

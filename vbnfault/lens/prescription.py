@@ -12,7 +12,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from .coating import DESIGN_NM, Layer, design
 from .glass import AIR, CLEAR, D_NM, Glass, Transmittance
@@ -86,10 +86,10 @@ class Surface:
         """
         return np.asarray(self.semi_diameter_mm + np.abs(self.sag_mm(self.semi_diameter_mm)) * slope)
 
-    def absorption_per_mm(self, wavelength_nm: float) -> float:
-        """Return the absorption coefficient of the medium behind the surface, in 1 / mm."""
-        fraction = float(np.interp(wavelength_nm, *self.internal_transmittance_10mm))
-        return -math.log(max(fraction, 1e-30)) / 10
+    def absorption_per_mm(self, wavelength_nm: ArrayLike) -> F64:
+        """Return the absorption coefficient of the medium behind the surface, in 1 / mm, like `wavelength_nm`."""
+        fraction = np.interp(np.asarray(wavelength_nm, dtype=np.float64), *self.internal_transmittance_10mm)
+        return np.asarray(-np.log(np.maximum(fraction, 1e-30)) / 10)
 
     def rim_mm(self, angle_rad: F64 | float) -> F64:
         """Return the distance of the rim from the axis in directions measured from +x towards +y.

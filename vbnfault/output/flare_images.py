@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import partial
 from numbers import Real
 from pathlib import Path
 from typing import Any
@@ -16,10 +17,11 @@ from ..core import spectra, tables
 from ..core.errors import InputError, shown
 from ..core.images import srgb8, write_exr, write_png
 from ..core.quantities import Electrons
+from ..core.spectra import Bands
 from ..detector import ThreeColourDetector
 from ..faults import FaultContext, registry
 from ..lens import Prescription, ThinLens, load_lens, paraxial_properties
-from ..lens.straylight.paraxial import Ghost, axial_transmittance, mean_ghost, paraxial_ghosts
+from ..lens.straylight.paraxial import Ghost, axial_transmittance, paraxial_ghosts
 from ..lens.straylight.scatter import Cleanliness
 from ..lens.straylight.settings import VEIL_FRACTION, GhostSettings, SensorGrid, StraylightSettings, SunSource
 from ..lens.straylight.total import SunlightInLens
@@ -103,7 +105,12 @@ class FlareRequest:
     @property
     def steps(self) -> int:
         """Return how many steps of progress `compute` reports."""
-        return 1 + (0 if self.model == "texture" else len(self.wavelength_nm))
+        return 1 + (0 if self.model == "texture" else len(self.bands.nodes_nm))
+
+    @property
+    def bands(self) -> Bands:
+        """Return the bands in which the Sun's light is computed; a single wavelength is a line."""
+        return Bands.sunlit(self.wavelength_nm)
 
     @property
     def pitch_mm(self) -> float:
@@ -160,7 +167,7 @@ def layers(request: FlareRequest) -> dict[str, F32]:
         return {"sun": sun, "texture": _textures(request)}
     light = SunlightInLens.of(
         request.lens,
-        wavelength_nm=request.wavelength_nm,
+        bands=request.bands,
         sensor=SensorGrid(shape=(request.pixels, request.pixels), pitch_mm=request.pitch_mm),
         sun=request.sun,
         settings=StraylightSettings(
@@ -184,15 +191,15 @@ def ghosts(request: FlareRequest, progress: Callable[[int], None] | None = None)
 
     `progress` is called with 1 after each wavelength.
     """
-    weight = spectra.solar_band_irradiance_W_m2_nm(request.wavelength_nm, 1.0)
-    weight = weight / weight.sum()
-    by_pair: dict[tuple[int, ...], list[tuple[float, Ghost]]] = {}
-    for wavelength_nm, fraction in zip(request.wavelength_nm, weight, strict=True):
-        for ghost in _ghosts_of_wavelength(request, float(wavelength_nm), alone=len(weight) == 1):
-            by_pair.setdefault(ghost.pair, []).append((float(fraction), ghost))
-        if progress is not None:
-            progress(1)
-    return tuple(mean_ghost(weighted) for _, weighted in sorted(by_pair.items()))
+    from ..lens.straylight.ghosts import traced_ghosts
+
+    nm = request.wavelength_nm
+    sun = Bands.sunlight(float(nm[0]), float(nm[-1]))
+    made = paraxial_ghosts
+    if request.model == "traced":
+        across = None if len(nm) == 1 else _ACROSS_SPECTRUM
+        made = partial(traced_ghosts, reflections=request.reflections, across=across)
+    return made(request.lens, request.sun_deg, azimuth_deg=request.azimuth_deg, bands=sun, progress=progress)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -265,24 +272,6 @@ def trace_flare(
     return compute(request)
 
 
-def _ghosts_of_wavelength(request: FlareRequest, wavelength_nm: float, *, alone: bool) -> tuple[Ghost, ...]:
-    """Return every ghost at one wavelength; `alone`: the only one, traced with the default number of rays."""
-    from ..lens.straylight.ghosts import traced_ghosts
-
-    if request.model == "paraxial":
-        return paraxial_ghosts(
-            request.lens, request.sun_deg, azimuth_deg=request.azimuth_deg, wavelength_nm=wavelength_nm
-        )
-    return traced_ghosts(
-        request.lens,
-        request.sun_deg,
-        azimuth_deg=request.azimuth_deg,
-        wavelength_nm=wavelength_nm,
-        reflections=request.reflections,
-        across=None if alone else _ACROSS_SPECTRUM,
-    )
-
-
 def _direct_image(request: FlareRequest) -> F32:
     """Return the Sun's direct image as a uniform disc of at least one pixel's area, float32[band, y, x].
 
@@ -302,7 +291,9 @@ def _direct_image(request: FlareRequest) -> F32:
     cover /= cover.sum() * request.pitch_mm**2
     inside = [(v >= 0) & (v < request.pixels) for v in (rows, columns)]
     out = np.zeros((len(request.wavelength_nm), request.pixels, request.pixels), dtype=np.float32)
-    power = axial_transmittance(request.lens, request.wavelength_nm) * np.cos(np.radians(request.sun_deg))
+    bands = request.bands
+    passed = bands.mean(axial_transmittance(request.lens, bands.wavelength_nm))
+    power = passed * np.cos(np.radians(request.sun_deg))
     power *= np.pi / 4 * optics.entrance_pupil_diameter_mm**2
     within = cover[np.ix_(*inside)]
     out[:, rows[inside[0]][:, None], columns[inside[1]]] = power[:, None, None] * within

@@ -31,12 +31,14 @@ from ..camera import Camera
 from ..core import spectra
 from ..core.errors import InputError, shown
 from ..core.quantities import Electrons
+from ..core.spectra import Bands
 from ..core.tables import did_you_mean
 from ..faults import Fault, Params, act, registry
 from ..lens import Prescription
 from ..lens.changes import changed
 from ..lens.footprint import ImageFrame
 from ..lens.straylight.irradiance import flare_model
+from ..lens.straylight.pyramid import scaled
 from ..lens.straylight.settings import GhostSettings, SensorGrid
 from ..lens.straylight.total import SunlightInLens, veil_per_px
 from ..pipeline.development import Development
@@ -410,27 +412,31 @@ class SceneEvaluator:
             return {"kept": kept_e, "direct": direct, "added": of_scene, "parts_e": {}, "ghosts_e": ()}
         light: SunlightInLens = source.light
         camera, pitch_mm = exposed.camera, light.sensor.pitch_mm
-        per_s = camera.detector.electron_rate_weights(light.nodes_nm) * source.irradiance_W_m2_nm
+        per_s = source.rates
         once = self.kept.once
-        # per band, over the Sun's irradiance
+        # over the Sun's irradiance
         levels = once("ghosts", light.ghost_key, light.ghost_levels)
         burst = once("starburst", light.starburst_key, light.starburst_layers)
         samples = once("glare", light.glare_samples_key, light.glare_samples, "samples")
         table, glare_beyond, kept = once("glare", light.glare_key, light.glare_light)
-        # per channel, in electrons per second
+        # in electrons per second
         burst_gain = light.starburst_gain(burst.flux_mm2 + burst.beyond_mm2)
         glare_gain = light.glare_gain(kept)
         glare_key = light.glare_key, light.glare_samples_key
         with self.kept.timed("light"):
             parts = {
-                "ghosts": self._channels("ghosts", levels.mixed, light.ghost_key, per_s * light.past_baffle),
-                "starburst": self._channels("starburst", burst.mixed, light.starburst_key, per_s * burst_gain),
-                "glare": self._channels("glare", lambda w: samples.mixed(table, w), glare_key, per_s * glare_gain),
+                "ghosts": self._channels(
+                    "ghosts", lambda w: scaled(levels.irradiance, w), light.ghost_key, per_s * light.past_baffle
+                ),
+                "starburst": self._channels("starburst", burst.planes, light.starburst_key, per_s * burst_gain),
+                "glare": self._channels(
+                    "glare", lambda w: samples.planes(table * w[:, None]), glare_key, per_s * glare_gain
+                ),
             }
             entering, veil_plane = light.veil_light()
             taken = (burst.flux_mm2 + burst.beyond_mm2) * burst_gain + entering
             taken = taken + (samples.flux_mm2(table) + glare_beyond) * glare_gain
-            direct_left = source.channel_mean(light.direct_fraction(levels.flux_mm2 * light.past_baffle, taken))
+            direct_left = light.direct_fraction(levels.flux_mm2 * light.past_baffle, taken)
             seconds = np.float32(camera.exposure_s)
             added = parts["ghosts"][0] + parts["starburst"][0]
             added += parts["glare"][0]
@@ -441,7 +447,7 @@ class SceneEvaluator:
                 veil = veil_per_px(camera_shape(camera), camera.focal_length_px)
                 flux = scene_e.sum(axis=(1, 2), dtype=np.float64) * lost
                 of_scene = veil * flux.astype(np.float32)[:, None, None]
-            sun_veil = (per_s @ entering * camera.exposure_s).astype(np.float32)
+            sun_veil = (per_s * entering * camera.exposure_s).astype(np.float32)
             for channel, plane in enumerate(added):
                 plane += veil_plane * sun_veil[channel]
                 plane += of_scene[channel]
@@ -486,11 +492,9 @@ class SceneEvaluator:
         camera = self._nominal_camera
         lens = self._nominal_lens(camera)
         scene = self._base.render
-        nodes = spectra.band_nodes_nm(scene.band_min_nm, scene.band_max_nm, scene.bands)
+        bands = Bands.sunlight(scene.band_min_nm, scene.band_max_nm)
         sensor = SensorGrid(shape=camera_shape(camera), pitch_mm=camera.detector.pixel_pitch_um * 1e-3)
-        model = flare_model(
-            lens, (float(nodes[len(nodes) // 2]),), sensor, spectra.sun_angular_radius_rad(1.0), GhostSettings()
-        )
+        model = flare_model(lens, bands, sensor, spectra.sun_angular_radius_rad(1.0), GhostSettings())
         ghosts = sorted(model.ghosts(camera.fov_deg / 4), key=lambda ghost: -ghost.flux_fraction)
         return tuple(ghost.pair for ghost in ghosts)
 
@@ -514,7 +518,7 @@ class SceneEvaluator:
             return light.ghost_model().flux_mm2(light.sun.angle_deg, light.sun.azimuth_deg, pairs)
 
         flux = self.kept.once("ghosts", light.ghost_key, make, "single")
-        return tuple(float((e_per_mm2 @ flux[pair]).mean()) for pair in pairs)
+        return tuple(float((e_per_mm2 * flux[pair]).mean()) for pair in pairs)
 
     # --- frames for navigation ------------------------------------------------------------------------------------
 

@@ -5,6 +5,8 @@ Each path is a table of steps, so that the rays of all ghosts run side by side t
 of a ray is relative to the vertex of the surface that the ray has just met. If the boxes of the bundles are
 symmetric about the plane of axis and Sun, the code traces only one side of this plane.
 
+Coatings vary faster with wavelength than directions of rays: a tracer of bands has the fractions of light of every
+other nanometre and means around the wavelengths that it traces. `ghosts.GhostSpectra` compares both with few rays.
 A route is the sequence of reflecting surfaces, which are numbered by their row in the prescription. The path of a
 route is the sequence of all surfaces that a ray meets; each of them is one step.
 
@@ -28,6 +30,7 @@ from numpy.typing import NDArray
 
 from ...core.errors import InputError
 from ...core.llvm import backend
+from ...core.spectra import Bands
 from ..coating import Layer, reflect_transmit
 from ..paraxial import paraxial_properties
 from ..prescription import Prescription
@@ -37,7 +40,7 @@ from .steps import Step, StopBlades, arrived, meet
 
 F64 = NDArray[np.float64]
 
-_COSINES = 256  # nodes of the reflectance tables
+_COSINES, _COSINES_OF_BANDS = 256, 64  # nodes of the reflectance tables, of single wavelengths and of bands
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -55,6 +58,8 @@ class Rays:
     disc
         float64[bundle]: semi-axis, in half widths of the box, of the ellipse to which a lattice is rounded. The
         outer rays of this lattice then follow a rim. With 0, the lattice stays rectangular.
+    light
+        int[bundle]: index into `Tracer.light_nm` of its light. Default: the mean around `wavelength`.
     """
 
     route: NDArray[np.int64]
@@ -62,6 +67,7 @@ class Rays:
     box_mm: F64
     direction: F64
     disc: F64 | None = None
+    light: NDArray[np.int64] | None = None
 
     def __len__(self) -> int:
         return len(self.route)
@@ -74,6 +80,7 @@ class Rays:
             box_mm=self.box_mm[chosen],
             direction=self.direction[chosen],
             disc=None if self.disc is None else self.disc[chosen],
+            light=None if self.light is None else self.light[chosen],
         )
 
 
@@ -161,7 +168,7 @@ def routes(lens: Prescription, reflections: int = 2) -> tuple[tuple[int, ...], .
 def name_of(route: Sequence[int]) -> tuple[int, ...]:
     """Return the name of a ghost: its reflecting rows in pairs; the first row of a pair is nearer the front.
 
-    Each pair is one reflection backwards and the next reflection forwards. The row that reflects forwards is first.
+    Each pair is a reflection backwards and the next one forwards; the row that reflects forwards is first.
     """
     return tuple(row for back, forth in zip(route[::2], route[1::2], strict=True) for row in (forth, back))
 
@@ -246,15 +253,19 @@ class _PathSteps:
 
 @lru_cache(maxsize=96)
 def _surface_fractions(
-    films: tuple[Layer, ...], front: tuple[float, ...], back: tuple[float, ...], wavelength_nm: tuple[float, ...]
+    films: tuple[Layer, ...],
+    front: tuple[float, ...],
+    back: tuple[float, ...],
+    wavelength_nm: tuple[float, ...],
+    cosines: int,
 ) -> F64:
     """Return the fractions of `Tracer._fractions` for one surface, float64[wavelength, 3, cosine], read-only.
 
     `front` and `back` are the indices on both sides at each wavelength. Lenses that differ in their geometry alone
     share these tables, which take most of the time to prepare a lens.
     """
-    out = np.empty((len(wavelength_nm), 3, _COSINES))
-    cosine = np.maximum(np.linspace(0, 1, _COSINES), 1e-6)[None, :]
+    out = np.empty((len(wavelength_nm), 3, cosines))
+    cosine = np.maximum(np.linspace(0, 1, cosines), 1e-6)[None, :]
     n_front, n_back, wavelength = (np.array(v)[:, None] for v in (front, back, wavelength_nm))
     # cosines on both sides, from the cosine in the medium of lower index by Snell's law
     thin = np.minimum(n_front, n_back)
@@ -279,19 +290,28 @@ def _aspheric_terms(lens: Prescription) -> F64:
 class Tracer:
     """Trace rays through a lens; the constructor computes tables of paths, indices and reflectances once.
 
-    `reflections` is 2, or 4 to include the paths of four reflections.
+    `reflections` is 2, or 4 to include the paths of four reflections. `bands` are those whose light rays may carry.
 
-    A ray is lost (clipped) outside `rims_mm`, float64[row]: the semi-diameter of each round rim, and infinity for
-    the sensor. `steps.meet` clips at these rims. `irradiance.ParaxialTracer` clips paraxial rays at the same rims.
+    A ray is lost (clipped) outside `rims_mm`, float64[row]: the semi-diameter of each round rim; the sensor's is
+    infinite. `steps.meet` clips at these rims. `irradiance.ParaxialTracer` clips paraxial rays at the same rims.
     A stop with blades does not use `rims_mm` but `steps.StopBlades`. `paraxial.paraxial_ghosts` has separate rims.
     From `rims_mm`, `ghosts` also computes first boxes and `irradiance` the widths of soft edges.
     """
 
     def __init__(
-        self, lens: Prescription, wavelength_nm: F64, *, reflections: int = 2, routes_: Any = None
+        self,
+        lens: Prescription,
+        wavelength_nm: F64,
+        *,
+        reflections: int = 2,
+        routes_: Any = None,
+        bands: Bands | None = None,
     ) -> None:
         self.lens = lens
         self.wavelength_nm = np.atleast_1d(np.asarray(wavelength_nm, dtype=np.float64))
+        self.bands = bands if bands is not None and len(bands.nm) > 1 else None
+        self.light_nm = self.wavelength_nm if self.bands is None else self.bands.sampled_nm
+        self._cosines = _COSINES if self.bands is None else _COSINES_OF_BANDS
         self.routes = routes(lens, reflections) if routes_ is None else tuple(routes_)
         self.sensor_mm = paraxial_properties(lens).bfd_mm
         self._paths = [path_of(lens, route) for route in self.routes]
@@ -310,9 +330,9 @@ class Tracer:
         be, lens = backend(), self.lens
         steps = _PathSteps.of(self._paths, np.append(lens.vertices_mm, lens.vertices_mm[-1] + self.sensor_mm))
         index = np.stack([np.append(lens.indices(w), 1.0) for w in self.wavelength_nm])
-        absorption = np.zeros_like(index)
+        absorption = np.zeros((len(self.light_nm), index.shape[1]))
         for k, surface in enumerate(lens.surfaces):
-            absorption[:, k + 1] = [surface.absorption_per_mm(w) for w in self.wavelength_nm]
+            absorption[:, k + 1] = surface.absorption_per_mm(self.light_nm)
         self._absorbs = bool(absorption.any())
         rows, medium = steps.row, steps.medium
         # index into the fractions of `_fractions`: 0 reflected from the front, 1 from behind, 2 transmitted
@@ -326,10 +346,11 @@ class Tracer:
         flat = [s.curvature_per_mm for s in lens.surfaces] + [0.0]
         conic = [1 + s.conic for s in lens.surfaces] + [1.0]
         ratio = index[:, medium] / index[:, steps.other]
+        curvature, per_rim = np.array(flat)[rows], (1 / self.rims_mm)[rows]
         # each step fetches few but wide records, because fetches take most of the time
-        curvature, per_rim = (np.array(flat)[rows], (1 / self.rims_mm)[rows])
-        self._index = index
-        self._look_up_word = ((rows * 3 + use) * _COSINES * 2 + steps.mirror.astype(np.int64)).astype(np.uint32)
+        self._look_up_word = ((rows * 3 + use) * self._cosines * 2 + steps.mirror.astype(np.int64)).astype(
+            np.uint32
+        )
         tables = {
             "row": be.UInt32(rows),
             "stop": be.UInt32((rows == lens.stop).astype(np.uint32)),
@@ -340,7 +361,8 @@ class Tracer:
             "last": be.Float(steps.last_gap_mm.astype(np.float32)),
             "conic": be.Float(np.array(conic, dtype=np.float32)),
             "per_rim": be.Float(per_rim.astype(np.float32)),
-            "absorption": be.Float(absorption[:, medium].astype(np.float32).ravel()),
+            "absorption": be.Float(self._around(absorption).astype(np.float32).ravel()),
+            "medium": be.UInt32(medium.astype(np.uint32)),
             "aspheric": [be.Float(c.astype(np.float32)) for c in aspheric],
         }
         self._last_gap_mm = float(steps.last_gap_mm[0]) if len(steps.last_gap_mm) else 0.0
@@ -355,7 +377,7 @@ class Tracer:
             "aspheric": aspheric,
             "absorption": absorption[:, medium],
         }
-        tables |= self._fraction_tables(self._fractions(index))
+        tables |= self._fraction_tables(self._coated)
         be.dr.eval(tables)
         return tables
 
@@ -381,29 +403,36 @@ class Tracer:
     @cached_property
     def _coated(self) -> F64:
         """Return the fractions of the coated surfaces."""
-        return self._fractions(self._index)
+        return self._around(self._fractions())
 
     @cached_property
     def _bare(self) -> F64:
         """Return the fractions of the surfaces without coatings."""
-        return self._fractions(self._index, bare=True)
+        return self._around(self._fractions(bare=True))
 
-    def _fractions(self, index: F64, bare: bool = False) -> F64:
+    def _fractions(self, bare: bool = False) -> F64:
         """Return the fractions reflected from the front, reflected from behind, and transmitted, of each surface.
 
-        The result is float64[wavelength, row, 3, cosine], the mean of both polarisations. The cosine is that of the
-        angle in the medium of lower index.
+        The result is float64[light, row, 3, cosine], the mean of both polarisations; cosines in the thinner medium.
         """
         lens = self.lens
-        out = np.zeros((len(index), len(lens.surfaces) + 1, 3, _COSINES))
-        wavelengths = tuple(self.wavelength_nm.tolist())
+        out = np.zeros((len(self.light_nm), len(lens.surfaces) + 1, 3, self._cosines))
+        wavelengths = tuple(self.light_nm.tolist())
+        media = [np.ones(len(wavelengths)), *(s.medium.index(self.light_nm) for s in lens.surfaces)]
+        index = [tuple(np.broadcast_to(medium, len(wavelengths)).tolist()) for medium in media]
         for k, surface in enumerate(lens.surfaces):
             films = () if bare else surface.coating
-            out[:, k] = _surface_fractions(
-                films, tuple(index[:, k].tolist()), tuple(index[:, k + 1].tolist()), wavelengths
-            )
+            out[:, k] = _surface_fractions(films, index[k], index[k + 1], wavelengths, self._cosines)
         out[:, -1, :2] = lens.sensor_reflectance
         return out
+
+    def _around(self, values: F64) -> F64:
+        """Return means around every wavelength of the tracer, and behind them the values at all of the bands."""
+        if self.bands is None:
+            return values
+        away = np.abs(self.light_nm - self.wavelength_nm[:, None])
+        hats = np.maximum(1 - away / (self.bands.nodes_nm[1] - self.bands.nodes_nm[0]), 0)
+        return np.concatenate([np.tensordot(hats / hats.sum(axis=1, keepdims=True), values, 1), values])
 
     def trace(
         self,
@@ -487,14 +516,15 @@ class Tracer:
         edge = be.UInt64(_paired(per_width, self._look_up_word.view(np.float32)))
         beyond = be.Float(stretch) if soft else None
         wavelength = start.wavelength * dr.opaque(be.UInt32, len(self.rows))
-        fractions = start.wavelength * dr.opaque(be.UInt32, 3 * _COSINES * (len(self.lens.surfaces) + 1))
+        fractions = start.light * dr.opaque(be.UInt32, 3 * self._cosines * (len(self.lens.surfaces) + 1))
+        media = start.light * dr.opaque(be.UInt32, len(self.lens.surfaces) + 2)
         end = dr.gather(be.UInt32, t["end"], start.route)
 
         def on(step: Any, *_: Any) -> Any:
             return step < end
 
         def body(step: Any, *ray: Any) -> Any:
-            at = self._fetched(step, edge, beyond, wavelength, fractions)
+            at = self._fetched(step, edge, beyond, wavelength, fractions, media)
             return step + 1, *meet(at, ray, soft=soft, special=self._special, blades=self._blades)
 
         first = dr.gather(be.UInt32, t["start"], start.route)
@@ -537,7 +567,7 @@ class Tracer:
         dr.eval(spots)
         return Spots(rays, side, *spots)
 
-    def _fetched(self, step: Any, edge: Any, beyond: Any, wavelength: Any, fractions: Any) -> Step:
+    def _fetched(self, step: Any, edge: Any, beyond: Any, wavelength: Any, fractions: Any, media: Any) -> Step:
         """Return the data of one step of each lane's path, fetched from the tables."""
         be, t = backend(), self._tables
         dr = be.dr
@@ -546,10 +576,13 @@ class Tracer:
         sharpness, word = _unpaired(edge, step)
         word = dr.reinterpret_array(be.UInt32, word)
         row = dr.gather(be.UInt32, t["row"], step) if self._special else None
+        absorption = None
+        if self._absorbs:
+            absorption = dr.gather(be.Float, t["absorption"], media + dr.gather(be.UInt32, t["medium"], step))
 
         def passed(cosine: Any) -> Any:
-            at = cosine * (_COSINES - 1)
-            node = dr.minimum(be.UInt32(at), _COSINES - 2)
+            at = cosine * (self._cosines - 1)
+            node = dr.minimum(be.UInt32(at), self._cosines - 2)
             low, rise = _unpaired(t["fraction"], (word >> 1) + fractions + node)
             return dr.fma(at - be.Float(node), rise, low)
 
@@ -565,7 +598,7 @@ class Tracer:
             stop=dr.gather(be.UInt32, t["stop"], step) == 1 if self._bladed else False,
             conic=dr.gather(be.Float, t["conic"], row) if self._special else 1.0,
             aspheric=[dr.gather(be.Float, a, row) for a in t["aspheric"]],
-            absorption=dr.gather(be.Float, t["absorption"], wavelength + step) if self._absorbs else None,
+            absorption=absorption,
             passed=passed,
         )
 
@@ -579,8 +612,8 @@ class Tracer:
             word = int(self._look_up_word[step])
 
             def passed(cosine: Any, word: int = word) -> Any:
-                at = cosine * (_COSINES - 1)
-                node = dr.minimum(be.UInt32(at), _COSINES - 2)
+                at = cosine * (self._cosines - 1)
+                node = dr.minimum(be.UInt32(at), self._cosines - 2)
                 low, rise = _unpaired(self._tables["fraction"], (word >> 1) + node)
                 return dr.fma(at - be.Float(node), rise, low)
 
@@ -642,6 +675,7 @@ class Tracer:
             dz=dz,
             route=whole(rays.route),
             wavelength=whole(rays.wavelength),
+            light=whole(rays.wavelength if rays.light is None else rays.light + len(self.wavelength_nm)),
             ray=first + iy * side + ix,
             mirrored=first + (side - 1 - iy) * side + ix,
         )

@@ -33,10 +33,11 @@ from numpy.typing import NDArray
 from ...core import activity
 from ...core.array_files import ArrayFiles, code_hash
 from ...core.llvm import backend
+from ...core.spectra import Bands
 from ..glass import D_NM
 from ..prescription import Prescription
 from .bundles import Rays, Spots, Tracer
-from .ghosts import boxes, lit_cells
+from .ghosts import GhostSpectra, boxes, lit_cells
 from .irradiance import ParaxialTracer
 from .settings import GhostSettings, SensorGrid
 
@@ -225,17 +226,18 @@ class _Smoothing:
 class _Tracing:
     """Trace the response of a lens, ring by ring of the sources.
 
-    Positions of rays on the sensor are traced at the middle band only. The light of each band is in proportion to
-    the flux of a coarse lattice. The colours of a ghost are apart by some parts in a hundred of its size, less than
+    Positions of rays on the sensor are traced at the middle node only. The light of each band is in proportion to
+    `GhostSpectra`. The colours of a ghost are apart by some parts in a hundred of its size, less than
     the width of its Gaussian.
     """
 
     def __init__(
-        self, lens: Prescription, wavelength_nm: F64, cells: PolarCells, settings: GhostSettings, loss: float
+        self, lens: Prescription, bands: Bands, cells: PolarCells, settings: GhostSettings, loss: float
     ) -> None:
-        self.cells, self.bands = cells, len(wavelength_nm)
+        self.cells, self.bands = cells, len(bands)
         kind = Tracer if settings.model == "traced" else ParaxialTracer
-        whole = kind(lens.with_round_stop(), wavelength_nm, reflections=settings.reflections)
+        whole = kind(lens.with_round_stop(), bands.nodes_nm, reflections=settings.reflections, bands=bands)
+        self.middle = len(bands.nodes_nm) // 2
         self.routes = len(whole.routes)
         self.tracer = whole.worn(loss) if loss and self.routes else whole
         self.rings = cells.rings + _BEYOND
@@ -304,14 +306,14 @@ class _Tracing:
         wide = np.where(seen, near[..., 3], 0).max(axis=0)[route]
         return route, np.column_stack([(low + high) / 2, wide / 2, (high - low) / 2, wide / 2])
 
-    def _bundles(self, route: NDArray[np.int64], box: F64, slope: float, bands: Sequence[int]) -> Rays:
-        """Return the bundles of routes in some bands, the bands of one route side by side."""
-        cosine, count = 1 / np.hypot(1, slope), len(route) * len(bands)
+    def _bundles(self, route: NDArray[np.int64], box: F64, slope: float) -> Rays:
+        """Return the bundles of routes at the middle node."""
+        cosine = 1 / np.hypot(1, slope)
         return Rays(
-            route=np.repeat(route, len(bands)),
-            wavelength=np.tile(np.array(bands), len(route)),
-            box_mm=np.repeat(box, len(bands), axis=0),
-            direction=np.tile([slope * cosine, 0.0, cosine], (count, 1)),
+            route=route,
+            wavelength=np.full(len(route), self.middle),
+            box_mm=box,
+            direction=np.tile([slope * cosine, 0.0, cosine], (len(route), 1)),
         )
 
     def _near(self, route: NDArray[np.int64], box: F64, slope: float) -> _Ghosts:
@@ -331,7 +333,7 @@ class _Tracing:
     def _narrowed(self, route: NDArray[np.int64], box: F64, slope: float) -> tuple[_Ghosts, F64]:
         """Return the ghosts in boxes, and how much each box became smaller."""
         shape = len(route), _COARSE, _COARSE
-        rays = self._bundles(route, box, slope, [self.bands // 2])
+        rays = self._bundles(route, box, slope)
         spots = self.tracer.trace(rays, _COARSE, centred=True, halved=False)
         x, y, radius = (v.numpy().reshape(shape) for v in (spots.x_mm, spots.y_mm, spots.radius))
         # a rim may lie between two rays, and so may the whole sensor, but not where the light is very thin
@@ -356,21 +358,18 @@ class _Tracing:
         return _Ghosts(route[seen], out, across, rings * self.cells.ring_mm / across), fraction
 
     def _colours(self, ghosts: _Ghosts, slope: float) -> F32:
-        """Return the flux of each ghost in every band over that in the middle band, float32[ghost, band]."""
-        rays = self._bundles(ghosts.route, ghosts.box_mm, slope, range(self.bands))
-        spots = self.tracer.trace(rays, _COARSE, centred=True, halved=False)
-        lit = lit_cells(spots, _COARSE).numpy().reshape(len(ghosts), self.bands, -1).sum(axis=2)
-        middle = lit[:, self.bands // 2, None]
-        return np.asarray(np.where(middle > 0, lit / np.where(middle > 0, middle, 1), 1.0), dtype=np.float32)
+        """Return the flux of each ghost in every band over that of its rays, float32[ghost, band]."""
+        rays = self._bundles(ghosts.route, ghosts.box_mm, slope)
+        reach_mm = self.rings * self.cells.ring_mm
+        spectra = GhostSpectra.of(self.tracer, rays, reach_mm)
+        return spectra.of_bands(self.middle).astype(np.float32)
 
     def _traced(self, ghosts: _Ghosts, across: int, sources: _Sources, colours: F32) -> _Arrived:
         """Return where the rays of all sources arrive, for the half of each box with y > 0."""
         be = backend()
         dr, Float, UInt32 = be.dr, be.Float, be.UInt32
         count, turns = len(ghosts), len(sources.slope)
-        parts = [
-            self._bundles(ghosts.route, ghosts.box_mm, float(slope), [self.bands // 2]) for slope in sources.slope
-        ]
+        parts = [self._bundles(ghosts.route, ghosts.box_mm, float(slope)) for slope in sources.slope]
         rays = Rays(
             route=np.tile(parts[0].route, turns),
             wavelength=np.tile(parts[0].wavelength, turns),
@@ -550,7 +549,7 @@ def _cosines(lit: F32) -> F32:
 
 def ghost_response(
     lens: Prescription,
-    wavelength_nm: tuple[float, ...],
+    bands: Bands,
     cells: PolarCells,
     settings: GhostSettings,
     coating_loss: float = 0.0,
@@ -562,9 +561,9 @@ def ghost_response(
     most, whatever loss is asked for.
     """
     if not coating_loss:
-        return _response(lens, wavelength_nm, cells, settings, 0.0)
+        return _response(lens, bands, cells, settings, 0.0)
     losses = np.linspace(0, 1, settings.reflections + 1)
-    parts = [_response(lens, wavelength_nm, cells, settings, loss) for loss in losses.tolist()]
+    parts = [_response(lens, bands, cells, settings, loss) for loss in losses.tolist()]
     others = losses[None, :] + np.where(np.eye(len(losses)) > 0, np.nan, 0)
     weights = np.nanprod((coating_loss - others) / (losses[:, None] - others), axis=1)
     table = sum(np.float32(w) * part.table for w, part in zip(weights, parts, strict=True))
@@ -574,7 +573,7 @@ def ghost_response(
 @lru_cache(maxsize=5)
 def _response(
     lens: Prescription,
-    wavelength_nm: tuple[float, ...],
+    bands: Bands,
     cells: PolarCells,
     settings: GhostSettings,
     coating_loss: float,
@@ -583,9 +582,9 @@ def _response(
 
     def traced() -> dict[str, F32]:
         activity.begin(f"ghosts of {lens.name} at every field angle (new response)")
-        return {"table": _traced_table(lens, wavelength_nm, cells, settings, coating_loss)}
+        return {"table": _traced_table(lens, bands, cells, settings, coating_loss)}
 
-    key = response_key(lens, wavelength_nm, cells, settings, coating_loss)
+    key = response_key(lens, bands, cells, settings, coating_loss)
     table = RESPONSES.kept(key, traced)["table"]
     table.setflags(write=False)
     return GhostResponse(cells=cells, table=table)
@@ -593,15 +592,15 @@ def _response(
 
 def _traced_table(
     lens: Prescription,
-    wavelength_nm: tuple[float, ...],
+    bands: Bands,
     cells: PolarCells,
     settings: GhostSettings,
     coating_loss: float,
 ) -> F32:
     """Return `GhostResponse.table` at one coating loss."""
-    tracing = _Tracing(lens, np.array(wavelength_nm), cells, settings, coating_loss)
+    tracing = _Tracing(lens, bands, cells, settings, coating_loss)
     count = len(cells.slopes)
-    table = np.zeros((len(wavelength_nm), tracing.nodes, cells.rings, count), dtype=np.float32)
+    table = np.zeros((len(bands), tracing.nodes, cells.rings, count), dtype=np.float32)
     if tracing.routes:
         for ring in range(count):
             table[..., ring] = tracing.ring(ring)
@@ -610,7 +609,7 @@ def _traced_table(
 
 def response_key(
     lens: Prescription,
-    wavelength_nm: tuple[float, ...],
+    bands: Bands,
     cells: PolarCells,
     settings: GhostSettings,
     coating_loss: float,
@@ -619,7 +618,7 @@ def response_key(
 
     Names do not count. Glasses count by their indices at the wavelengths that rays are traced at.
     """
-    traced_nm = *wavelength_nm, float(np.median(wavelength_nm)), D_NM
+    traced_nm = *bands.nm, float(np.median(bands.nodes_nm)), D_NM
     surfaces = [dataclasses.asdict(s) for s in lens.with_round_stop().surfaces]
     for surface in surfaces:
         del surface["medium"]
@@ -627,10 +626,10 @@ def response_key(
         "code": _code_hash(),
         "surfaces": surfaces,
         "indices": [lens.indices(nm).tolist() for nm in traced_nm],
-        "absorption": [[s.absorption_per_mm(nm) for s in lens.surfaces] for nm in wavelength_nm],
+        "absorption": [s.absorption_per_mm(bands.wavelength_nm).tolist() for s in lens.surfaces],
         "sensor_reflectance": lens.sensor_reflectance,
         "hood": lens.hood and dataclasses.asdict(lens.hood),
-        "wavelength_nm": wavelength_nm,
+        "bands": dataclasses.asdict(bands),
         "cells": dataclasses.asdict(cells),
         "settings": [settings.model, settings.reflections, coating_loss],
     }

@@ -8,8 +8,8 @@ Flux, position and size of the ghost are then sums over a fine grid of rays in i
 from __future__ import annotations
 
 import warnings
-from collections.abc import Collection
-from dataclasses import dataclass
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -17,11 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.llvm import backend
+from ...core.spectra import Bands, hat_weights
 from ..glass import D_NM
 from ..paraxial import paraxial_properties
 from ..prescription import Prescription
 from .bundles import Rays, Spots, Tracer, name_of
-from .paraxial import Ghost
+from .paraxial import AT_D_LINE, Ghost, mean_ghost
 
 F64 = NDArray[np.float64]
 
@@ -33,6 +34,9 @@ PEAK = 64  # rays across a box, to locate the peak
 _TOGETHER = 1 << 22  # rays traced at a time, to limit memory
 _SHARP = 1e-3  # default width of soft edges while boxes are located
 _LEAST_SPREAD = 0.25  # fraction of a ghost's image that is magnified less than `Arrivals.magnification`
+_SPECTRUM = 6  # rays across a ghost whose spectrum is computed
+_SPECTRUM_AT_ONCE = 1 << 20
+_LEAST_SHARE = 1e-2  # of a ghost's light in a band that a wavelength must have to be drawn in it
 _UNEVEN = 2.0  # ratio of the areas of neighbouring cells above which the image is uneven
 
 
@@ -293,9 +297,9 @@ def _spread(
 
 
 @lru_cache(maxsize=8)
-def tracer(lens: Prescription, wavelength_nm: tuple[float, ...], reflections: int = 2) -> Tracer:
-    """Return the tracer of a lens and its wavelengths; it is cached."""
-    return Tracer(lens, np.array(wavelength_nm), reflections=reflections)
+def tracer(lens: Prescription, bands: Bands, reflections: int = 2) -> Tracer:
+    """Return the tracer of a lens at the nodes of bands; it is cached."""
+    return Tracer(lens, bands.nodes_nm, reflections=reflections, bands=bands)
 
 
 def traced_ghosts(
@@ -303,10 +307,11 @@ def traced_ghosts(
     sun_deg: float,
     *,
     azimuth_deg: float = 0.0,
-    wavelength_nm: float = D_NM,
+    bands: Bands = AT_D_LINE,
     reflections: int = 2,
     across: int | None = None,
     only: Collection[tuple[int, ...]] | None = None,
+    progress: Callable[[int], None] | None = None,
 ) -> tuple[Ghost, ...]:
     """Return the ghosts of a far point source by exact rays, in the form of `paraxial.paraxial_ghosts`.
 
@@ -314,6 +319,8 @@ def traced_ghosts(
 
     Parameters
     ----------
+    bands
+        One band, whose mean is returned.
     reflections
         2, or 4 to include ghosts of four reflections.
     across
@@ -321,20 +328,29 @@ def traced_ghosts(
         ghosts of four reflections.
     only
         Names of the ghosts to trace: the pair of rows, the smaller first. Default: all.
+    progress
+        Called with 1 after each wavelength.
     """
     turn = np.radians(azimuth_deg)
-    made = tracer(lens, (float(wavelength_nm),), reflections).turned(turn)
+    made = tracer(lens, bands, reflections).turned(turn)
     rays, _ = boxes(made, sun_deg)
     if only is not None:
         rays = rays.take(named(made, rays, only))
     if not len(rays):
         return ()
-    if across is not None:
-        return traced(made, rays, sun_deg, turn, across)
     four = np.array([len(made.routes[r]) > 2 for r in rays.route])
-    parts = [(rays.take(~four), FINE), (rays.take(four), FINE_OF_FOUR)]
-    ghosts = [ghost for part, count in parts for ghost in traced(made, part, sun_deg, turn, count)]
-    return tuple(sorted(ghosts, key=lambda g: g.pair))
+    parts = [(~four, FINE), (four, FINE_OF_FOUR)] if across is None else [(four | True, across)]
+    weights = GhostSpectra.of(made, rays).weights(1)[..., 0]
+    of_name = {name_of(made.routes[route]): own for route, own in zip(rays.route, weights, strict=True)}
+    by_name: dict[tuple[int, ...], list[tuple[float, Ghost]]] = {}
+    for k in range(len(made.wavelength_nm)):
+        for chosen, count in parts:
+            at_node = replace(rays.take(chosen), wavelength=np.full(int(chosen.sum()), k))
+            for ghost in traced(made, at_node, sun_deg, turn, count) if len(at_node) else ():
+                by_name.setdefault(ghost.pair, []).append((float(of_name[ghost.pair][k]), ghost))
+        if progress is not None:
+            progress(1)
+    return tuple(mean_ghost(of) for _, of in sorted(by_name.items()))
 
 
 def named(made: Tracer, rays: Rays, names: Collection[tuple[int, ...]]) -> NDArray[np.bool_]:
@@ -359,6 +375,111 @@ def traced(
         coarse = spots if peak_across == across else made.trace(part, peak_across, centred=True)
         out += _described(made, spots, across, turn_rad, pupil, peaks(coarse, peak_across, sun_deg))
     return tuple(sorted(out, key=lambda g: g.pair))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class GhostSpectra:
+    """Hold the light of bundles, and compute with which weights their rays add to the bands.
+
+    Few rays are enough, as only ratios count.
+
+    Attributes
+    ----------
+    bands
+        The bands; None for a tracer without.
+    traced_nm
+        float64[wavelength]: wavelengths of the tracer.
+    true, traced
+        Light of each bundle at `Bands.sampled_nm`, float64[bundle, n], and that which its rays carry if
+        they are traced at the wavelengths of the tracer, float64[bundle, wavelength].
+    """
+
+    bands: Bands | None
+    traced_nm: F64
+    true: F64
+    traced: F64
+
+    @classmethod
+    def of(cls, made: Tracer, rays: Rays, reach_mm: float = np.inf, step: int = 1) -> GhostSpectra:
+        """Return the spectra of bundles; rays that arrive farther than `reach_mm` from the axis count less.
+
+        The light of the rays is computed at every `step`-th wavelength of the tracer and is linear between these.
+        """
+        nm, count = made.wavelength_nm, len(rays)
+        if made.bands is None:
+            none = np.ones((count, len(nm)))
+            return cls(bands=None, traced_nm=nm, true=none, traced=none)
+        lit = made.light_nm
+        nearest = np.rint(np.interp(lit, nm, np.arange(len(nm)))).astype(np.int64)
+        nodes = np.arange(0, len(nm), step)
+        wavelength = np.concatenate([nearest, nodes])
+        # the mean light around the tracer's wavelengths is before that of the bands
+        light = np.concatenate([np.arange(len(lit)), nodes - len(nm)])
+        parts = []
+        together = max(1, _SPECTRUM_AT_ONCE // (len(light) * _SPECTRUM**2))
+        for first in range(0, count, together):
+            part = rays.take(np.arange(first, min(first + together, count)))
+            each = replace(
+                part.take(np.repeat(np.arange(len(part)), len(light))),
+                wavelength=np.tile(wavelength, len(part)),
+                light=np.tile(light, len(part)),
+            )
+            parts.append(_arriving(made.trace(each, _SPECTRUM, centred=True), reach_mm).reshape(len(part), -1))
+        spectra = np.concatenate(parts) if parts else np.zeros((0, len(light)))
+        traced = np.einsum("gk,kn->gn", spectra[:, len(lit) :], hat_weights(nm[nodes], nm))
+        return cls(bands=made.bands, traced_nm=nm, true=spectra[:, : len(lit)], traced=traced)
+
+    def take(self, chosen: NDArray[Any]) -> GhostSpectra:
+        """Return the spectra of some of the bundles."""
+        return replace(self, true=self.true[chosen], traced=self.traced[chosen])
+
+    def of_bands(self, wavelength: int) -> F64:
+        """Return the mean true light in each band over that traced at one wavelength, float64[bundle, band]."""
+        if self.bands is None:
+            return np.ones((len(self.true), 1))
+        traced = self.traced[:, wavelength, None]
+        mean = np.einsum("gn,bn->gb", self.true, _sampled(self.bands, self.bands.weights))
+        return np.asarray(np.where(traced > 0, mean / np.where(traced > 0, traced, 1), 1.0))
+
+    def weights(self, step: int) -> F64:
+        """Return the weights of rays at every `step`-th wavelength, float64[bundle, wavelength, band].
+
+        The light of a ghost in a band is the sum of the light of its rays times these weights: each is the mean
+        over the band of true light times the hat function of the wavelength, over the light of the rays.
+        """
+        if self.bands is None:
+            return np.ones((*self.true.shape, 1)) / self.true.shape[1]
+        # einsum, because the bits of BLAS may depend on the number of threads
+        shares = _shares(self.bands, tuple(self.traced_nm[::step].tolist()))
+        mean = np.einsum("gn,kbn->gkb", self.true, shares)
+        total = mean.sum(axis=1, keepdims=True)
+        mean[mean < _LEAST_SHARE * total] = 0  # not worth the drawing
+        mean *= total / np.maximum(mean.sum(axis=1, keepdims=True), 1e-300)
+        traced = self.traced[:, ::step, None]
+        return np.asarray(np.where(traced > 0, mean / np.where(traced > 0, traced, 1), 0))
+
+
+@lru_cache(maxsize=16)
+def _shares(bands: Bands, nodes_nm: tuple[float, ...]) -> F64:
+    """Return the weights of the sampled wavelengths in the hat function of each node, float64[node, band, n]."""
+    return _sampled(bands, bands.weights * hat_weights(np.array(nodes_nm), bands.wavelength_nm)[:, None])
+
+
+def _sampled(bands: Bands, weights: F64) -> F64:
+    """Return weights of the wavelengths of bands, float64[..., n], as weights of `Bands.sampled_nm`."""
+    return weights @ hat_weights(bands.sampled_nm, bands.wavelength_nm).T
+
+
+def _arriving(spots: Spots, reach_mm: float) -> F64:
+    """Return the mean light of the rays of each bundle that arrive near the axis, float64[bundle]."""
+    be = backend()
+    dr = be.dr
+    away = (spots.x_mm * spots.x_mm + spots.y_mm * spots.y_mm) * dr.opaque(be.Float, reach_mm**-2)
+    # where no ray passes the rims, those that nearly pass decide
+    nearly = 1e-6 / (1 + spots.radius**8)
+    weight = (_inside(spots.radius, _SPECTRUM) + nearly) / (1 + away * away)
+    total = dr.block_sum(be.Float64(spots.fraction * weight), _SPECTRUM**2)
+    return np.asarray(total.numpy() / dr.block_sum(be.Float64(weight), _SPECTRUM**2).numpy())
 
 
 def fluxes_mm2(made: Tracer, rays: Rays, sun_deg: float, across: int) -> F64:

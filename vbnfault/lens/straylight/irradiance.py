@@ -1,5 +1,8 @@
 """Render the ghosts of the Sun as irradiance on the sensor, by exact or paraxial rays, per band.
 
+Rays are traced at few wavelengths, the nodes, and each adds its light to all bands with the weights of
+`ghosts.GhostSpectra`: so the spectra of coatings, glasses and bands count at every nanometre.
+
 A ghost is an image of the openings that its light passes. The Sun's disc and diffraction soften the edges of that
 image by widths that are known for each rim. The Sun's width is the shift, to first order, when the Sun moves by the
 radius of its disc. The width of diffraction is Fresnel's for a straight edge. Where the Sun itself is nearly in
@@ -20,9 +23,10 @@ from numpy.typing import NDArray
 from ...core.errors import InputError
 from ...core.llvm import backend
 from ...core.memory import release_unused
+from ...core.spectra import Bands
 from ..prescription import Prescription
 from .bundles import Rays, Spots, TraceOptions, Tracer, name_of
-from .ghosts import Arrivals, boxes, fluxes_mm2, named, traced
+from .ghosts import Arrivals, GhostSpectra, boxes, fluxes_mm2, named, traced
 from .paraxial import Ghost, along, mean_ghost
 from .pyramid import LEVELS, Canvas, Pyramid
 from .raster import PARTS, BundleDrawing, Sums, edge_kind
@@ -65,10 +69,8 @@ class ParaxialTracer(Tracer):
     `steps.meet` does the same for exact rays; its module lists all code that applies rims.
     """
 
-    def __init__(
-        self, lens: Prescription, wavelength_nm: F64, *, reflections: int = 2, routes_: Any = None
-    ) -> None:
-        super().__init__(lens, wavelength_nm, reflections=reflections, routes_=routes_)
+    def __init__(self, lens: Prescription, wavelength_nm: F64, **options: Any) -> None:
+        super().__init__(lens, wavelength_nm, **options)
         be = backend()
         factors = [along(lens, path, self.wavelength_nm) for path in self._paths]
         whole = np.stack([m for m, _ in factors])  # route, wavelength
@@ -107,6 +109,7 @@ class ParaxialTracer(Tracer):
         x, y = start.x, start.y
         sx, sy = start.dx / start.dz, start.dy / start.dz
         of = start.wavelength * dr.opaque(be.UInt32, len(self.routes)) + start.route
+        light = start.light * dr.opaque(be.UInt32, len(self.routes)) + start.route
         m00, m01 = (dr.gather(be.Float, f["whole"], 2 * of + k) for k in (0, 1))
         steps = start.wavelength * dr.opaque(be.UInt32, len(self.rows))
         end = dr.gather(be.UInt32, t["end"], start.route)
@@ -132,7 +135,7 @@ class ParaxialTracer(Tracer):
             across=side,
             x_mm=dr.fma(m00, x, m01 * sx),
             y_mm=dr.fma(m00, y, m01 * sy),
-            fraction=dr.select(radius >= 0, dr.gather(be.Float, t["fractions"], of), 0),  # one value per ray
+            fraction=dr.select(radius >= 0, dr.gather(be.Float, t["fractions"], light), 0),  # one value per ray
             radius=radius,
             margin=margin,
         )
@@ -167,10 +170,9 @@ class _Detail:
 
 @dataclass(frozen=True, eq=False)
 class _Drawn:
-    """Hold what is drawn: bundle, two bands and their weights, whether it is rough, and part of the light."""
+    """Hold what is drawn: bundle, its weight in every band, whether it is rough, and part of the light."""
 
     source: NDArray[np.int64]
-    band: NDArray[np.int64]
     weight: F64
     rough: NDArray[np.bool_]
     part: NDArray[np.int64]
@@ -186,7 +188,7 @@ class _Drawn:
         rows = np.repeat(np.arange(len(many)), many)
         within = np.arange(len(rows)) - np.repeat(np.cumsum(many) - many, many)
         source = first[self.source][rows] + within
-        return _Drawn(source, self.band[rows], self.weight[rows], self.rough[rows], self.part[rows])
+        return _Drawn(source, self.weight[rows], self.rough[rows], self.part[rows])
 
 
 class FlareModel:
@@ -196,8 +198,8 @@ class FlareModel:
     ----------
     lens
         At its final size.
-    wavelength_nm
-        float64[band]: nodes of the bands; one node is one wavelength.
+    bands
+        Bands of the images.
     sensor
         Pixels whose middle lies on the axis.
     sun_radius_rad
@@ -209,7 +211,7 @@ class FlareModel:
     def __init__(
         self,
         lens: Prescription,
-        wavelength_nm: F64,
+        bands: Bands,
         sensor: SensorGrid,
         *,
         sun_radius_rad: float,
@@ -219,13 +221,13 @@ class FlareModel:
         if model not in MODELS:
             raise InputError(f"model = {model!r}: must be one of {', '.join(MODELS)}")
         self.lens = lens
-        self.nodes_nm = np.atleast_1d(np.asarray(wavelength_nm, dtype=np.float64))
-        self.canvas = Canvas(shape=shape, pitch_mm=pitch_mm, bands=len(self.nodes_nm))
+        self.bands, self.nodes_nm = bands, bands.nodes_nm
+        self.canvas = Canvas(shape=shape, pitch_mm=pitch_mm, bands=len(bands))
         self.sun_radius_rad = sun_radius_rad
         kind = Tracer if model == "traced" else ParaxialTracer
         at = np.arange((len(self.nodes_nm) - 1) * _SUBDIVISIONS + 1) / _SUBDIVISIONS
         self._fine = np.interp(at, np.arange(len(self.nodes_nm)), self.nodes_nm)
-        self._tracer = kind(lens, self._fine, reflections=settings.reflections)
+        self._tracer = kind(lens, self._fine, reflections=settings.reflections, bands=bands)
         if lens.hood is not None:
             shift = sun_radius_rad * lens.hood.length_mm / lens.hood.radius_mm  # of the edge's shadow
             self._tracer.hood_width = max(shift, self._tracer.hood_width)
@@ -374,10 +376,10 @@ class FlareModel:
             raise InputError(f"sun_deg = {sun_deg:g}: must be from 0 to below 90")
         turn = float(np.radians(azimuth_deg))
         made, rays, arrivals = self._boxes(sun_deg, turn)
-        shown = self._in_frame(arrivals) & (arrivals.peak > _LEAST)
+        shown = self._in_frame(arrivals)
         if only is not None:
             shown &= named(made, rays, [only])
-        rays, arrivals = rays.take(shown), arrivals.take(shown)
+        rays, arrivals, spectra = self._bright(made, rays.take(shown), arrivals.take(shown), self._reach_mm)
         detail = self._details(self._fainter(rays, arrivals), self._spread(arrivals, rays.route))
         sums = Sums(self.canvas)
         cosine = float(np.cos(np.radians(sun_deg)))
@@ -385,13 +387,15 @@ class FlareModel:
         finely = (arrivals.uneven > _UNEVEN) | detail.spread_out[rays.route]
         across = np.where(finely, 2 * self._across - 1, self._across)
         over_disc = len(disc_samples(_DISC_RINGS)) * _ACROSS_FOCUSED**2
-        number = self.canvas.bands * np.where(sampled, over_disc, across**2)
+        number = len(self.nodes_nm) * np.where(sampled, over_disc, across**2)
         for of_disc in (False, True):
             group = np.flatnonzero(sampled == of_disc)
             # one half of the lattices mirrors the other only if it does for all of them, in whatever part
             halved = not (rays.direction[group, 1].any() or rays.box_mm[group, 1].any())
             for part in _parts(group, across[group], number[group]):
-                each, bundles, drawn = self._coloured(rays.take(part), arrivals.take(part), detail)
+                each, bundles, drawn = self._coloured(
+                    rays.take(part), arrivals.take(part), detail, spectra.take(part)
+                )
                 strength, side = np.full(len(bundles), cosine), across[part][each]
                 if of_disc:
                     each, bundles, strength = self._over_disc(bundles, sun_deg)
@@ -423,13 +427,15 @@ class FlareModel:
         turn = float(np.radians(azimuth_deg))
         made, rays, _ = self._boxes(sun_deg, turn)
         rays = rays.take(named(made, rays, only))
-        bands = len(self.nodes_nm)
-        flux = {name: np.zeros(bands) for name in only}
+        nodes = np.arange(0, len(self._fine), _SUBDIVISIONS)
+        flux = {name: np.zeros(len(self.bands)) for name in only}
         if len(rays):
-            each = np.repeat(np.arange(len(rays)), bands)
-            nodes = np.tile(np.arange(bands) * _SUBDIVISIONS, len(rays))
-            by_band = fluxes_mm2(made, replace(rays.take(each), wavelength=nodes), sun_deg, across)
-            for route, own in zip(rays.route, by_band.reshape(len(rays), bands), strict=True):
+            each = np.repeat(np.arange(len(rays)), len(nodes))
+            at_nodes = replace(rays.take(each), wavelength=np.tile(nodes, len(rays)))
+            traced_mm2 = fluxes_mm2(made, at_nodes, sun_deg, across).reshape(len(rays), len(nodes))
+            spectra = GhostSpectra.of(made, rays, step=_SUBDIVISIONS)
+            by_band = np.einsum("gk,gkb->gb", traced_mm2, spectra.weights(_SUBDIVISIONS))
+            for route, own in zip(rays.route, by_band, strict=True):
                 flux[name_of(made.routes[route])] += own
         return flux
 
@@ -443,16 +449,32 @@ class FlareModel:
         """
         turn = float(np.radians(azimuth_deg))
         made, rays, arrivals = self._boxes(sun_deg, turn)
-        rays = rays.take(self._in_frame(arrivals) & (arrivals.peak > _LEAST))
+        shown = self._in_frame(arrivals)
+        rays, _, spectra = self._bright(made, rays.take(shown), arrivals.take(shown), np.inf)
         if not len(rays):
             return ()
+        weights = spectra.weights(_SUBDIVISIONS).mean(axis=2)
+        of_name = {name_of(made.routes[route]): own for route, own in zip(rays.route, weights, strict=True)}
         by_name: dict[tuple[int, ...], list[tuple[float, Ghost]]] = {}
-        for node in range(0, len(self._fine), _SUBDIVISIONS):
-            for ghost in traced(made, _at_node(rays, node), sun_deg, turn, across, across):
-                by_name.setdefault(ghost.pair, []).append((1 / len(self.nodes_nm), ghost))
+        for k in range(len(self.nodes_nm)):
+            for ghost in traced(made, _at_node(rays, k * _SUBDIVISIONS), sun_deg, turn, across, across):
+                by_name.setdefault(ghost.pair, []).append((float(of_name[ghost.pair][k]), ghost))
         peak = {name: sum(part * g.peak_irradiance_fraction for part, g in of) for name, of in by_name.items()}
         highest = sorted(sorted(by_name), key=lambda name: -peak[name])[:most]
         return tuple(mean_ghost(by_name[name]) for name in sorted(highest))
+
+    def _bright(
+        self, made: Tracer, rays: Rays, arrivals: Arrivals, reach_mm: float
+    ) -> tuple[Rays, Arrivals, GhostSpectra]:
+        """Return the ghosts that are bright enough to show, and their spectra.
+
+        The peaks of the arrivals become those in the band in which each ghost is brightest. They were traced at the
+        first wavelength, where coatings may reflect much more or less, and with whole coatings.
+        """
+        spectra = GhostSpectra.of(made, rays, reach_mm, _SUBDIVISIONS)
+        arrivals = replace(arrivals, peak=arrivals.peak * spectra.of_bands(0).max(axis=1))
+        bright = arrivals.peak > (_LEAST if self._whole is None else 0)
+        return rays.take(bright), arrivals.take(bright), spectra.take(bright)
 
     def _fainter(self, rays: Rays, arrivals: Arrivals) -> NDArray[np.int64]:
         """Return the levels to add where edges are too faint to show in the sum of all ghosts, by route."""
@@ -471,14 +493,15 @@ class FlareModel:
         soft = 8 * 2.0**LEVELS * self.canvas.pitch_mm
         return np.asarray(np.hypot(beyond[:, 0], beyond[:, 1]) < self._reach_mm + soft)
 
-    def _coloured(self, rays: Rays, arrivals: Arrivals, detail: _Detail) -> tuple[NDArray[np.int64], Rays, _Drawn]:
+    def _coloured(
+        self, rays: Rays, arrivals: Arrivals, detail: _Detail, spectra: GhostSpectra
+    ) -> tuple[NDArray[np.int64], Rays, _Drawn]:
         """Return the bundles of all wavelengths, the ghost of each, and what is drawn of them.
 
-        The nodes of the bands are always traced. Further wavelengths are added where the colours of a ghost lie far
+        The nodes are always traced. Further wavelengths are added where the colours of a ghost lie far
         apart (`_APART_PX`). The inner part of the light is smooth and is drawn from the nodes alone.
         """
-        bands = len(self.nodes_nm)
-        apart = arrivals.move_mm / max(bands - 1, 1) / self.canvas.pitch_mm
+        apart = arrivals.move_mm / max(len(self.nodes_nm) - 1, 1) / self.canvas.pitch_mm
 
         def divided(level: NDArray[np.int64]) -> NDArray[np.int64]:
             """Return into how many steps the interval between two nodes is divided at a level: 1, 2, 4 or 8."""
@@ -493,22 +516,20 @@ class FlareModel:
         taken = at[None, :] % (_SUBDIVISIONS // most)[:, None] == 0
         which, wavelength = np.nonzero(taken)
         bundles = replace(rays.take(which), wavelength=wavelength)
-        hats = np.maximum(1 - np.abs(at[:, None] / _SUBDIVISIONS - np.arange(bands)), 0)
-        first = np.minimum(at // _SUBDIVISIONS, bands - 1)
-        second = np.minimum(first + 1, bands - 1)
-        band = np.column_stack([first, second])
+        weights = {n: spectra.weights(_SUBDIVISIONS // n) for n in np.unique(list(divisions.values())) if n}
         parts = []
         for part, name in enumerate(PARTS):
             divided_ = divisions[name]
             step = _SUBDIVISIONS // np.maximum(divided_, 1)
             source = np.flatnonzero((divided_ > 0)[which] & (wavelength % step[which] == 0))
-            # the weights of the wavelengths taken sum to one in every band
-            total = np.stack([hats[::n].sum(axis=0) for n in range(1, _SUBDIVISIONS + 1)])
-            rows = wavelength[source]
-            weight = np.take_along_axis(hats[rows] / total[step[which[source]] - 1], band[rows], axis=1)
-            weight[:, 1] *= band[rows, 1] > band[rows, 0]
+            weight = np.empty((len(source), len(self.bands)))
+            ghost, node = which[source], wavelength[source] // step[which[source]]
+            for number, own in weights.items():
+                chosen = divided_[ghost] == number
+                weight[chosen] = own[ghost[chosen], node[chosen]]
+            lit = weight.any(axis=1)
             of = np.full(len(source), part)
-            parts.append((source, band[rows], weight, rough[which[source]], of))
+            parts.append(tuple(column[lit] for column in (source, weight, rough[ghost], of)))
         return which, bundles, _Drawn(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
     def _over_disc(self, rays: Rays, sun_deg: float) -> tuple[NDArray[np.int64], Rays, F64]:
@@ -529,7 +550,6 @@ class FlareModel:
         return BundleDrawing(
             source=drawn.source,
             level=levels[drawn.part, route],
-            band=drawn.band,
             weight=drawn.weight,
             strength=strength[drawn.source],
             kind=detail.kind[route],
@@ -576,13 +596,13 @@ def disc_samples(rings: int) -> F64:
 @lru_cache(maxsize=4)
 def flare_model(
     lens: Prescription,
-    nodes_nm: tuple[float, ...],
+    bands: Bands,
     sensor: SensorGrid,
     sun_radius_rad: float,
     settings: GhostSettings = TRACED,
 ) -> FlareModel:
     """Return the model of a lens and a sensor; it is cached."""
-    return FlareModel(lens, np.array(nodes_nm), sensor, sun_radius_rad=sun_radius_rad, settings=settings)
+    return FlareModel(lens, bands, sensor, sun_radius_rad=sun_radius_rad, settings=settings)
 
 
 __all__ = ["MODELS", "FlareModel", "disc_samples", "flare_model"]

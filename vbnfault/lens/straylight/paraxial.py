@@ -8,7 +8,7 @@ disc. The ghost is the image of the overlap of these discs, magnified by M₀₀
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import combinations
@@ -16,6 +16,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ...core.spectra import Bands, hat_weights
 from ..coating import mean_reflectance
 from ..glass import D_NM
 from ..paraxial import paraxial_properties
@@ -24,6 +25,7 @@ from ..rays import forward, ghost
 
 F64 = NDArray[np.float64]
 
+AT_D_LINE = Bands.lines(D_NM)
 _GRID = 129  # sample points across the smallest disc
 
 
@@ -157,17 +159,21 @@ def _media(lens: Prescription, wavelength_nm: tuple[float, ...]) -> tuple[F64, F
     return index, vertex
 
 
-def transmittance(lens: Prescription, path: Sequence[tuple[int, bool]], wavelength_nm: float = D_NM) -> float:
-    """Return the fraction of the light that takes a path, for normal incidence on every surface."""
-    index = lens.indices(wavelength_nm)
-    fraction = 1.0
+def transmittance(lens: Prescription, path: Sequence[tuple[int, bool]], wavelength_nm: ArrayLike = D_NM) -> F64:
+    """Return the fraction of the light that takes a path, for normal incidence on every surface.
+
+    The result is float64 like `wavelength_nm`.
+    """
+    nm = np.asarray(wavelength_nm, dtype=np.float64)
+    index = [np.ones(nm.shape), *(surface.medium.index(nm) for surface in lens.surfaces)]
+    fraction = np.ones(nm.shape)
     for row, mirror in path:
         if row == len(lens.surfaces):
-            fraction *= lens.sensor_reflectance
+            fraction = fraction * lens.sensor_reflectance
             continue
         films = lens.surfaces[row].coating
-        reflected = float(mean_reflectance(films, index[row], index[row + 1], 1.0, wavelength_nm))
-        fraction *= reflected if mirror else 1 - reflected
+        reflected = mean_reflectance(films, index[row], index[row + 1], 1.0, nm)
+        fraction = fraction * (reflected if mirror else 1 - reflected)
     return fraction
 
 
@@ -184,22 +190,40 @@ def axial_transmittance(lens: Prescription, wavelength_nm: ArrayLike) -> F64:
 @lru_cache(maxsize=64)
 def _axial_transmittance(lens: Prescription, wavelength_nm: tuple[float, ...]) -> tuple[float, ...]:
     """Return `axial_transmittance`, which every exposure and every direct image of the Sun needs."""
-    path = forward(lens)
-    passed = np.array([transmittance(lens, path, nm) for nm in wavelength_nm])
-    glass = lens.surfaces[:-1]
-    depth = np.array([sum(s.thickness_mm * s.absorption_per_mm(nm) for s in glass) for nm in wavelength_nm])
-    return tuple((passed * np.exp(-depth)).tolist())
+    nm = np.array(wavelength_nm)
+    depth = sum((s.thickness_mm * s.absorption_per_mm(nm) for s in lens.surfaces[:-1]), np.zeros(len(nm)))
+    return tuple((transmittance(lens, forward(lens), nm) * np.exp(-depth)).tolist())
 
 
 def paraxial_ghosts(
-    lens: Prescription, sun_deg: float, *, azimuth_deg: float = 0.0, wavelength_nm: float = D_NM
+    lens: Prescription,
+    sun_deg: float,
+    *,
+    azimuth_deg: float = 0.0,
+    bands: Bands = AT_D_LINE,
+    progress: Callable[[int], None] | None = None,
 ) -> tuple[Ghost, ...]:
     """Return the ghosts of a far point source at an angle from the axis, towards an azimuth (0: +x).
+
+    They are the mean over the only band of `bands`. `progress` is called with 1 after each wavelength.
 
     A ray is lost (clipped) outside the round rim of any surface, whose radius is `semi_diameter_mm`; blades of the
     stop are ignored. These rims are separate from those of the tracers, which `steps` lists. Ghosts without
     rays are left out.
     """
+    hats = bands.weights[0] * hat_weights(bands.nodes_nm, bands.wavelength_nm)
+    light = {pair: hats @ transmittance(lens, ghost(lens, *pair), bands.wavelength_nm) for pair in pairs(lens)}
+    by_pair: dict[tuple[int, int], list[tuple[float, Ghost]]] = {}
+    for node, nm in enumerate(bands.nodes_nm.tolist()):
+        for one in _lossless_ghosts(lens, sun_deg, azimuth_deg, nm):
+            by_pair.setdefault(one.pair, []).append((float(light[one.pair][node]), one))
+        if progress is not None:
+            progress(1)
+    return tuple(mean_ghost(of) for _, of in sorted(by_pair.items()))
+
+
+def _lossless_ghosts(lens: Prescription, sun_deg: float, azimuth_deg: float, wavelength_nm: float) -> list[Ghost]:
+    """Return the ghosts of surfaces that reflect and transmit all light, at one wavelength."""
     turn = np.radians(azimuth_deg)
     slope = np.tan(np.radians(sun_deg)) * np.array([np.cos(turn), np.sin(turn)])
     pupil = np.pi / 4 * paraxial_properties(lens).entrance_pupil_diameter_mm ** 2
@@ -223,14 +247,13 @@ def paraxial_ghosts(
             continue
         on_sensor = matrix[0, 0] * passing + matrix[0, 1] * slope
         centroid = on_sensor.mean(axis=0)
-        fraction = transmittance(lens, path, wavelength_nm)
         ghosts.append(
             Ghost(
                 pair=pair,
-                flux_fraction=fraction * len(passing) * (2 * radius[least] / _GRID) ** 2 / pupil,
+                flux_fraction=len(passing) * (2 * radius[least] / _GRID) ** 2 / pupil,
                 centroid_mm=(float(centroid[0]), float(centroid[1])),
                 rms_radius_mm=float(np.sqrt(np.mean(np.sum((on_sensor - centroid) ** 2, axis=1)))),
-                peak_irradiance_fraction=float(fraction * np.cos(np.radians(sun_deg)) / matrix[0, 0] ** 2),
+                peak_irradiance_fraction=float(np.cos(np.radians(sun_deg)) / matrix[0, 0] ** 2),
             )
         )
-    return tuple(ghosts)
+    return ghosts

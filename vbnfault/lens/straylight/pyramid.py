@@ -21,7 +21,6 @@ T = TypeVar("T")
 
 LEVELS = 6
 MARGIN = 4  # pixels around each level, for cells that lie partly outside
-_STRIP = 128  # rows; shorter steps wait for the interpreter's lock
 _CALM_SIGMA = 0.8  # sigma by which a coarser level is smoothed, in pixels of this level
 
 
@@ -60,13 +59,10 @@ class Pyramid:
             flux += inside.sum(axis=(1, 2), dtype=np.float64) * 4**k
         return np.asarray(flux * self.canvas.pitch_mm**2)
 
-    def mixed(self, weights: F64) -> F32:
-        """Return sums over the bands with weights float64[channel, band], float32[channel, y, x].
-
-        The bands are added before the levels are resized, which is cheaper than `Sums.irradiance` for few channels.
-        """
-        mix = weights.astype(np.float32)
-        return summed(self.canvas, [np.tensordot(mix, level, 1) for level in self.levels])
+    @property
+    def irradiance(self) -> F32:
+        """Return the sum of all levels, float32[band, y, x]."""
+        return summed(self.canvas, self.levels)
 
 
 def summed(canvas: Canvas, levels: Sequence[NDArray[Any]], unit: float | None = None) -> F32:
@@ -108,22 +104,10 @@ def summed(canvas: Canvas, levels: Sequence[NDArray[Any]], unit: float | None = 
     return out
 
 
-def bands_mixed(array: F32, weights: F64) -> F32:
-    """Return float32[band, y, x] summed over the bands with float64[channel, band], float32[channel, y, x]."""
-    # the rows of a strip stay in the cache; BLAS is slow for so few weights, and its bits depend on the threads
-    factors = weights.tolist()
-    out = buffers.empty((len(factors), *array.shape[1:]))
-    starts = range(0, array.shape[1], _STRIP)
-
-    def mix(strip: int) -> None:
-        rows = slice(starts[strip], starts[strip] + _STRIP)
-        for plane, row in zip(out[:, rows], factors, strict=True):
-            cv2.multiply(array[0, rows], row[0], dst=plane)
-            for band, factor in zip(array[1:, rows], row[1:], strict=True):
-                cv2.scaleAdd(band, factor, plane, dst=plane)
-
-    in_layers(mix, len(starts))
-    return out
+def scaled(array: F32, factors: F64) -> F32:
+    """Return float32[band, y, x] after multiplying each band by a factor in place."""
+    in_layers(lambda band: np.multiply(array[band], np.float32(factors[band]), out=array[band]), len(array))
+    return array
 
 
 def in_layers(step: Callable[[int], T], count: int) -> list[T]:

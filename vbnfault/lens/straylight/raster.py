@@ -37,7 +37,6 @@ _EDGE_NODES = 2049
 _UNLIKE = 0.05  # ratio of neighbouring areas below which a fold is near
 _SMOOTH = 0.5  # change of irradiance over a pixel that still looks smooth
 _NEIGHBOURS = 16384  # lanes that follow each other, mostly cells side by side, whose pixels share the cache
-_BANDS_APART = 64  # largest number of bands that are drawn one after the other
 _ONE = np.float32(1).view(np.uint32)  # the bits of the number, as an integer
 _NARROW_PX = 1.5  # cells narrower than this are drawn by points
 _POINTS = 64  # largest number of points along each side of a cell
@@ -59,8 +58,8 @@ class BundleDrawing:
         Index into the traced bundles.
     level
         Level of the pyramid.
-    band, weight
-        int64 and float64[bundle, 2]: two bands and their weights.
+    weight
+        float64[bundle, band]: weights in all bands.
     strength
         Irradiance for a `fraction` of 1 without magnification.
     kind
@@ -79,7 +78,6 @@ class BundleDrawing:
 
     source: NDArray[np.int64]
     level: NDArray[np.int64]
-    band: NDArray[np.int64]
     weight: F64
     strength: F64
     kind: NDArray[np.int64]
@@ -250,27 +248,23 @@ class Sums:
         """Return a function that adds irradiance to a pixel, in the level and bands of the cell's bundle."""
         be = backend()
         dr, lattice, placement, total = be.dr, cells.lattice, cells.lattice.placement, self._total
-        bands = [
-            (
-                cells.given(lattice.start + placement.band[:, k] * lattice.size, be.UInt32),
-                cells.given(placement.weight[:, k] * _UNITS),
-            )
-            for k in (0, 1)
-            if (placement.weight[:, k] > 0).any()
-        ]
+        number = lattice.bands
+        start = cells.given(lattice.start, be.UInt32)
+        weights = [cells.given(column * _UNITS) for column in placement.weight.T]
 
         def add(value: Any, pixel: Any, shown: Any) -> None:
-            for start, weight in bands:
+            value, first = dr.clip(value, -_MOST, _MOST), start + pixel * number
+            for band, weight in enumerate(weights):
                 # negative numbers wrap around, and wrap back when they are read as signed
-                units = be.UInt64(be.Int64(dr.round(dr.clip(value, -_MOST, _MOST) * weight)))
+                units = be.UInt64(be.Int64(dr.round(value * weight)))
                 # the lanes of a vector rarely add to the same pixel, so they are not summed beforehand
-                dr.scatter_add(total, units, start + pixel, shown & (weight > 0), mode=dr.ReduceMode.Direct)
+                dr.scatter_add(total, units, first + band, shown & (weight > 0), mode=dr.ReduceMode.Direct)
 
         return add
 
     def levels(self) -> Pyramid:
         """Return the sums of every level and band."""
-        levels = tuple(np.multiply(part, 1 / _UNITS, dtype=np.float32) for part in self._parts())
+        levels = tuple(np.multiply(part, 1 / _UNITS, dtype=np.float32, order="C") for part in self._parts())
         return Pyramid(canvas=self.canvas, levels=levels)
 
     def irradiance(self) -> F32:
@@ -278,32 +272,30 @@ class Sums:
         return summed(self.canvas, self._parts(), 1 / _UNITS)
 
     def _parts(self) -> list[NDArray[np.int64]]:
-        """Return the integer sums of every level, int64[band, y, x]."""
+        """Return the integer sums of every level, int64[band, y, x]; the bands of a pixel are neighbours."""
         canvas, total = self.canvas, self._total.numpy().view(np.int64)
         return [
-            total[canvas.starts[level] : canvas.starts[level + 1]].reshape(canvas.bands, *canvas.sizes[level])
+            total[canvas.starts[level] : canvas.starts[level + 1]]
+            .reshape(*canvas.sizes[level], canvas.bands)
+            .transpose(2, 0, 1)
             for level in range(LEVELS)
         ]
 
 
-def _shared_out(work: NDArray[np.uint32], band: NDArray[np.uint16]) -> NDArray[np.intp]:
-    """Return an order of lanes that balances their work, intp[lane]; `work` and `band` hold a value for each lane.
+def _shared_out(work: NDArray[np.uint32]) -> NDArray[np.intp]:
+    """Return an order of lanes that balances their work, intp[lane]; `work` holds a value for each lane.
 
-    Bands follow each other, because a plane of the sums fits the cache where those of all bands do not. Lanes with
-    nearly equal work are neighbours, because neighbours in the vector unit wait for one another. Among those,
-    neighbouring cells follow each other, because their pixels share the cache. Groups of such lanes are scattered
-    within a band so that every thread gets some of the large ones.
+    Lanes with nearly equal work are neighbours, because neighbours in the vector unit wait for one another. Among
+    those, neighbouring cells follow each other, because their pixels share the cache. Groups of such lanes are
+    scattered so that every thread gets some of the large ones.
     """
     # the exponent and the first four bits of a number in single precision
     sizes = (np.maximum(work, 1).astype(np.float32).view(np.uint32) - _ONE >> 19).astype(np.uint16)
-    lanes = np.argsort(band << 10 | sizes, kind="stable")  # of 16 bits, which numpy sorts fastest
-    parts = []
-    for lanes_of_band in np.split(lanes, np.cumsum(np.bincount(band))[:-1]):
-        groups = len(lanes_of_band) // _NEIGHBOURS
-        golden = np.argsort(np.arange(groups) * ((np.sqrt(5) - 1) / 2) % 1)
-        whole, rest = np.split(lanes_of_band, [groups * _NEIGHBOURS])
-        parts += [whole.reshape(groups, _NEIGHBOURS)[golden].ravel(), rest]
-    return np.concatenate(parts)
+    lanes = np.argsort(sizes, kind="stable")  # of 16 bits, which numpy sorts fastest
+    groups = len(lanes) // _NEIGHBOURS
+    golden = np.argsort(np.arange(groups) * ((np.sqrt(5) - 1) / 2) % 1)
+    whole, rest = np.split(lanes, [groups * _NEIGHBOURS])
+    return np.concatenate([whole.reshape(groups, _NEIGHBOURS)[golden].ravel(), rest])
 
 
 class _Triangle:
@@ -434,8 +426,7 @@ class _Lattice:
         self.entrance_mm2 = traced.entrance_mm2[placement.source]
         self.light = self.entrance_mm2 * placement.strength * self.per_mm**2
         self.numbers = lattice_places(self.across - 1, self.across - 1)
-        # the band of each cell, modulo a number that `_shared_out` can sort by
-        self._bands = np.repeat((placement.band[:, 0] % _BANDS_APART).astype(np.uint16), (self.across - 1) ** 2)
+        self.bands = canvas.bands
 
     def cells(self, index: NDArray[np.intp] | None = None) -> _Cells:
         """Return all cells, or those at an index."""
@@ -443,7 +434,7 @@ class _Lattice:
 
     def shared_out(self, index: NDArray[np.intp], work: NDArray[np.uint32]) -> _Cells:
         """Return the cells at an index in an order that shares out their work, such as pixels to draw."""
-        return self.cells(index[_shared_out(work, self._bands[index])])
+        return self.cells(index[_shared_out(work)])
 
 
 class _Cells:

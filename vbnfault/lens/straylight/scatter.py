@@ -21,6 +21,7 @@ from scipy.special import erf, exprel, j1
 
 from ...core.array_files import ArrayFiles, code_hash
 from ...core.errors import InputError
+from ...core.spectra import Bands
 from ..coating import reflect_transmit
 from ..footprint import disc_overlap
 from ..glass import D_NM, RANGE_NM
@@ -470,7 +471,7 @@ class _Surfaces:
     `stretch` is a_ent / a_j: the radius of the axial beam at the entrance over its radius at surface j.
     """
 
-    scale: float  # π NA² T
+    scale: float  # π NA²
     stretch: F64
     roughness: tuple[Harvey, ...]
     dusty: NDArray[np.bool_]
@@ -478,7 +479,7 @@ class _Surfaces:
     wavelength_nm: float
 
     def irradiance(self, offset: F64, lit: F64) -> F64:
-        """Return the irradiance on the sensor over the source's at the entrance, float64[sample].
+        """Return the irradiance on the sensor over the source's at the entrance and over T, float64[sample].
 
         `lit` [surface, sample] is the lit fraction of each beam. Surface j scatters the radiance E_ent T
         (a_ent/a_j)² BSDF. This radiance fills the cone of the image, hence the factor π NA². From Lagrange's
@@ -541,7 +542,7 @@ def _surfaces(lens: Prescription, wavelength_nm: float, cleanliness: Cleanliness
     marginal = np.abs(along(lens, path, wavelength_nm)[1][rows, 0, 0])
     aperture = figures.entrance_pupil_diameter_mm / (2 * figures.efl_mm)
     return _Surfaces(
-        scale=float(np.pi * aperture**2 * axial_transmittance(lens, wavelength_nm)[0]),
+        scale=float(np.pi * aperture**2),
         stretch=1 / np.maximum(marginal, 1e-6),
         roughness=tuple(
             Harvey.of_roughness(
@@ -598,16 +599,29 @@ def _lit_at(lens: Prescription, slopes: tuple[float, ...]) -> F64:
     return np.stack([np.cos(a) * _lit(lens, float(np.degrees(a))) for a in angle])
 
 
-def _surfaces_of_bands(lens: Prescription, wavelength_nm: ArrayLike, cleanliness: Cleanliness) -> list[_Surfaces]:
-    """Return the scatter of a lens's surfaces at each wavelength."""
+def _surfaces_of_bands(
+    lens: Prescription, wavelength_nm: ArrayLike | Bands, cleanliness: Cleanliness
+) -> list[_Surfaces]:
+    """Return the scatter of a lens's surfaces at each wavelength, or at the nodes of bands."""
+    nodes = wavelength_nm.nodes_nm if isinstance(wavelength_nm, Bands) else wavelength_nm
     return [
-        _surfaces(lens, float(nm), cleanliness)
-        for nm in np.atleast_1d(_check("wavelength_nm", wavelength_nm, *RANGE_NM))
+        _surfaces(lens, float(nm), cleanliness) for nm in np.atleast_1d(_check("wavelength_nm", nodes, *RANGE_NM))
     ]
 
 
+def _passed(lens: Prescription, wavelength_nm: ArrayLike | Bands, scattered: F64) -> F64:
+    """Return the scattered light behind the lens, float64[band, ...]; `scattered` are its values over T.
+
+    Scatter varies slowly with wavelength, T as fast as coatings do.
+    """
+    if not isinstance(wavelength_nm, Bands):
+        return (axial_transmittance(lens, wavelength_nm) * scattered.T).T
+    transmitted = axial_transmittance(lens, wavelength_nm.wavelength_nm)
+    return (wavelength_nm.mean(transmitted) * wavelength_nm.behind(transmitted).smooth_mean(scattered).T).T
+
+
 def veiling_glare(
-    lens: Prescription, *, sun_deg: float, wavelength_nm: ArrayLike, cleanliness: Cleanliness = POLISHED
+    lens: Prescription, *, sun_deg: float, wavelength_nm: ArrayLike | Bands, cleanliness: Cleanliness = POLISHED
 ) -> VeilingGlare:
     """Return the light of a far point source that a lens's surfaces scatter onto the sensor.
 
@@ -616,7 +630,7 @@ def veiling_glare(
     sun_deg
         Angle of the source from the axis, 0 to 89.9.
     wavelength_nm
-        float64[band].
+        float64[band], or bands.
     cleanliness
         What scatters on the surfaces.
     """
@@ -625,14 +639,14 @@ def veiling_glare(
     lit = np.cos(np.radians(angle)) * _lit(lens, angle)[:, None]
     return VeilingGlare(
         offset=_OFFSETS,
-        irradiance=np.stack([band.irradiance(_OFFSETS, lit) for band in bands]),
+        irradiance=_passed(lens, wavelength_nm, np.stack([band.irradiance(_OFFSETS, lit) for band in bands])),
         efl_mm=paraxial_properties(lens).efl_mm,
-        glare_total_fraction=np.array([band.tis for band in bands]),
+        glare_total_fraction=-np.log1p(-scattered_fraction(lens, wavelength_nm, cleanliness=cleanliness)),
     )
 
 
 def glare_kernels(
-    lens: Prescription, slope: F64, *, wavelength_nm: ArrayLike, cleanliness: Cleanliness = POLISHED
+    lens: Prescription, slope: F64, *, wavelength_nm: ArrayLike | Bands, cleanliness: Cleanliness = POLISHED
 ) -> tuple[F64, F64]:
     """Return the glare of far point sources at many field angles.
 
@@ -651,16 +665,20 @@ def glare_kernels(
     """
     lit = _lit_at(lens, tuple(np.asarray(slope, dtype=np.float64).tolist()))
     bands = _surfaces_of_bands(lens, wavelength_nm, cleanliness)
-    return _OFFSETS, np.stack([np.einsum("aj,js->as", lit, band.of_each(_OFFSETS)) for band in bands])
+    kernels = np.stack([np.einsum("aj,js->as", lit, band.of_each(_OFFSETS)) for band in bands])
+    return _OFFSETS, _passed(lens, wavelength_nm, kernels)
 
 
-def scattered_fraction(lens: Prescription, wavelength_nm: ArrayLike, *, cleanliness: Cleanliness = POLISHED) -> F64:
+def scattered_fraction(
+    lens: Prescription, wavelength_nm: ArrayLike | Bands, *, cleanliness: Cleanliness = POLISHED
+) -> F64:
     """Return the fraction of the transmitted light that a lens's surfaces scatter, 1 - exp(-Σ TIS), float64[band].
 
     Parameters as in `veiling_glare`.
     """
     single = np.array([band.tis for band in _surfaces_of_bands(lens, wavelength_nm, cleanliness)])
-    return np.asarray(-np.expm1(-single))
+    fraction = -np.expm1(-single)
+    return wavelength_nm.smooth_mean(fraction) if isinstance(wavelength_nm, Bands) else fraction
 
 
 def point_source_transmittance(
@@ -675,7 +693,8 @@ def point_source_transmittance(
     angles = np.atleast_1d(_check("sun_deg", sun_deg, 0.0, _STEEPEST_DEG))
     lit = np.stack([np.cos(np.radians(a)) * _lit(lens, float(a)) for a in angles], axis=1)
     bands = _surfaces_of_bands(lens, wavelength_nm, cleanliness)
-    return np.stack([band.irradiance(np.sin(np.radians(angles)), lit) for band in bands])
+    scattered = np.stack([band.irradiance(np.sin(np.radians(angles)), lit) for band in bands])
+    return _passed(lens, wavelength_nm, scattered)
 
 
 # --- a baffle ---------------------------------------------------------------------------------------------------

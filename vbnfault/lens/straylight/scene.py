@@ -13,6 +13,10 @@ Sources out of the field are in coarse renders around the first one (`surroundin
 as the one before and without what that one shows, and far bodies beside the scene (`PointSources`).
 
 The Sun's disc is not part of the scene; `total` computes its straylight.
+
+Within a channel of the sensor, the reflectance of a source is taken as linear in wavelength (`in_channels`). So the
+light of a channel is that of two spectra, which rise and fall linearly over it, and each is integrated with the
+lens's coatings at every nanometre, as for the Sun.
 """
 
 from __future__ import annotations
@@ -25,6 +29,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core import spectra
+from ...core.spectra import Bands
 from ..interface import Lens
 from ..paraxial import paraxial_properties
 from ..prescription import Prescription
@@ -191,8 +197,10 @@ class SceneInLens:
     ----------
     lens
         The lens at its final size.
-    nodes_nm
-        float64[band].
+    bands
+        Bands in which the light is computed.
+    of_nodes
+        float64[band, node]: converts the radiance at its nodes to these bands, as `in_channels` returns it.
     sensor
         The sensor.
     render
@@ -202,7 +210,7 @@ class SceneInLens:
     settings
         State of the lens.
     passed
-        float64[band]: transmittance of the path that forms the image, as `DirectPath.transmittance`.
+        float64[n]: transmittance of the path that forms the image, as `DirectPath.transmittance`.
     around
         Grids of the renders around that of the scene.
     rings
@@ -212,7 +220,8 @@ class SceneInLens:
     """
 
     lens: Prescription
-    nodes_nm: F64
+    bands: Bands
+    of_nodes: F64
     sensor: SensorGrid
     render: RenderGrid
     image: Lens
@@ -230,17 +239,20 @@ class SceneInLens:
         Parameters
         ----------
         radiance
-            float32[band, y, x] on the grid of the render, without the Sun's disc.
+            float32[node, y, x] on the grid of the render, without the Sun's disc.
         weights
             float64[channel, band], with which the bands are added.
         around
             The same of the renders around it, on the grids `around`.
         points
-            `PointSources` and their irradiances, float32[band, source].
+            `PointSources` and their irradiances, float32[node, source].
         """
         renders = zip((self.render, *self.around), (radiance, *around), strict=True)
         sources: list[Sources] = [(render, render.irradiance(array)) for render, array in renders]
         sources += points
+        # einsum, because the bits of BLAS may depend on the number of threads
+        of_nodes = self.of_nodes.astype(np.float32)
+        sources = [(grid, np.einsum("bn,ns->bs", of_nodes, irradiance)) for grid, irradiance in sources]
         return SceneStraylight(
             ghosts=self.ghosts(sources, weights),
             glare=self.glare(sources, weights),
@@ -258,7 +270,7 @@ class SceneInLens:
         if not response.table.any():
             return np.zeros((len(weights), *self.sensor.shape), dtype=np.float32)
         light = sum(self._places(grid).polar @ irradiance.T for grid, irradiance in sources)
-        light = light.reshape(len(cells.slopes), cells.azimuths, len(self.nodes_nm))
+        light = light.reshape(len(cells.slopes), cells.azimuths, len(weights.T))
         # rays of ghosts meet the hood themselves
         light *= lit_fraction(self.lens, self.settings.baffle, np.array(cells.slopes)).astype(np.float32)[
             :, None, None
@@ -293,12 +305,11 @@ class SceneInLens:
             finer = _STEPS_OF_SPIKES if self.lens.surfaces[self.lens.stop].blades else 1
             field = float(np.hypot(*self.render.half))
             directions = _directions(grid, field, self.sensor, self.image, self._efl_px, finer)
-            kernels, mix = _wings(
-                self.lens, tuple(self.nodes_nm.tolist()), grid.block / grid.focal_px, directions, self.sensor
-            )
+            behind = self.bands.behind(self.passed)
+            kernels, mix = _wings(self.lens, behind, grid.block / grid.focal_px, directions, self.sensor)
             # the Sun's starburst scales with the beam across its direction, too
             kept = (self._lit(places.slope) / np.hypot(1, places.slope)).astype(np.float32)
-            gains = np.einsum("cb,b,bk->kcb", weights, self.passed, mix).astype(np.float32)
+            gains = np.einsum("cb,b,bk->kcb", weights, self.bands.mean(self.passed), mix).astype(np.float32)
             terms = [
                 (np.einsum("cb,bs->cs", gain, irradiance) * kept, kernel)
                 for gain, kernel in zip(gains, kernels, strict=True)
@@ -309,13 +320,13 @@ class SceneInLens:
     def veil(self, sources: Sequence[Sources], weights: F64) -> F32:
         """Return what mount, barrel and edges scatter; arguments and result as those of `ghosts`."""
         properties = paraxial_properties(self.lens)
-        entering = np.zeros(len(self.nodes_nm))
+        entering = np.zeros(len(weights.T))
         for grid, irradiance in sources:
             slope = self._places(grid).slope
             cosine = (self._lit(slope) / np.hypot(1, slope)).astype(np.float32)
             entering += np.einsum("bs,s->b", irradiance, cosine, dtype=np.float64)
         entering *= np.pi / 4 * properties.entrance_pupil_diameter_mm**2
-        flux = np.einsum("cb,b->c", weights, entering * self.passed * self.settings.veil_fraction)
+        flux = np.einsum("cb,b->c", weights, entering * self.bands.mean(self.passed) * self.settings.veil_fraction)
         per_mm2 = cos4_map(self.sensor.shape, self._efl_px) * np.float32(1 / (np.pi * properties.efl_mm**2))
         return np.asarray(per_mm2 * flux.astype(np.float32)[:, None, None])
 
@@ -323,9 +334,7 @@ class SceneInLens:
     def response(self) -> GhostResponse:
         """Return the ghosts of every source; they are cached for lens, sensor and coating loss."""
         settings = self.settings
-        return ghost_response(
-            self.lens, tuple(self.nodes_nm.tolist()), self._cells, settings.ghosts, settings.coating_loss
-        )
+        return ghost_response(self.lens, self.bands, self._cells, settings.ghosts, settings.coating_loss)
 
     @property
     def reach(self) -> float:
@@ -364,15 +373,17 @@ class SceneInLens:
     def _kernel(self, grid: RenderGrid | PointSources) -> SeparatedKernel:
         """Return the glare of sources on a grid, with all losses but those at the baffle."""
         slope = np.tan(np.linspace(0, np.arctan(self._places(grid).slope.max()), _ANGLES))
-        cleanliness = self.settings.cleanliness
-        offset, kernels = glare_kernels(self.lens, slope, wavelength_nm=self.nodes_nm, cleanliness=cleanliness)
-        gain = self.passed / axial_transmittance(self.lens, self.nodes_nm) * self._kept_of_single
+        cleanliness, bands = self.settings.cleanliness, self.bands
+        offset, kernels = glare_kernels(self.lens, slope, wavelength_nm=bands, cleanliness=cleanliness)
+        own = bands.mean(axial_transmittance(self.lens, bands.wavelength_nm))
+        gain = bands.mean(self.passed) / own * self._kept_of_single
         return separated(kernels * gain[:, None, None], slope, offset)
 
     @property
     def _kept_of_single(self) -> F64:
         """Return the factor of `VeilingGlare.kept_of_single`, float64[band]."""
-        fraction = scattered_fraction(self.lens, self.nodes_nm, cleanliness=self.settings.cleanliness)
+        bands = self.bands.behind(self.passed)
+        fraction = scattered_fraction(self.lens, bands, cleanliness=self.settings.cleanliness)
         single = -np.log1p(-fraction)
         return np.where(single > 0, fraction / np.where(single > 0, single, 1), 1.0)
 
@@ -380,6 +391,29 @@ class SceneInLens:
         """Return the fraction of the lens's entrance that sources light through the baffle and past the hood."""
         past_baffle = lit_fraction(self.lens, self.settings.baffle, slope)
         return np.minimum(past_baffle, hood_transmission(self.lens, slope))
+
+
+def in_channels(rates: F64, nodes_nm: F64) -> tuple[Bands, F64, F64]:
+    """Return two bands for each channel, and the matrices that convert to them and from them.
+
+    The matrices are float64[band, node] and float64[channel, band].
+
+    In the first band of a channel the weight of its sunlight falls linearly over the wavelengths that it senses, in
+    the second it rises. The ratio of a source to sunlight, linear between the nodes, is fitted by a line with the
+    weights of the channel. The values include the `rates`, float64[channel, n].
+    """
+    nm = spectra.fine_nodes_nm(nodes_nm)
+    ratio = spectra.hat_weights(nodes_nm, nm) / spectra.solar_band_irradiance_W_m2_nm(nodes_nm, 1.0)[:, None]
+    lines, values = [], []
+    for spectrum in rates * spectra.solar_irradiance_W_m2_nm(nm):
+        seen = nm[spectrum > 0] if spectrum.any() else nm
+        ends = np.array([seen[0], max(seen[-1], seen[0] + 1)])
+        line = spectra.hat_weights(ends, nm) * spectrum
+        hats = spectra.hat_weights(ends, nm)
+        at_ends = np.linalg.lstsq((hats * np.sqrt(spectrum)).T, (ratio * np.sqrt(spectrum)).T)[0]
+        lines.append(line)
+        values.append(np.trapezoid(line, nm, axis=1)[:, None] * at_ends)
+    return Bands.of(nm, np.concatenate(lines)), np.concatenate(values), np.repeat(np.eye(len(rates)), 2, axis=1)
 
 
 def lit_fraction(lens: Prescription, baffle: Baffle, slope: F64) -> F64:
@@ -453,11 +487,10 @@ def _places(
 
 @lru_cache(maxsize=4)
 def _wings(
-    lens: Prescription, nodes_nm: tuple[float, ...], width_rad: float, directions: DirectionGrid, sensor: SensorGrid
+    lens: Prescription, bands: Bands, width_rad: float, directions: DirectionGrid, sensor: SensorGrid
 ) -> tuple[tuple[F32, ...], F64]:
     """Return `wing_spectra` of sources of this width; they are cached for the camera."""
-    nodes = np.array(nodes_nm)
-    return wing_spectra(starburst_of_source(lens, nodes, width_rad), nodes, directions, sensor)
+    return wing_spectra(starburst_of_source(lens, bands, width_rad), bands, directions, sensor)
 
 
 @lru_cache(maxsize=8)

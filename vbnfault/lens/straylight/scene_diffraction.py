@@ -15,6 +15,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.spectra import Bands
 from ..paraxial import paraxial_properties
 from ..point_spread import REACH_PX
 from ..prescription import Prescription
@@ -34,14 +35,14 @@ _LEAST_AIRY = 3.0  # smallest radius of a disc that `Starburst` allows, in wavel
 _BLUR = 1 / 3
 
 
-def starburst_of_source(lens: Prescription, nodes_nm: F64, width_rad: float) -> Starburst:
+def starburst_of_source(lens: Prescription, bands: Bands, width_rad: float) -> Starburst:
     """Return the starburst of a source as wide as a pixel of a render; it is cached with its tables."""
-    airy_rad = float(nodes_nm.max()) * 1e-6 / paraxial_properties(lens).entrance_pupil_diameter_mm
+    airy_rad = bands.nm[-1] * 1e-6 / paraxial_properties(lens).entrance_pupil_diameter_mm
     return _starburst(lens, max(_RADIUS_OF_SQUARE * width_rad, _LEAST_AIRY * airy_rad))
 
 
 def wing_spectra(
-    burst: Starburst, nodes_nm: F64, grid: DirectionGrid, sensor: SensorGrid
+    burst: Starburst, bands: Bands, grid: DirectionGrid, sensor: SensorGrid
 ) -> tuple[tuple[F32, ...], F64]:
     """Return the Fourier transforms of kernels on a grid of directions, and their weights in each band.
 
@@ -54,11 +55,7 @@ def wing_spectra(
     size, count = grid.padded, grid.count
     offset = (np.arange(size) + size // 2) % size - size // 2
     node = np.where(np.abs(offset) < count, offset, 0)
-    frame = StarburstFrame(
-        sun_xy_mm=(0.0, 0.0),
-        wavelength_nm=nodes_nm,
-        sensor=sensor,
-    )
+    frame = StarburstFrame(sun_xy_mm=(0.0, 0.0), bands=bands, sensor=sensor)
     u = (node * grid.step).astype(np.float32)
     layers, mix = burst.layers_at(frame, u[None, :], u[:, None])
     away = np.hypot(node[:, None], node)
@@ -69,10 +66,10 @@ def wing_spectra(
     return tuple(np.ascontiguousarray(rfft2(_sharpened(layer * gain)).real) for layer in layers), mix
 
 
-def wing_fraction(burst: Starburst, nodes_nm: F64, sensor: SensorGrid) -> F64:
+def wing_fraction(burst: Starburst, bands: Bands, sensor: SensorGrid) -> F64:
     """Return the fraction of the light that passes the stop and is in the wings, float64[band]."""
     pitch_mm = sensor.pitch_mm
-    frame = StarburstFrame(sun_xy_mm=(0.0, 0.0), wavelength_nm=nodes_nm, sensor=sensor)
+    frame = StarburstFrame(sun_xy_mm=(0.0, 0.0), bands=bands, sensor=sensor)
     flux_mm2 = burst.flux_by_distance(frame, lambda sine: _faded_in(sine * burst.efl_mm / pitch_mm))
     return flux_mm2 / (np.pi * burst.pupil_radius_mm**2)
 

@@ -123,7 +123,7 @@ class DirectPath:
     Attributes
     ----------
     transmittance
-        float64[band], T of the path.
+        float64[n], T of the path at `spectra.Bands.wavelength_nm`.
     admitted_mm2
         A cos θ: the area of the beam that passes, across the Sun's direction.
     beam_fraction

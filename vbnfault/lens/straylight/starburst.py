@@ -47,6 +47,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.errors import InputError
+from ...core.spectra import Bands
 from ..paraxial import paraxial_properties
 from ..prescription import Prescription, Surface
 from ..thin import beyond_frame
@@ -67,8 +68,6 @@ _WING_SUNS = 12.0  # distance from an edge's normal, in radii of the disc, beyon
 _WING_STEP, _WING_POINTS, _WING_COLUMNS = 0.05, 1200, 241
 _STRAIGHT_PER_MM = 1e-9
 _LEAST_CORNER_RAD = 1e-3
-_LONE_BAND_NM = 150.0  # half width of a single band, as in vbnfault.core.spectra
-_HAT_POINTS = 17  # wavelengths on each side of a band's node
 _HANKEL_POINTS = 4096
 _DISC_POINTS = 32
 _GRAIN_POINTS = 2048
@@ -182,33 +181,22 @@ def _block(open_: F64, x: NDArray[Any], y: NDArray[Any], defects: StopDefects, p
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StarburstFrame:
-    """Describe where and in which bands a starburst is computed. Raises InputError if the nodes do not rise.
+    """Describe where and in which bands a starburst is computed.
 
     Attributes
     ----------
     sun_xy_mm
         Position of the image of the Sun's centre, from the middle of the frame. As in the lens, x points to the
         right and y points down. The position may lie outside the frame.
-    wavelength_nm
-        Nodes of the bands, float64[band], rising. The weight of a band is a triangle that ends at its neighbours.
+    bands
+        Bands of the light that passes the stop.
     sensor
         Size of the frame and pitch of its pixels.
-    half_width_nm
-        Half width of the triangles. With None, each triangle ends at the neighbouring nodes, and a single band has
-        constant weight over 150 nm on each side. With 0, each band is monochromatic.
     """
 
     sun_xy_mm: tuple[float, float]
-    wavelength_nm: F64
+    bands: Bands
     sensor: SensorGrid
-    half_width_nm: float | None = None
-
-    def __post_init__(self) -> None:
-        """Convert the nodes to a float64 array and check them."""
-        nodes = np.atleast_1d(np.asarray(self.wavelength_nm, dtype=np.float64))
-        if not (nodes > 0).all() or not (np.diff(nodes) > 0).all():
-            raise InputError(f"wavelength_nm = {nodes.tolist()}: must be above 0 and rise")
-        object.__setattr__(self, "wavelength_nm", nodes)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -350,10 +338,10 @@ class Starburst:
         float32[band, table].
         """
         pitch_mm = frame.sensor.pitch_mm
-        key = (tuple(frame.wavelength_nm), pitch_mm, frame.half_width_nm)
+        key = frame.bands, pitch_mm
         tables = self._memo.get(key)
         if tables is None:
-            bands = _hats(frame.wavelength_nm, frame.half_width_nm)
+            bands = [(frame.bands.wavelength_nm, weight) for weight in frame.bands.weights]
             tables = _fewest(_polar(self, self._sines(pitch_mm), bands, pitch_mm / self.efl_mm / np.sqrt(12)))
             self._memo.clear()
             self._memo[key] = tables
@@ -437,26 +425,6 @@ def _edge(stop: Surface, pupil_radius_mm: float) -> _Edge:
     )
 
 
-def _hats(nodes_nm: F64, half_width_nm: float | None) -> tuple[tuple[F64, F64], ...]:
-    """Return the wavelengths that represent each band, and the weights of these wavelengths, whose sum is 1."""
-    if half_width_nm is None and len(nodes_nm) == 1:
-        nm = np.linspace(nodes_nm[0] - _LONE_BAND_NM, nodes_nm[0] + _LONE_BAND_NM, 2 * _HAT_POINTS)
-        return ((nm, np.full(len(nm), 1 / len(nm))),)
-    if half_width_nm == 0:
-        return tuple((np.array([node]), np.ones(1)) for node in nodes_nm)
-    bands = []
-    for k, node in enumerate(nodes_nm):
-        if half_width_nm is None:
-            low, high = nodes_nm[max(k - 1, 0)], nodes_nm[min(k + 1, len(nodes_nm) - 1)]
-        else:
-            low, high = node - half_width_nm, node + half_width_nm
-        part = (np.arange(_HAT_POINTS) + 0.5) / _HAT_POINTS
-        nm = np.concatenate([low + (node - low) * part, high + (node - high) * part])
-        weight = np.concatenate([(node - low) * part, (high - node) * part])
-        bands.append((nm, weight / weight.sum()))
-    return tuple(bands)
-
-
 def _polar(burst: Starburst, sine: F64, bands: Sequence[tuple[F64, F64]], pixel_rad: float) -> F32:
     """Return (θ² - σ²) |A|² / λ², float32[band, radius, angle + 1]; `pixel_rad` is the rms width of a pixel."""
     edge = _edge(burst.stop, burst.pupil_radius_mm)
@@ -476,7 +444,8 @@ def _polar(burst: Starburst, sine: F64, bands: Sequence[tuple[F64, F64]], pixel_
     if burst.stop.blades and opening > _LEAST_CORNER_RAD:
         # apart from k⁴, the wavelength changes only the width of Fresnel's integral, so three nodes are enough
         if edge.end_curvature_per_mm > _STRAIGHT_PER_MM:
-            nodes = np.linspace(mm[0], mm[-1], min(len(mm), 3))
+            alike = np.ptp(mm) < 1e-6 * mm.max()
+            nodes = mm[:1] if alike else np.linspace(mm.min(), mm.max(), min(len(mm), 3))
         powers = _corner(burst, sine, opening, edge.end_curvature_per_mm, nodes, pixel_rad)
         turn = np.exp(-1j * order[repeats] * first_corner) * _blur(burst.angles)[repeats]
         corners = np.fft.rfft(powers, norm="forward")[:, :, repeats] * edge.count * turn

@@ -15,6 +15,9 @@ mount, barrel and edges scatter, and all of it returns as a veil. Diffraction an
 image: within some pixels the point spread contains the diffraction, and neighbouring light outshines the ghosts.
 `scene` computes both farther away; what the stop then diffracts beyond the point spread, the image loses too.
 
+Spectrum. All results are means over bands (`spectra.Bands`), such as those of a sensor's channels in sunlight.
+Coatings, glasses and bands count at every nanometre, geometry and scatter are linear between a few wavelengths.
+
 Veil. The walls behind the lens, lit by the transmitted light, act as a small Lambertian source on the axis at a
 focal length from the sensor (assumed):
 
@@ -37,12 +40,13 @@ from numpy.typing import NDArray
 
 from ...core import buffers
 from ...core.memory import release_unused
+from ...core.spectra import Bands
 from ..paraxial import paraxial_properties
 from ..prescription import Prescription
 from ..thin import cos4_map
 from .irradiance import FlareModel, flare_model
 from .paraxial import axial_transmittance
-from .pyramid import Pyramid, bands_mixed, in_layers
+from .pyramid import Pyramid, in_layers, scaled
 from .scatter import (
     Cleanliness,
     VeilingGlare,
@@ -88,12 +92,12 @@ class Straylight:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Burst:
-    """Hold a starburst, summed over the bands.
+    """Hold a starburst.
 
     Attributes
     ----------
     planes
-        Sum of the bands with the weights of `SunlightInLens.in_channels`, float32[channel, y, x], read-only.
+        Irradiance times the rates of `SunlightInLens.in_channels`, float32[band, y, x], read-only.
     flux_mm2, beyond_mm2
         float64[band]: flux inside and outside the frame, over the Sun's irradiance at the entrance.
     """
@@ -110,8 +114,7 @@ class ClearLight:
     Attributes
     ----------
     planes
-        Sum of both and of the bands with the weights of `SunlightInLens.in_channels`, float32[channel, y, x],
-        read-only.
+        Sum of both times the rates of `SunlightInLens.in_channels`, float32[band, y, x], read-only.
     ghosts_mm2, starburst_mm2
         float64[band]: flux of each in the frame, over the Sun's irradiance at the entrance.
     beyond_mm2
@@ -154,6 +157,8 @@ class SunlightInLens:
     ----------
     own, passed
         float64[band]: transmittance of the lens along its axis, and of the path of the direct image.
+    behind
+        The bands of the light that has taken this path.
     admitted_mm2, beam_fraction
         As in `DirectPath`.
     past_baffle, past_hood
@@ -163,12 +168,13 @@ class SunlightInLens:
     """
 
     lens: Prescription
-    nodes_nm: F64
+    bands: Bands
     sensor: SensorGrid
     sun: SunSource
     settings: StraylightSettings
     own: F64
     passed: F64
+    behind: Bands
     admitted_mm2: float
     beam_fraction: float
     past_baffle: float
@@ -180,7 +186,7 @@ class SunlightInLens:
         cls,
         lens: Prescription,
         *,
-        wavelength_nm: F64,
+        bands: Bands,
         sensor: SensorGrid,
         sun: SunSource,
         settings: StraylightSettings = DEFAULT,
@@ -192,8 +198,8 @@ class SunlightInLens:
         ----------
         lens
             At its final size.
-        wavelength_nm
-            float64[band], nodes of the bands.
+        bands
+            Bands of the results, in the light before the lens.
         path
             Path that forms the direct image; default: the lens along its axis, with its paraxial entrance pupil.
 
@@ -202,19 +208,19 @@ class SunlightInLens:
         InputError
             A value is out of range.
         """
-        nodes = np.atleast_1d(np.asarray(wavelength_nm, dtype=np.float64))
         diameter_mm = paraxial_properties(lens).entrance_pupil_diameter_mm
         pupil_mm2 = float(np.pi / 4 * diameter_mm**2 * np.cos(np.radians(sun.angle_deg)))
-        own = axial_transmittance(lens, nodes)
+        own = axial_transmittance(lens, bands.wavelength_nm)
         path = DirectPath(transmittance=own, admitted_mm2=pupil_mm2) if path is None else path
         return cls(
             lens=lens,
-            nodes_nm=nodes,
+            bands=bands,
             sensor=sensor,
             sun=sun,
             settings=settings,
-            own=own,
-            passed=np.broadcast_to(path.transmittance, own.shape),
+            own=bands.mean(own),
+            passed=bands.mean(path.transmittance),
+            behind=bands.behind(path.transmittance),
             admitted_mm2=path.admitted_mm2,
             beam_fraction=path.beam_fraction,
             past_baffle=_lit_fraction(lens, settings.baffle, sun.angle_deg),
@@ -241,19 +247,18 @@ class SunlightInLens:
         )
 
     def in_channels(
-        self, weights: F64, clear: ClearLight, samples: GlareSamples, exposure_s: float = 1.0
+        self, rates: F64, clear: ClearLight, samples: GlareSamples, exposure_s: float = 1.0
     ) -> tuple[F32, F64]:
-        """Return the sum of all straylight and of the bands, float32[channel, y, x], and the kept direct fraction.
+        """Return all straylight in the channels of a sensor, float32[band, y, x], and the kept direct fraction.
 
-        The values are those of `total`, but for rounding. Planes of all bands would take 34 MB for 1024 pixels and
-        8 bands, and several times as long.
+        The values are those of `total`, but for rounding.
 
         Parameters
         ----------
-        weights
-            float64[channel, band]: what a second of the Sun's irradiance gives in each channel.
+        rates
+            float64[band]: what a second of the Sun's irradiance gives in the channel of each band.
         clear
-            Result of `clear_light` for these weights.
+            Result of `clear_light` for these rates.
         samples
             Result of `glare_samples`.
         exposure_s
@@ -264,43 +269,41 @@ class SunlightInLens:
         entering, per_mm2 = self._veil_on_axis()
         # on the sensor glare and veil have the same factor, cos⁴
         scattered = table * gain[:, None].astype(np.float32) + (entering * per_mm2)[:, None].astype(np.float32)
-        planes = samples.mixed(scattered, weights * exposure_s, (clear.planes, exposure_s))
+        planes = samples.planes(scattered * rates[:, None] * exposure_s, (clear.planes, exposure_s))
         taken = (samples.flux_mm2(table) + glare_beyond) * gain + entering
         taken = taken + clear.starburst_mm2 + clear.beyond_mm2
         return planes, self.direct_fraction(clear.ghosts_mm2, taken)
 
     @property
     def clear_key(self) -> tuple[Any, ...]:
-        """Return all that `clear_light` depends on beside the weights."""
+        """Return all that `clear_light` depends on beside the rates."""
         return *self.ghost_key, self.past_baffle, *self.burst_key
 
-    def clear_light(self, weights: F64, burst: Burst | None = None) -> ClearLight:
+    def clear_light(self, rates: F64, burst: Burst | None = None) -> ClearLight:
         """Return ghosts and starburst, which roughness, dust and veil do not change.
 
-        `weights` are as in `in_channels`. `burst` is the result of `burst` for the same weights, if it is known.
+        `rates` are as in `in_channels`. `burst` is the result of `burst` for the same rates, if it is known.
         """
-        frame_bytes = 4 * len(self.nodes_nm) * self.sensor.shape[0] * self.sensor.shape[1]
+        frame_bytes = 4 * len(self.bands.nodes_nm) * self.sensor.shape[0] * self.sensor.shape[1]
         release_unused(9 * frame_bytes)  # the sums of all levels take 90 MB, the cells 200 MB
-        ghosts = self._ghosts()
+        planes = self._ghosts()
         # what the drawing took, before the other parts and the signals of the sample's faults take as much
         release_unused(9 * frame_bytes)
-        ghosts_mm2 = _flux_mm2(ghosts, self.sensor.pitch_mm)
-        planes = bands_mixed(ghosts, weights)
-        del ghosts  # before the starburst takes as much
-        burst = self.burst(weights) if burst is None else burst
+        ghosts_mm2 = _flux_mm2(planes, self.sensor.pitch_mm)
+        scaled(planes, rates)
+        burst = self.burst(rates) if burst is None else burst
         planes += burst.planes
         planes.flags.writeable = False
         return ClearLight(
             planes=planes, ghosts_mm2=ghosts_mm2, starburst_mm2=burst.flux_mm2, beyond_mm2=burst.beyond_mm2
         )
 
-    def burst(self, weights: F64) -> Burst:
-        """Return the starburst, summed over the bands with weights as in `in_channels`."""
+    def burst(self, rates: F64) -> Burst:
+        """Return the starburst, times rates as in `in_channels`."""
         image, beyond = self.starburst()
         flux = _flux_mm2(image, self.sensor.pitch_mm)
-        planes = bands_mixed(image, weights)
-        planes.flags.writeable = False
-        return Burst(planes=planes, flux_mm2=flux, beyond_mm2=beyond)
+        scaled(image, rates).flags.writeable = False
+        return Burst(planes=image, flux_mm2=flux, beyond_mm2=beyond)
 
     @property
     def lit(self) -> float:
@@ -322,11 +325,6 @@ class SunlightInLens:
         """Return the position of the direct image."""
         return self.sun.xy_mm(self._efl_mm)
 
-    @property
-    def _nodes(self) -> tuple[float, ...]:
-        """Return the nodes in the form that caches need."""
-        return tuple(self.nodes_nm.tolist())
-
     # --- ghosts
 
     @property
@@ -334,13 +332,13 @@ class SunlightInLens:
         """Return all that `ghost_levels` depends on."""
         sun, settings = self.sun, self.settings
         return (
-            *(self.lens, self._nodes, self.sensor, settings.ghosts, settings.coating_loss),
+            *(self.lens, self.bands, self.sensor, settings.ghosts, settings.coating_loss),
             *(sun.angle_deg, sun.azimuth_deg, sun.radius_rad),
         )
 
     def ghost_model(self) -> FlareModel:
         """Return the model of the ghosts."""
-        model = flare_model(self.lens, self._nodes, self.sensor, self.sun.radius_rad, self.settings.ghosts)
+        model = flare_model(self.lens, self.bands, self.sensor, self.sun.radius_rad, self.settings.ghosts)
         return model.worn(self.settings.coating_loss)
 
     def _ghosts(self) -> F32:
@@ -362,12 +360,12 @@ class SunlightInLens:
         stop, optics = lens.surfaces[lens.stop], paraxial_properties(lens)
         outline = stop.semi_diameter_mm, stop.blades, stop.blade_rounding, stop.rotation_deg
         pupil = optics.efl_mm, optics.entrance_pupil_diameter_mm
-        return *outline, *pupil, self.sun.radius_rad, self._sun_xy_mm, self._nodes, self.sensor
+        return *outline, *pupil, self.sun.radius_rad, self._sun_xy_mm, self.behind, self.sensor
 
     @property
     def _starburst_frame(self) -> StarburstFrame:
         """Return where and in which bands the starburst is computed."""
-        return StarburstFrame(sun_xy_mm=self._sun_xy_mm, wavelength_nm=self.nodes_nm, sensor=self.sensor)
+        return StarburstFrame(sun_xy_mm=self._sun_xy_mm, bands=self.behind, sensor=self.sensor)
 
     def starburst_layers(self) -> Diffraction:
         """Return the diffracted light of a lens with a transmission of 1.
@@ -392,7 +390,7 @@ class SunlightInLens:
     @property
     def burst_key(self) -> tuple[Any, ...]:
         """Return all that `starburst` depends on."""
-        where = self.lens, self._nodes, self.sensor, self.sun.radius_rad, self._sun_xy_mm
+        where = self.lens, self.behind, self.sensor, self.sun.radius_rad, self._sun_xy_mm
         return *where, tuple(self.passed.tolist()), self.lit, self.beam_fraction, self.pupil_mm2
 
     def starburst(self) -> tuple[F32, F64]:
@@ -425,7 +423,7 @@ class SunlightInLens:
         stop = self.lens.stop
         surfaces[stop] = replace(surfaces[stop], blades=0, blade_rounding=0.0, rotation_deg=0.0)
         lens = replace(self.lens, surfaces=tuple(surfaces), sensor_reflectance=0.0)
-        return lens, self._nodes, self.sensor, self.sun.angle_deg, self._sun_xy_mm, self.settings.cleanliness
+        return lens, self.bands, self.sensor, self.sun.angle_deg, self._sun_xy_mm, self.settings.cleanliness
 
     def glare_light(self) -> tuple[F32, F64, F64]:
         """Return the irradiance at the steps of `glare_samples`, its flux beyond the frame, and its kept fraction.
@@ -460,7 +458,7 @@ class SunlightInLens:
         return veiling_glare(
             self.lens,
             sun_deg=self.sun.angle_deg,
-            wavelength_nm=self.nodes_nm,
+            wavelength_nm=self.bands,
             cleanliness=self.settings.cleanliness,
         )
 
@@ -507,9 +505,9 @@ class Diffraction:
     flux_mm2: F64
     beyond_mm2: F64
 
-    def mixed(self, weights: F64) -> F32:
-        """Return sums over the bands with weights float64[channel, band], float32[channel, y, x]."""
-        return np.asarray(np.tensordot((weights @ self.mix).astype(np.float32), self.layers, 1))
+    def planes(self, rates: F64) -> F32:
+        """Return the images of the bands times rates float64[band], float32[band, y, x]."""
+        return np.asarray(np.tensordot((rates[:, None] * self.mix).astype(np.float32), self.layers, 1))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -535,12 +533,12 @@ class GlareSamples:
         # not a product of BLAS, whose bits may depend on the number of threads
         return np.einsum("bs,s->b", table[:, : len(self.area_mm2)].astype(np.float64), self.area_mm2)
 
-    def mixed(self, table: F32, weights: F64, more: tuple[F32, float] | None = None) -> F32:
-        """Return sums over the bands with weights float64[channel, band], float32[channel, y, x].
+    def planes(self, table: NDArray[np.floating], more: tuple[F32, float] | None = None) -> F32:
+        """Return the images of a table [band, step], float32[band, y, x].
 
         `more` are planes of the shape of the result, and a factor; their product is added.
         """
-        channels = bands_mixed(table[:, None], weights)[:, 0]
+        channels = table.astype(np.float32)
         index = self.index.astype(np.intp)  # numpy would convert it for every channel
         out = buffers.empty((len(channels), *index.shape))
 
@@ -555,14 +553,12 @@ class GlareSamples:
         return out
 
 
-def scene_veil_fraction(
-    lens: Prescription, wavelength_nm: F64, *, cleanliness: Cleanliness, veil_fraction: float
-) -> F64:
+def scene_veil_fraction(lens: Prescription, bands: Bands, *, cleanliness: Cleanliness, veil_fraction: float) -> F64:
     """Return the fraction of an extended scene's light that leaves its image for the veil, float64[band].
 
     Surfaces scatter the first part of it; mount, barrel and edges scatter `veil_fraction` of the rest.
     """
-    scattered = scattered_fraction(lens, wavelength_nm, cleanliness=cleanliness)
+    scattered = scattered_fraction(lens, bands, cleanliness=cleanliness)
     return np.asarray(1 - (1 - scattered) * (1 - veil_fraction))
 
 

@@ -1,0 +1,217 @@
+"""Coatings, filters and efficiencies count at every nanometre, whatever the number of bands of a render."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pytest
+import tmm
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+from test_faults_kit import make_context
+
+from vbnfault.camera import Camera
+from vbnfault.core import llvm, spectra
+from vbnfault.core.errors import VbnfaultError
+from vbnfault.core.quantities import Radiance
+from vbnfault.core.spectra import Bands
+from vbnfault.detector import ThreeColourDetector
+from vbnfault.detector.efficiency import Curve, QuantumEfficiency
+from vbnfault.faults import FaultContext, registry
+from vbnfault.lens import Prescription, parse_lens, scaled_to_field
+from vbnfault.lens.coating import Layer
+from vbnfault.lens.imaging import RealLens
+from vbnfault.lens.straylight.paraxial import pairs, paraxial_ghosts
+from vbnfault.lens.straylight.scene import in_channels
+from vbnfault.lens.straylight.settings import SensorGrid
+
+try:
+    llvm.find()
+except VbnfaultError as error:
+    pytest.skip(f"no usable LLVM: {error}", allow_module_level=True)
+
+from vbnfault.lens.straylight.irradiance import FlareModel
+
+F64 = NDArray[np.float64]
+NM = np.linspace(400.0, 700.0, 301)
+SUN = spectra.solar_irradiance_W_m2_nm(NM)
+SIZE = 48
+# A mirror for green of quarter waves at 540 nm: reflects 94 % there, and a few per cent 80 nm away.
+STACK = tuple(Layer(n=n, thickness_nm=540.0 / 4 / n) for n in (2.35, 1.46) * 5)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Narrow(ThreeColourDetector):
+    """A sensor with a narrow red filter, whose edges are steep, and a plain one; blue has a slope."""
+
+    @property
+    def efficiency(self) -> QuantumEfficiency:
+        red = Curve(channel="R", wavelength_nm=(590.0, 591.0, 609.0, 610.0), value=(0.0, 0.4, 0.4, 0.0))
+        green = Curve(channel="G", wavelength_nm=(400.0, 700.0), value=(0.5, 0.5))
+        blue = Curve(channel="B", wavelength_nm=(400.0, 500.0), value=(0.6, 0.0))
+        return QuantumEfficiency(curves=(red, green, blue))
+
+
+def doublet() -> Prescription:
+    """A crown and a flint in air, whose stop lies behind them."""
+    rows: list[dict[str, Any]] = []
+    for radius, thickness, index in ((30.0, 4.0, 1.52), (-25.0, 0.5, 1.0), (-24.0, 1.5, 1.62), (-90.0, 2.0, 1.0)):
+        glass = {} if index == 1 else {"nd": index, "vd": 60.0 if index < 1.6 else 36.0}
+        rows.append({"radius_mm": radius, "thickness_mm": thickness, "diameter_mm": 16.0} | glass)
+    rows.append({"stop": True, "thickness_mm": 0.0, "diameter_mm": 9.0})
+    return scaled_to_field(parse_lens({"name": "doublet", "surface": rows}, source="test"), 30.0, SIZE * 0.02)
+
+
+def without_dispersion(lens: Prescription) -> Prescription:
+    media = [replace(s.medium, formula="cauchy", coefficients=(s.medium.nd, 0.0)) for s in lens.surfaces]
+    surfaces = tuple(replace(s, medium=medium) for s, medium in zip(lens.surfaces, media, strict=True))
+    return replace(lens, surfaces=surfaces)
+
+
+def with_films(lens: Prescription, films: tuple[Layer, ...]) -> Prescription:
+    """The films on every surface between glass and air, the first next to the air."""
+    index = lens.indices()
+    surfaces = tuple(
+        replace(s, coating=() if index[k] == index[k + 1] else films if index[k] == 1 else films[::-1])
+        for k, s in enumerate(lens.surfaces)
+    )
+    return replace(lens, surfaces=surfaces)
+
+
+def context(lens: Prescription, bands: int, detector: ThreeColourDetector) -> FaultContext:
+    real = RealLens(prescription=lens, width_px=SIZE, height_px=SIZE, pixel_pitch_um=20.0)
+    nodes = spectra.band_nodes_nm(400.0, 700.0, bands)
+    return replace(
+        make_context(SIZE, sun=(0.75 * SIZE, 0.4 * SIZE)),
+        camera=Camera(lens=real, detector=detector, exposure_s=1e-3),
+        wavelength_nm=nodes,
+        sun_irradiance_W_m2_nm=spectra.solar_band_irradiance_W_m2_nm(nodes, 1.0),
+        sun_angular_radius_rad=spectra.sun_angular_radius_rad(1.0),
+    )
+
+
+def detector(kind: type[ThreeColourDetector] = Narrow) -> ThreeColourDetector:
+    return kind(width_px=SIZE, height_px=SIZE, pixel_pitch_um=20.0)
+
+
+@pytest.mark.parametrize(
+    ("films", "model", "worn"), [("bbar", "traced", 0.4), ("stack", "traced", 0.0), ("stack", "paraxial", 0.0)]
+)
+def test_ghosts_of_every_channel_are_those_of_single_wavelengths(films: str, model: str, worn: float) -> None:
+    """The flux of all ghosts in each channel is within 1 % of an integral over lines, for any number of bands.
+
+    Bands as nodes were wrong by factors of 2 to 70 with two bands, and by a quarter to three quarters with eight.
+    """
+    lens = doublet().coated("bbar") if films == "bbar" else with_films(doublet(), STACK)
+    fault = registry()["straylight"][model]()
+    sums = []
+    for bands in (2, 3, 16):
+        where = replace(context(lens, bands, detector()), coating_loss=worn)
+        source = fault.sunlight(fault.draw_state(np.random.default_rng(0)), where)
+        sun = source.light.sun
+        flux = source.light.ghost_model().flux_mm2(sun.angle_deg, sun.azimuth_deg, pairs(lens))
+        sums.append(source.rates * sum(flux.values()))
+    assert sun.angle_deg > 5
+    sensor = SensorGrid(shape=(SIZE, SIZE), pitch_mm=0.02)
+    some = np.arange(400.0, 701.0, 6.0)
+    settings = source.light.settings.ghosts
+    lines = []
+    for nm in some:
+        made = FlareModel(lens, Bands.lines(nm), sensor, sun_radius_rad=sun.radius_rad, settings=settings).worn(
+            worn
+        )
+        lines.append(sum(made.flux_mm2(sun.angle_deg, sun.azimuth_deg, pairs(lens)).values())[0])
+    expected = np.trapezoid(detector().electron_rates(NM) * SUN * CubicSpline(some, lines)(NM), NM, axis=1)
+    for found in sums:
+        np.testing.assert_allclose(found, expected, rtol=0.01)
+
+
+def test_the_list_of_ghosts_has_the_means_of_both_coatings() -> None:
+    """Without dispersion a paraxial ghost has one geometry, and its light is that of the package tmm."""
+    bare = without_dispersion(doublet())
+    coated = with_films(bare, STACK)
+    sun = Bands.sunlight(400.0, 700.0)
+    line = Bands.lines(550.0)
+    plain = {g.pair: g.flux_fraction for g in paraxial_ghosts(bare, 4.0, bands=line)}
+    index = bare.indices()
+
+    def reflectance(n0: float, n1: float, nm: float, films: tuple[Layer, ...]) -> float:
+        indices = [n0, *(f.n for f in films), n1]
+        return float(tmm.coh_tmm("s", indices, [np.inf, *(f.thickness_nm for f in films), np.inf], 0, nm)["R"])
+
+    both = [np.zeros((4, len(NM))), np.zeros((4, len(NM)))]
+    for row in range(4):
+        films = STACK if index[row] == 1 else STACK[::-1]
+        both[0][row] = [reflectance(index[row], index[row + 1], nm, ()) for nm in NM]
+        both[1][row] = [reflectance(index[row], index[row + 1], nm, films) for nm in NM]
+
+    def light(r: F64, pair: tuple[int, int]) -> F64:
+        first, second = pair
+        passes = np.prod([(1 - r[k]) ** (3 if first < k < second else 1) for k in range(4)], axis=0)
+        return np.asarray(r[first] * r[second] * passes)
+
+    for ghost in paraxial_ghosts(coated, 4.0, bands=sun):
+        gain = sun.weights[0] @ light(both[1], ghost.pair) / light(both[0], ghost.pair)[0]
+        # both use the same rays; sums over the same nanometres
+        assert ghost.flux_fraction == pytest.approx(plain[ghost.pair] * gain, rel=1e-6)
+
+
+@pytest.mark.parametrize("bands", [2, 5, 32])
+def test_the_image_of_grey_ground_has_the_transmission_that_each_channel_sees(bands: int) -> None:
+    """∫ QE S T λ/hc dλ behind coatings that reflect one colour, and a filter of 20 nm, within 0.1 %."""
+    lens = with_films(doublet(), STACK)
+    camera = context(lens, bands, detector()).camera
+    nodes = spectra.band_nodes_nm(400.0, 700.0, bands)
+    grey = spectra.solar_band_irradiance_W_m2_nm(nodes, 1.0).astype(np.float32)
+    light = camera.lens.on_axis(Radiance(array=grey[:, None, None], wavelength_nm=nodes))
+    found = camera.detector.electrons_expected(light, 1.0).array[0, 0]
+    plain = camera.lens.axial_solid_angle_sr(nodes) / spectra.band_means(camera.lens.transmittance(NM), nodes)
+    sensed = camera.detector.electron_rates(NM) * SUN * camera.lens.transmittance(NM)
+    # the focal length changes with wavelength by less than 2 %, linearly between the bands
+    np.testing.assert_allclose(found, np.trapezoid(sensed, NM, axis=1) * plain.mean(), rtol=0.02)
+    np.testing.assert_allclose(
+        camera.electron_rate_weights(nodes) @ grey, np.trapezoid(sensed, NM, axis=1), rtol=1e-3
+    )
+    # the mean over the bands would be wrong by more than a tenth in the narrow channel
+    assert (
+        bands > 2
+        or abs(
+            camera.detector.electron_rate_weights(nodes)[0]
+            @ (grey * spectra.band_means(camera.lens.transmittance(NM), nodes))
+            / np.trapezoid(sensed, NM, axis=1)[0]
+            - 1
+        )
+        > 0.1
+    )
+
+
+def test_all_straylight_of_the_sun_is_the_same_for_any_number_of_bands() -> None:
+    """Ghosts, starburst, glare and veil, the fraction of the Sun and of the scene that is left."""
+    fault = registry()["straylight"]["traced"]()
+    made = []
+    for bands in (2, 32):
+        where = context(doublet().coated("v"), bands, detector(ThreeColourDetector))
+        params = fault.draw_state(np.random.default_rng(0))
+        made.append(fault._light(params, where))
+    few, many = made
+    assert few is not None
+    assert many is not None
+    for name in ("added", "direct_left", "scene_lost"):
+        np.testing.assert_allclose(getattr(few, name), getattr(many, name), rtol=1e-4)
+
+
+def test_a_scene_of_linear_reflectance_has_exact_bands_in_every_channel() -> None:
+    """The two bands of a channel hold ∫ rate S ρ f dλ for linear ρ and any filter f."""
+    rates = detector().electron_rates(NM)
+    for count in (2, 5, 16):
+        nodes = spectra.band_nodes_nm(400.0, 700.0, count)
+        bands, of_nodes, weights = in_channels(rates, nodes)
+        reflectance = 0.04 + 1e-4 * (NM - 400)
+        radiance = spectra.solar_band_irradiance_W_m2_nm(nodes, 1.0) * (0.04 + 1e-4 * (nodes - 400))
+        for filtered in (np.ones(len(NM)), np.exp(-(((NM - 595) / 4) ** 2))):
+            expected = np.trapezoid(rates * SUN * reflectance * filtered, NM, axis=1)
+            np.testing.assert_allclose(
+                weights @ (bands.mean(filtered) * (of_nodes @ radiance)), expected, rtol=1e-9
+            )
