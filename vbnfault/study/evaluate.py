@@ -470,7 +470,7 @@ class SceneEvaluator:
         ghosts = replace(light.settings.ghosts, model="traced")
         traced = replace(light, settings=replace(light.settings, ghosts=ghosts))
         levels = self.kept.once("ghosts", traced.ghost_key, traced.ghost_levels)
-        return self._channels("ghosts", levels.mixed, traced.ghost_key, weights)[0]
+        return self._channels("ghosts", lambda w: scaled(levels.irradiance, w), traced.ghost_key, weights)[0]
 
     def _channels(self, name: str, mixed: Callable[[F64], F32], key: Hashable, weights: F64) -> tuple[F32, F64]:
         """Return a part of straylight in electrons per second, float32[channel, y, x], and its sums by channel."""
