@@ -32,7 +32,7 @@ CHECKSUM = "attributes_sha256"
 # root attributes that the store needs for itself; all others are the user's
 OWN_ATTRIBUTES = ("store", "samples", "coordinates", CHECKSUM)
 
-_BRACKETS, _DEEPEST = re.compile(r'"(?:[^"\\]|\\.)*"|[][{}]'), 64
+_BRACKETS, _DEEPEST = re.compile(r'"[^"\\]*+(?:\\.[^"\\]*+)*+"|[][{}]'), 64
 _LITTLE_ENDIAN = {"name": "bytes", "configuration": {"endian": "little"}}
 
 
