@@ -151,6 +151,8 @@ def test_root_attributes_of_the_wrong_type_are_one_sentence(
         "scene": [],
         "scene.camera": 7,
         "scene.faults.straylight": "x",
+        "fault_models.straylight": [],
+        "scene.faults.straylight.model": {},
         "blocks": [],
         "versions": "x",
         "versions_of_samples": [7],

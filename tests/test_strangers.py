@@ -282,9 +282,9 @@ def test_a_split_that_is_a_path_is_damage(
     described_store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     store = st.open_store(shutil.copytree(described_store, tmp_path / "s.zarr"))
-    text = np.array([str(tmp_path / "pwned"), "train"], dtype=object)
-    store.file("split", 1).write_bytes(layout.encode_values(text))
-    for name in ("png", "yolo", "webdataset"):
+    for name, split in (("png", "/pwned"), ("yolo", "../pwned"), ("webdataset", "other"), ("exr", "")):
+        text = np.array([split and f"{tmp_path}{split}", "train"], dtype=object)
+        store.file("split", 1).write_bytes(layout.encode_values(text))
         out = tmp_path / name
         assert run(monkeypatch, "export", store.path, "--format", name, "--out", out) == 1
         assert "a split is none of train, val, test" in said(capsys)

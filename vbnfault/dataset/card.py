@@ -173,7 +173,7 @@ def _provenance(attributes: Mapping[str, Any]) -> Iterator[list[str]]:
     tables = {name: getattr(packaged, name, None) or {} for name in ("body", "orbit", "spice")}
     of_body = _flat({name: table for name, table in tables.items() if table})
     for fault, table in scene.get("faults", {}).items() if isinstance(scene.get("faults"), Mapping) else ():
-        cls = registry().get(fault, {}).get(table.get("model"))
+        cls = registry().get(fault, {}).get(str(table.get("model")))
         if cls is not None:
             defaults |= {f"faults.{fault}.{key}": value for key, value in _flat(cls().to_dict()).items()}
     for key, value in _flat(scene).items():

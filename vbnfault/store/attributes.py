@@ -77,6 +77,10 @@ def check_attributes(attributes: Mapping[str, Any]) -> None:
         for key, value in _values_at(attributes, path.split(".")):
             if not isinstance(value, dict):
                 raise InputError(f"{without_middle(key)} = {shown(value)}: must be a table")
+    for path in ("fault_models.*", "scene.faults.*.model"):
+        for key, value in _values_at(attributes, path.split(".")):
+            if not isinstance(value, str):
+                raise InputError(f"{without_middle(key)} = {shown(value)}: must be a text")
     _check_blocks(attributes.get("blocks", [1]))
     notes = attributes.get("versions_of_samples", [])
     if not isinstance(notes, list) or not all(

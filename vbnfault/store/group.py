@@ -23,6 +23,7 @@ from .layout import (
     SPARE,
     array_documents,
     canonical,
+    check_depth,
     coordinate_chunks,
     encode_values,
     group_document,
@@ -116,7 +117,8 @@ def read_document(files: Files, name: str) -> dict[str, Any] | None:
         content = files.read(name, MOST_DOCUMENT_BYTES)
         if sum(map(content.count, b",[{")) > _MOST_VALUES:
             return None
-        document = json.loads(content)
+        check_depth(text := content.decode())
+        document = json.loads(text)
     except (OSError, ValueError, RecursionError):
         return None
     return document if isinstance(document, dict) else None

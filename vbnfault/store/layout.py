@@ -32,7 +32,7 @@ CHECKSUM = "attributes_sha256"
 # root attributes that the store needs for itself; all others are the user's
 OWN_ATTRIBUTES = ("store", "samples", "coordinates", CHECKSUM)
 
-_BRACKETS, _DEEPEST = re.compile(r"[][{}]"), 64
+_BRACKETS, _DEEPEST = re.compile(r'"[^"\\]*+(?:\\.[^"\\]*+)*+"|[][{}]'), 64
 _LITTLE_ENDIAN = {"name": "bytes", "configuration": {"endian": "little"}}
 
 
@@ -131,16 +131,23 @@ def group_document(
     return {**document, "node_type": "group"}
 
 
+def check_depth(content: str) -> None:
+    """Raise ValueError if JSON is nested deeper than what vbnfault writes, so that no function recurses too far."""
+    depth = 0
+    for part in _BRACKETS.finditer(content):
+        depth += part[0] in "[{"
+        depth -= part[0] in "]}"
+        if depth > _DEEPEST:
+            raise ValueError("it is nested too deep")
+
+
 def drawn_table(text: object) -> dict[str, Any]:
     """Return the table that the scalar `parameters` or `proposal` of a sample holds as JSON.
 
     Raises ValueError if it is none, or is nested deeper than what vbnfault writes.
     """
-    depth, content = 0, str(text or "{}")
-    for bracket in _BRACKETS.finditer(content):
-        depth += 1 if bracket[0] in "[{" else -1
-        if depth > _DEEPEST:
-            raise ValueError("it is nested too deep")
+    content = str(text or "{}")
+    check_depth(content)
     # no float holds a whole number of more digits, and no array
     table = json.loads(content, parse_int=lambda digits: int(digits) if len(digits) < 25 else float(digits))
     if not isinstance(table, dict):

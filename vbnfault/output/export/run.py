@@ -187,7 +187,9 @@ def _parts(store: Store, size: int, min_area_px: int) -> tuple[ExportPart, ...]:
     """Return the parts of an export: of each split, in ascending order, up to `size` samples."""
     split = [str(name) for number in range(store.shards) for name in _column(store, "split", number)]
     parts: list[ExportPart] = []
-    for name in (*SPLITS, *sorted(set(split) - set(SPLITS))):
+    if not {*split} <= {*SPLITS}:  # only a sample that is not built has none: "" would name the root folder
+        raise VbnfaultError(f"{store.path}: a split is none of {', '.join(SPLITS)}; the build command repairs it")
+    for name in SPLITS:
         samples = [i for i, of_sample in enumerate(split) if of_sample == name]
         starts = range(0, len(samples), size)
         for k, start in enumerate(starts):
