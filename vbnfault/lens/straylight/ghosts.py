@@ -476,8 +476,8 @@ def _arriving(spots: Spots, reach_mm: float) -> F64:
     dr = be.dr
     away = (spots.x_mm * spots.x_mm + spots.y_mm * spots.y_mm) * dr.opaque(be.Float, reach_mm**-2)
     # where no ray passes the rims, those that nearly pass decide
-    nearly = 1e-6 / (1 + spots.radius**8)
-    weight = (_inside(spots.radius, _SPECTRUM) + nearly) / (1 + away * away)
+    nearly = 1e-6 / (1 + spots.radius**4)
+    weight = dr.maximum((_inside(spots.radius, _SPECTRUM) + nearly) / (1 + away * away), 1e-30)
     total = dr.block_sum(be.Float64(spots.fraction * weight), _SPECTRUM**2)
     return np.asarray(total.numpy() / dr.block_sum(be.Float64(weight), _SPECTRUM**2).numpy())
 
