@@ -9,6 +9,7 @@ import pytest
 
 from vbnfault.core import llvm
 from vbnfault.core.errors import VbnfaultError
+from vbnfault.core.spectra import Bands
 from vbnfault.lens import RealLens, load_lens, paraxial_properties, scaled_to_field
 from vbnfault.lens.straylight.settings import SensorGrid, SunSource
 from vbnfault.lens.straylight.total import SunlightInLens
@@ -59,7 +60,7 @@ def test_the_sensor_raises_ghosts_near_the_axis(name: str) -> None:
     for reflectance in (0.0, 0.05, 0.1):
         found = SunlightInLens.of(
             replace(lens, sensor_reflectance=reflectance),
-            wavelength_nm=np.array([450.0, 650.0]),
+            bands=Bands.lines(450.0, 650.0),
             sensor=SensorGrid(shape=(32, 32), pitch_mm=SENSOR_MM / 32),
             sun=SunSource(angle_deg=3.0, radius_rad=4.65e-3),
         ).total()

@@ -53,7 +53,7 @@ def scene_of(files: dict[str, Path], **tables: dict[str, Any]) -> config.Scene:
         dataset={"samples": 4, "sites": 2},
         body={"shape": str(files["shape"]), "unit": "m"},
         camera={"lens": str(files["lens"]), "detector": str(files["detector"]), "width_px": 64, "height_px": 64},
-        spacecraft={"model": str(files["spacecraft"])},
+        spacecraft={"model": str(files["spacecraft"]), "translation_m": [0.0, 0.0, -9.0]},
         **tables,
     )
     table["faults"] = {"pixel_overwriting": {"texture_file": str(files["texture"])}}

@@ -36,7 +36,7 @@ def test_describe_says_what_the_frame_shows() -> None:
     # 90 degrees across: twice the height, over 512 pixels
     assert "0.0391 to 0.391 m a pixel, footprint 20 to 200 m across" in text
     assert "Sun: 2 au" in text
-    assert "at least 5% sunlit ground" in text
+    assert "at least 20% sunlit ground" in text
     faint = next(line for line in described("sun.distance_au=2") if "exposure" in line)
     bright = next(line for line in described("sun.distance_au=1") if "exposure" in line)
     times = [float(re.search(r"about ([0-9.e-]+) s", line)[1]) for line in (faint, bright)]  # type: ignore[index]

@@ -106,5 +106,5 @@ def own(path: Path) -> Path:
 
 def own_folder(path: Path) -> Path:
     """Make a folder within one that vbnfault makes, and return it; a link of this name is removed."""
-    own(path).mkdir(exist_ok=True)
+    own(path).mkdir(parents=True, exist_ok=True)
     return path

@@ -163,7 +163,8 @@ def _geometry(session: Session) -> list[str]:
             f"{_bounds(stratum.sun_azimuth_deg)} deg; camera from {towards} by roll {_bounds(stratum.roll_deg)}, "
             f"pitch {_bounds(stratum.pitch_deg)}, yaw {_bounds(stratum.yaw_deg)} deg; {lit}"
         )
-    return [*lines, _redrawn(session), *([_suns_seen(session)] if scene.exchanges_views else [])]
+    suns = scene.exchanges_views and (session.plan.stratum == plan.SUN_FACING).any()
+    return [*lines, _redrawn(session), *([_suns_seen(session)] if suns else [])]
 
 
 def _suns_seen(session: Session) -> str:
