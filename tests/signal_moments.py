@@ -9,6 +9,7 @@ output has the number of the signal, which changes with the moment, the exit cod
 
 from __future__ import annotations
 
+import importlib.util
 import itertools
 import json
 import os
@@ -19,8 +20,10 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-HERE = Path(__file__).resolve().parent
-FILES = tuple(str(HERE.parent / "vbnfault" / name) for name in ("__main__.py", "cli/app.py"))
+PACKAGE = importlib.util.find_spec("vbnfault")
+assert PACKAGE is not None
+assert PACKAGE.origin is not None
+FILES = tuple(str(Path(PACKAGE.origin).parent / name) for name in ("__main__.py", "cli/app.py"))
 
 
 class Moments:

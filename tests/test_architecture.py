@@ -208,7 +208,7 @@ def test_only_one_unit_imports(library: str) -> None:
 
 
 def requirements() -> list[Requirement]:
-    project = tomllib.loads((ROOT.parent / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     return [Requirement(line) for line in project["dependencies"]]
 
 
