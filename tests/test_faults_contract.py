@@ -349,13 +349,13 @@ def test_every_number_serves_at_both_ends_of_its_limits(
 @pytest.mark.parametrize("model", ["traced", "paraxial"])
 def test_limits_of_straylight_are_those_of_scatter(model: str) -> None:
     """Scattering serves at both ends of the declared limits; it and the reader refuse what lies beyond."""
-    from vbnfault.lens.straylight import scatter
+    from vbnfault.lens.straylight import particles, scatter
 
     fields = registry()["straylight"][model].__dataclass_fields__
     for key, physics in (
         ("roughness_nm", lambda value: scatter.Harvey.of_roughness(roughness_nm=value, index_step=0.5).b0),
-        ("cleanliness_level", scatter.obscured_fraction),
-        ("cleanliness_level", lambda value: scatter.particle_scatter_fraction(value, 550.0)),
+        ("cleanliness_level", particles.obscured_fraction),
+        ("cleanliness_level", lambda value: particles.particle_scatter_fraction(value, 550.0)),
     ):
         low, high = fields[key].metadata["limits"]
         assert np.isfinite([physics(low), physics(high)]).all()

@@ -19,20 +19,22 @@ from vbnfault.core.errors import InputError
 from vbnfault.lens import Prescription, load_lens, paraxial_properties, parse_lens
 from vbnfault.lens.paraxial import gap, refraction, system
 from vbnfault.lens.rays import forward
-from vbnfault.lens.straylight import scatter
+from vbnfault.lens.straylight import particles, scatter
 from vbnfault.lens.straylight.paraxial import mirrors, transmittance
-from vbnfault.lens.straylight.scatter import (
+from vbnfault.lens.straylight.particles import (
     DUST_INDEX,
-    Cleanliness,
-    Harvey,
-    baffle_transmission,
     obscured_fraction,
     particle_bsdf,
     particle_count,
     particle_scatter_fraction,
+    scattered_intensity,
+)
+from vbnfault.lens.straylight.scatter import (
+    Cleanliness,
+    Harvey,
+    baffle_transmission,
     point_source_transmittance,
     scattered_fraction,
-    scattered_intensity,
     veiling_glare,
 )
 
@@ -146,7 +148,7 @@ def test_mie_coefficients_against_miepython() -> None:
     # miepython has the opposite sign of absorption, and errors up to 1.1e-11; those here are below 1e-13, both
     # against Bessel functions of mpmath with 50 digits
     for index in (DUST_INDEX, 1.33 + 0j, 1.6 + 0.3j, 0.75 + 0j):
-        for x, *ours in zip(sizes, *scatter._coefficients(sizes, index), strict=True):
+        for x, *ours in zip(sizes, *particles._coefficients(sizes, index), strict=True):
             for row, expected in zip(ours, mie.coefficients(np.conj(index), float(x)), strict=True):
                 np.testing.assert_allclose(row[: len(expected)], expected, rtol=0, atol=2e-11)
                 assert (row[len(expected) :] == 0).all()
@@ -164,8 +166,8 @@ def test_large_spheres_join_small_ones() -> None:
     """Mie's series averaged over sizes of ±15 % against diffraction and rays, at a size parameter of 500."""
     sizes = 500 * np.exp(np.linspace(-0.15, 0.15, 100))
     angle = np.radians([0.01, 0.05, 0.1, 0.15, 0.5, 1.0, 3.0, 10.0, 25.0, 45.0, 70.0, 88.0])
-    series = scatter._mie(sizes, np.cos(angle), DUST_INDEX) / sizes[:, None] ** 2
-    rays = scatter._large(sizes, np.cos(angle), DUST_INDEX) / sizes[:, None] ** 2
+    series = particles._mie(sizes, np.cos(angle), DUST_INDEX) / sizes[:, None] ** 2
+    rays = particles._large(sizes, np.cos(angle), DUST_INDEX) / sizes[:, None] ** 2
     ratio = rays.mean(axis=0) / series.mean(axis=0)
     # within the lobe the rays agree to a thousandth, 5e-3 where it is steep; outside, single sizes differ by 35 %
     # as rays interfere: 3.5 % over 100, besides the edge's light, which keeps its phase to the refracted ray's
@@ -229,7 +231,7 @@ def test_particles_grow_with_the_level_and_vanish_when_clean() -> None:
 
 def test_nothing_heavy_is_imported() -> None:
     script = (
-        "import sys, vbnfault.lens.straylight.scatter as s; s.scattered_intensity(3.0, 1.0); "
+        "import sys, vbnfault.lens.straylight.particles as s; s.scattered_intensity(3.0, 1.0); "
         "assert not {'miepython', 'numba', 'matplotlib'} & set(sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
@@ -495,13 +497,13 @@ def test_a_bad_baffle_is_told() -> None:
 
 def test_the_table_of_dust_is_the_same_from_disk() -> None:
     """The table that the process keeps equals the one read from disk and, at some sizes, the one computed."""
-    edges, angles, kept = scatter._intensities(scatter.DUST_INDEX)
-    scatter._intensities.cache_clear()
-    read = scatter._intensities(scatter.DUST_INDEX)[2]
+    edges, angles, kept = particles._intensities(particles.DUST_INDEX)
+    particles._intensities.cache_clear()
+    read = particles._intensities(particles.DUST_INDEX)[2]
     assert read is not kept
     np.testing.assert_array_equal(read, kept)
     assert not read.flags.writeable
     some = slice(0, None, 200)
     middle = np.sqrt(edges[1:] * edges[:-1])[some]
     # a matrix product of other rows may be summed in another order
-    np.testing.assert_allclose(scatter.scattered_intensity(middle, np.cos(angles)), kept[some], rtol=1e-9)
+    np.testing.assert_allclose(particles.scattered_intensity(middle, np.cos(angles)), kept[some], rtol=1e-9)

@@ -45,7 +45,7 @@ from ..lens.footprint import Footprint, ImageFrame
 from ..lens.glass import D_NM
 from ..lens.rays import forward
 from ..lens.straylight.paraxial import along
-from ..lens.straylight.scatter import DUST_INDEX
+from ..lens.straylight.particles import DUST_INDEX
 from .context import FaultContext, Params
 from .contract import LensFault
 from .fields import Interval, Severity, bounds, number

@@ -37,7 +37,8 @@ from ..core import spectra
 from ..core.quantities import Radiance
 from ..core.shared_results import SharedResults
 from ..core.spectra import Bands
-from ..lens.straylight.scatter import CLEANLINESS_LIMITS, ROUGHNESS_NM_LIMITS, Cleanliness
+from ..lens.straylight.particles import CLEANLINESS_LIMITS
+from ..lens.straylight.scatter import ROUGHNESS_NM_LIMITS, Cleanliness
 from ..lens.straylight.scene import PointSources, RenderGrid, SceneInLens, in_channels, surrounding_grids
 from ..lens.straylight.scene_diffraction import starburst_of_source, wing_fraction
 from ..lens.straylight.settings import Baffle, DirectPath, GhostSettings, SensorGrid, StraylightSettings, SunSource

@@ -11,7 +11,8 @@ Modules:
 - `raster` draws bundles of rays on the sensor, and `pyramid` adds up the levels on which they are drawn.
 - `irradiance` renders the image of all ghosts with these modules.
 - `starburst` computes the light that the stop diffracts.
-- `scatter` computes the glare, which surfaces and dust scatter, and the transmission of a baffle.
+- `scatter` computes the glare, which surfaces and dust scatter, and the transmission of a baffle; `particles`
+  computes how dust scatters.
 - `total` adds the veil, and returns the sum of all straylight and the remaining fraction of the direct image.
 - `scene` computes ghosts, glare and veil of everything that a render shows, with `ghost_response` (ghosts of every
   field angle, traced once for a lens) and `scene_scatter` (glare as a convolution).
