@@ -174,8 +174,8 @@ def test_a_gain_multiplies_signal_and_hot_pixels_in_dn() -> None:
     base, louder = (raw(amplified(sensor, g), 50.0, 64, 5, exposure_s=5.0) for g in (1.0, 4.0))
     below = louder < sensor.readout.top_dn - sensor.readout.bias_dn
     assert np.median(louder[below]) == pytest.approx(4 * np.median(base), rel=0.03)
-    # The 40 hottest pixels of a dark frame, in two others of equal noise: a mean of 40 pixels of 300 e and more has a
-    # standard error of at most 1.4 %, mostly shared by both, and rounding to DN adds less than 1 %.
+    # The 40 hottest pixels of a dark frame, in two others of equal noise: a mean of 40 pixels of 300 e and more
+    # has a standard error of at most 1.4 %, mostly shared by both, and rounding to DN adds less than 1 %.
     chosen = np.argsort(raw(sensor, 0.0, 64, 6, exposure_s=20.0), axis=None)[-40:]
     dark, louder_dark = (raw(amplified(sensor, g), 0.0, 64, 5, exposure_s=20.0).ravel()[chosen] for g in (1.0, 4.0))
     assert dark.mean() > 1.1 * np.median(raw(sensor, 0.0, 64, 5, exposure_s=20.0))
