@@ -13,9 +13,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import victim
-from kills import forked
 from synthetic import SAMPLES, Session, fake_sample, flip, make_spec, run
+from tools import victim
+from tools.kills import forked
 from typer.testing import CliRunner
 
 from vbnfault import cli
