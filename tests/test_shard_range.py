@@ -320,17 +320,6 @@ def test_stores_of_another_dataset_are_refused(
     assert not (tmp_path / "m.zarr").exists()
 
 
-@pytest.mark.parametrize("changes", [{"format_version": 2}, {"codecs": {"image": "zstd 3"}}])
-def test_stores_of_other_codecs_are_refused(tmp_path: Path, parts: list[Path], changes: dict) -> None:
-    spec = st.open_store(parts[0]).spec
-    st.create(tmp_path / "c.zarr", dataclasses.replace(spec, **changes), SAMPLES)
-    with pytest.raises(
-        InputError, match=r"c\.zarr: has another format or other codecs than .*vbnfault migrate STORE"
-    ):
-        merge([*parts, tmp_path / "c.zarr"], tmp_path / "m.zarr")
-    assert not (tmp_path / "m.zarr").exists()
-
-
 def test_a_source_is_locked_only_if_its_shards_move(tmp_path: Path, parts: list[Path]) -> None:
     with lock.locked(parts[1]):
         with pytest.raises(VbnfaultError, match=r"b\.zarr: another command is writing to it"):

@@ -48,11 +48,6 @@ def home(tmp_path: Path) -> Path:
 # --- links ----------------------------------------------------------------------------------------------------
 
 
-def _migrate(sound: Path, here: Path) -> list[object]:
-    (here / ".m.zarr.migrate.partial").symlink_to(here / "home")
-    return ["migrate", sound, "--out", here / "m.zarr"]
-
-
 def _lock(sound: Path, here: Path) -> list[object]:
     (here / ".m.zarr.lock").symlink_to(here / "home/docs/thesis.txt")
     return ["merge", sound, "--out", here / "m.zarr"]
@@ -83,7 +78,6 @@ def _loop(sound: Path, here: Path) -> list[object]:
 @pytest.mark.parametrize(
     ("make", "code", "sentence"),
     [
-        (_migrate, 0, ""),
         (_lock, 2, ".m.zarr.lock: has the name of a lock, but is a link or a pipe; remove it"),
         (_lock_of_an_export, 2, ".e.lock: has the name of a lock, but is a link or a pipe; remove it"),
         (_lock_that_is_a_pipe, 2, ".m.zarr.lock: has the name of a lock, but is a link or a pipe; remove it"),

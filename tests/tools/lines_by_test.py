@@ -2,7 +2,8 @@
 
 `python -m pytest -n 0 -p tools.lines_by_test tests/test_plan.py` with the folder `tests` on PYTHONPATH writes
 a JSON to the file named by LINES_BY_TEST: `lines`, of "path:line" the tests that execute it, and `seconds`, the
-duration of each test. What runs in the set-up of a test is noted for its whole file, what runs outside of tests as "import".
+duration of each test. What runs in the set-up of a test is noted for its whole file, and what runs outside of tests
+as "import".
 """
 
 from __future__ import annotations
