@@ -25,8 +25,8 @@ import numpy as np
 from vbnfault.core import resources
 from vbnfault.lens import Prescription, load_lens, paraxial_properties
 from vbnfault.lens.glass import D_NM
-from vbnfault.lens.rays import ghost
-from vbnfault.lens.straylight.paraxial import along, axial_transmittance, pairs, transmittance
+from vbnfault.lens.rays import axial_transmittance, ghost, transmittance
+from vbnfault.lens.straylight.paraxial import along, pairs
 from vbnfault.lens.straylight.scatter import ROUGHNESS_NM, Cleanliness, point_source_transmittance
 from vbnfault.lens.straylight.settings import VEIL_FRACTION
 

@@ -45,9 +45,9 @@ from .mapping import ChiefHeights, FieldMap, camera_model, chief_heights, field_
 from .paraxial import paraxial_properties
 from .point_spread import REACH_PX, PointSpreads, Tiles, kernels_of_spots
 from .prescription import Prescription
+from .rays import axial_transmittance
 from .resampling import RadialTables, Resampling, table_distances
 from .spots import FieldBundles, field_bundles, spot_diagrams
-from .straylight.paraxial import axial_transmittance
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]

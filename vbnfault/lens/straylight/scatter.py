@@ -20,11 +20,10 @@ from ..footprint import disc_overlap
 from ..glass import RANGE_NM
 from ..paraxial import paraxial_properties
 from ..prescription import Prescription
-from ..rays import forward
-from ..thin import beyond_frame
-from .paraxial import along, axial_transmittance, mirrors
+from ..rays import axial_transmittance, forward
+from ..thin import beyond_frame, cos4_map
+from .paraxial import along, mirrors
 from .particles import CLEANLINESS_LIMITS, checked, particle_bsdf, particle_scatter_fraction
-from .pyramid import in_layers
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -35,8 +34,10 @@ REFERENCE_NM = 550.0  # wavelength at which roughness and the Harvey knee are qu
 ROUGHNESS_NM_LIMITS = (0.0, 50.0)
 ROUGHNESS_NM, KNEE, SLOPE = 1.0, 0.01, -1.5  # assumed: a good polish, and usual values for its scatter
 
-_LOOKUP = 1 << 16
 _OFFSETS: F64 = np.geomspace(1e-6, 2.0, 1025)
+_LOOKUP = 1 << 16
+# values of ln(offset²), too close together to be visible in an image
+_STEPS: F64 = np.linspace(2 * np.log(_OFFSETS[0]), 2 * np.log(_OFFSETS[-1]), _LOOKUP)
 _STEEPEST_DEG = 89.9
 _DISC = 65  # points across a beam
 _AROUND = 360  # azimuths about the source, for the flux outside the frame
@@ -164,49 +165,10 @@ class VeilingGlare:
     glare_total_fraction: F64
 
     @cached_property
-    def _lookup(self) -> tuple[float, float, F32]:
-        """Return start and step of ln(offset²), and the irradiance at these steps.
-
-        The step of 4e-4 is too small to be visible in an image.
-        """
-        steps = np.linspace(2 * np.log(self.offset[0]), 2 * np.log(self.offset[-1]), _LOOKUP)
-        rows = [np.interp(steps, 2 * np.log(self.offset), row) for row in self.irradiance]
-        return steps[0], float(steps[1] - steps[0]), np.array(rows, dtype=np.float32)
-
-    def image(self, sun_xy_mm: tuple[float, float], shape: tuple[int, int], pitch_mm: float) -> F32:
-        """Return the irradiance of the glare over the source's at the entrance, float32[band, y, x].
-
-        The middle of the frame lies on the axis; x points to the right, y down. `sun_xy_mm` is the position of the
-        source's image, which may lie outside the frame. At this position the glare is finite but has no meaning,
-        because the direct image is much brighter. The result does not include the cos⁴ of a pixel's field angle.
-        """
-        index = self.samples(sun_xy_mm, shape, pitch_mm)
-        table = self.table
-        out = np.empty((len(table), *shape), dtype=np.float32)
-        in_layers(lambda band: np.take(table[band], index, out=out[band], mode="clip"), len(table))
-        return out
-
-    @property
     def table(self) -> F32:
-        """Return the irradiance at the steps to which `samples` refers, float32[band, step]."""
-        return self._lookup[2]
-
-    def samples(self, sun_xy_mm: tuple[float, float], shape: tuple[int, int], pitch_mm: float) -> NDArray[np.intp]:
-        """Return the step of `table` at each pixel of a frame, [y, x]; it depends on the focal length alone."""
-        start, step, _ = self._lookup
-        height, width = shape
-        x = ((np.arange(width) - (width - 1) / 2) * pitch_mm / self.efl_mm).astype(np.float32)
-        y = ((np.arange(height) - (height - 1) / 2) * pitch_mm / self.efl_mm).astype(np.float32)[:, None]
-        sun = np.asarray(sun_xy_mm, dtype=np.float64) / self.efl_mm
-        sine = (sun / np.sqrt(1 + sun @ sun)).astype(np.float32)
-        per_length = 1 / np.sqrt(1 + x * x + y * y)
-        position = (x * per_length - sine[0]) ** 2
-        position += (y * per_length - sine[1]) ** 2
-        np.log(np.maximum(position, np.float32(self.offset[0] ** 2), out=position), out=position)
-        position -= np.float32(start)
-        position *= np.float32(1 / step)
-        position += np.float32(0.5)
-        return np.clip(position.astype(np.intp), 0, _LOOKUP - 1)
+        """Return the irradiance at the steps of a `GlareLayout`, float32[band, step]."""
+        rows = [np.interp(_STEPS, 2 * np.log(self.offset), row) for row in self.irradiance]
+        return np.array(rows, dtype=np.float32)
 
     @property
     def kept_of_single(self) -> F64:
@@ -217,18 +179,67 @@ class VeilingGlare:
         """
         return np.asarray(exprel(-self.glare_total_fraction))
 
-    def beyond_mm2(self, sun_xy_mm: tuple[float, float], shape: tuple[int, int], pitch_mm: float) -> F64:
+    def beyond_mm2(self, layout: GlareLayout) -> F64:
         """Return the flux on the sensor plane outside the frame, float64[band] in mm².
 
         The flux is divided by the source's irradiance at the entrance. The flux includes the cos⁴ of the field
-        angle, which `image` omits.
+        angle, which `table` omits.
         """
-        slope = tuple(float(v) / self.efl_mm for v in sun_xy_mm)
+        shape, pitch_mm = layout.shape, layout.pitch_mm
+        slope = tuple(float(v) / self.efl_mm for v in layout.sun_xy_mm)
         half_slope = (shape[1] / 2 * pitch_mm / self.efl_mm, shape[0] / 2 * pitch_mm / self.efl_mm)
         missing = _missing(slope, tuple(self.offset.tolist()), half_slope)
         # E dA = E(β) cos⁴θ dA = E(β) f² d²β
         rings = 2 * np.pi * (self.efl_mm * self.offset) ** 2 * missing
         return np.asarray(np.trapezoid(self.irradiance * rings, x=np.log(self.offset), axis=1))
+
+
+@dataclass(frozen=True)
+class GlareLayout:
+    """Describe how the table of a source's glare is laid out on the sensor; roughness and dust do not change it.
+
+    The middle of the frame lies on the axis; x points to the right, y down. `sun_xy_mm` is the position of the
+    source's image, which may lie outside the frame. At this position the glare is finite but has no meaning,
+    because the direct image is much brighter.
+    """
+
+    efl_mm: float
+    sun_xy_mm: tuple[float, float]
+    shape: tuple[int, int]
+    pitch_mm: float
+
+    @cached_property
+    def steps(self) -> NDArray[np.int32]:
+        """Return the step of the table at each pixel, int32[y, x]."""
+        start, step = _STEPS[0], float(_STEPS[1] - _STEPS[0])
+        height, width = self.shape
+        x = ((np.arange(width) - (width - 1) / 2) * self.pitch_mm / self.efl_mm).astype(np.float32)
+        y = ((np.arange(height) - (height - 1) / 2) * self.pitch_mm / self.efl_mm).astype(np.float32)[:, None]
+        sun = np.asarray(self.sun_xy_mm, dtype=np.float64) / self.efl_mm
+        sine = (sun / np.sqrt(1 + sun @ sun)).astype(np.float32)
+        per_length = 1 / np.sqrt(1 + x * x + y * y)
+        position = (x * per_length - sine[0]) ** 2
+        position += (y * per_length - sine[1]) ** 2
+        np.log(np.maximum(position, np.float32(_OFFSETS[0] ** 2), out=position), out=position)
+        position -= np.float32(start)
+        position *= np.float32(1 / step)
+        position += np.float32(0.5)
+        return np.clip(position.astype(np.int32), 0, _LOOKUP - 1)
+
+    @property
+    def cos4(self) -> F32:
+        """Return cos⁴ of the field angle of every pixel, float32[y, x], a factor on the light of the table."""
+        return cos4_map(self.shape, self.efl_mm / self.pitch_mm)
+
+    @cached_property
+    def area_mm2(self) -> F64:
+        """Return the pixels' area times `cos4` for each step, float64[step]."""
+        return np.bincount(self.steps.ravel(), weights=self.cos4.ravel()).astype(np.float64) * self.pitch_mm**2
+
+    def flux_mm2(self, table: F32) -> F64:
+        """Return the flux in the frame of a table float32[band, step], float64[band]."""
+        # not a product of BLAS, whose bits may depend on the number of threads
+        return np.einsum("bs,s->b", table[:, : len(self.area_mm2)].astype(np.float64), self.area_mm2)
 
 
 @lru_cache(maxsize=4)

@@ -10,8 +10,6 @@ A camera whose point spread was measured (`camera.point_spread`) has the wings o
 
 from __future__ import annotations
 
-from functools import lru_cache
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -36,9 +34,9 @@ _BLUR = 1 / 3
 
 
 def starburst_of_source(lens: Prescription, bands: Bands, width_rad: float) -> Starburst:
-    """Return the starburst of a source as wide as a pixel of a render; it is cached with its tables."""
+    """Return the starburst of a source as wide as a pixel of a render."""
     airy_rad = bands.nm[-1] * 1e-6 / paraxial_properties(lens).entrance_pupil_diameter_mm
-    return _starburst(lens, max(_RADIUS_OF_SQUARE * width_rad, _LEAST_AIRY * airy_rad))
+    return starburst(lens, sun_radius_rad=max(_RADIUS_OF_SQUARE * width_rad, _LEAST_AIRY * airy_rad))
 
 
 def wing_spectra(
@@ -83,8 +81,3 @@ def _sharpened(kernel: F32) -> F32:
 def _faded_in(away_px: F64) -> F64:
     """Return the fraction of the light at a distance from the image of a point that is in the wings."""
     return np.clip((away_px - POINT_SPREAD_PX + 1) / 2, 0, 1)
-
-
-@lru_cache(maxsize=4)
-def _starburst(lens: Prescription, radius_rad: float) -> Starburst:
-    return starburst(lens, sun_radius_rad=radius_rad)
