@@ -20,7 +20,6 @@ from vbnfault.core.quantities import Electrons, Radiance
 from vbnfault.core.spectra import Bands
 from vbnfault.faults import FaultContext, from_dict
 from vbnfault.lens import ThinLens, load_lens, paraxial_properties
-from vbnfault.lens.halo import Halo
 from vbnfault.lens.prescription import Prescription
 from vbnfault.lens.straylight import ghost_response
 from vbnfault.lens.straylight.bundles import Tracer
@@ -28,10 +27,11 @@ from vbnfault.lens.straylight.ghosts import boxes, lit_cells, traced_ghosts
 from vbnfault.lens.straylight.paraxial import paraxial_ghosts
 from vbnfault.lens.straylight.scatter import Cleanliness
 from vbnfault.lens.straylight.scene import PointSources, RenderGrid, SceneInLens, surrounding_grids
-from vbnfault.lens.straylight.scene_diffraction import POINT_SPREAD_PX, starburst_of_source, wing_fraction
+from vbnfault.lens.straylight.scene_convolution import POINT_SPREAD_PX, starburst_of_source, wing_fraction
 from vbnfault.lens.straylight.settings import Baffle, DirectPath, SensorGrid, StraylightSettings, SunSource
 from vbnfault.lens.straylight.starburst import StarburstFrame
 from vbnfault.lens.straylight.total import SunInLens
+from vbnfault.lens.thin import Halo
 from vbnfault.pipeline.record import to_sample
 from vbnfault.scene import config
 

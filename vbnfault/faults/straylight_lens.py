@@ -41,7 +41,7 @@ from ..lens.straylight.paraxial import Ghost
 from ..lens.straylight.particles import CLEANLINESS_LIMITS
 from ..lens.straylight.scatter import ROUGHNESS_NM_LIMITS, Cleanliness
 from ..lens.straylight.scene import PointSources, RenderGrid, SceneInLens, in_channels, surrounding_grids
-from ..lens.straylight.scene_diffraction import starburst_of_source, wing_fraction
+from ..lens.straylight.scene_convolution import starburst_of_source, wing_fraction
 from ..lens.straylight.settings import Baffle, DirectPath, GhostSettings, SensorGrid, StraylightSettings, SunSource
 from ..lens.straylight.total import (
     FINE_SPIKES,

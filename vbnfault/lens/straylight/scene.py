@@ -5,8 +5,7 @@ direction, where dA / f² is the area of a pixel of the render in focal lengths.
 in the radiance L, so that it is computed from responses that depend on the lens alone:
 
 - ghosts by `ghost_response`, in polar cells;
-- glare by `scene_scatter` and the light that the stop diffracts (starburst) by `scene_diffraction`, as
-  convolutions over direction cosines;
+- glare and the light that the stop diffracts (starburst) by `scene_convolution`, over direction cosines;
 - the veil of mount, barrel and edges by its closed form (`total`), from the flux that enters the lens.
 
 Sources out of the field are in coarse renders around the first one (`surrounding_grids`), each four times as wide
@@ -39,8 +38,7 @@ from ..thin import cos4_map
 from .ghost_response import GhostResponse, PolarCells, ghost_response
 from .irradiance import disc_samples
 from .scatter import glare_kernels, hood_transmission, scattered_fraction
-from .scene_diffraction import starburst_of_source, wing_spectra
-from .scene_scatter import DirectionGrid, SeparatedKernel, separated
+from .scene_convolution import DirectionGrid, SeparatedKernel, separated, starburst_of_source, wing_spectra
 from .settings import SensorGrid, StraylightSettings
 
 F32 = NDArray[np.float32]

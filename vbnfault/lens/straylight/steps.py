@@ -22,8 +22,8 @@ The tracers of exact and of paraxial rays do not share more than `StopBlades`: o
 radii and margins of lost rays, the other with radii, and a common form would change the last bits of either.
 
 The image of the scene and the Sun's direct image do not use these two modules. Their rays are clipped in
-`lens.rays.trace`, and `lens.mapping.relative_radii` passes the result to `lens.spots` (image) and `lens.beams`
-(dust).
+`lens.rays.trace`, and `lens.mapping.relative_radii` passes the result to `lens.point_spread` (image) and to
+`lens.beams` (dust).
 """
 
 from __future__ import annotations
