@@ -18,6 +18,7 @@ from vbnfault import dataset
 from vbnfault.cli import app
 from vbnfault.core import resources, spectra
 from vbnfault.core.errors import InputError
+from vbnfault.core.spectra import Bands
 from vbnfault.faults import FaultContext, from_dict
 from vbnfault.lens import (
     Prescription,
@@ -259,9 +260,7 @@ def test_scaling_keeps_films_roughness_and_grains_and_lengthens_paths_in_glass()
     assert taken(lens) / taken(clear[0]) == pytest.approx(0.9 ** (glass_mm / 10), rel=1e-9)
     # in clear glass, roughness of 2 nm and particles of a level scatter the same share, over the same angles
     glare = [
-        veiling_glare(
-            v, sun_deg=10.0, wavelength_nm=np.array([D_NM]), cleanliness=Cleanliness(roughness_nm=2.0, level=300.0)
-        )
+        veiling_glare(v, Bands.lines(D_NM), sun_deg=10.0, cleanliness=Cleanliness(roughness_nm=2.0, level=300.0))
         for v in clear
     ]
     shape, pitch = (32, 32), 1.0

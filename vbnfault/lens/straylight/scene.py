@@ -371,7 +371,7 @@ class SceneInLens:
         """Return the glare of sources on a grid, with all losses but those at the baffle."""
         slope = np.tan(np.linspace(0, np.arctan(self._places(grid).slope.max()), _ANGLES))
         cleanliness, bands = self.settings.cleanliness, self.bands
-        offset, kernels = glare_kernels(self.lens, slope, wavelength_nm=bands, cleanliness=cleanliness)
+        offset, kernels = glare_kernels(self.lens, bands, slope, cleanliness)
         own = bands.mean(axial_transmittance(self.lens, bands.wavelength_nm))
         gain = bands.mean(self.passed) / own * self._kept_of_single
         return separated(kernels * gain[:, None, None], slope, offset)
@@ -380,7 +380,7 @@ class SceneInLens:
     def _kept_of_single(self) -> F64:
         """Return the factor of `VeilingGlare.kept_of_single`, float64[band]."""
         bands = self.bands.behind(self.passed)
-        fraction = scattered_fraction(self.lens, bands, cleanliness=self.settings.cleanliness)
+        fraction = scattered_fraction(self.lens, bands, self.settings.cleanliness)
         single = -np.log1p(-fraction)
         return np.where(single > 0, fraction / np.where(single > 0, single, 1), 1.0)
 

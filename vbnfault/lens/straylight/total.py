@@ -141,7 +141,7 @@ def glare(
 
     The arrays are float32[band, step], float64[band] in mm², and float64[band]: `VeilingGlare.kept_of_single`.
     """
-    scattering = veiling_glare(lens, sun_deg=sun_deg, wavelength_nm=bands, cleanliness=cleanliness)
+    scattering = veiling_glare(lens, bands, sun_deg=sun_deg, cleanliness=cleanliness)
     return scattering.table, scattering.beyond_mm2(layout), scattering.kept_of_single
 
 
@@ -335,7 +335,7 @@ def scene_veil_fraction(lens: Prescription, bands: Bands, *, cleanliness: Cleanl
 
     Surfaces scatter the first part of it; mount, barrel and edges scatter `veil_fraction` of the rest.
     """
-    scattered = scattered_fraction(lens, bands, cleanliness=cleanliness)
+    scattered = scattered_fraction(lens, bands, cleanliness)
     return np.asarray(1 - (1 - scattered) * (1 - veil_fraction))
 
 
