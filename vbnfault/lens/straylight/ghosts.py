@@ -19,7 +19,6 @@ from scipy.interpolate import CubicSpline
 
 from ...core.llvm import backend
 from ...core.spectra import Bands, hat_weights
-from ..glass import D_NM
 from ..paraxial import paraxial_properties
 from ..prescription import Prescription
 from .bundles import Rays, Spots, Tracer, name_of
@@ -607,30 +606,3 @@ def peaks(spots: Spots, across: int, sun_deg: float) -> F64:
     highest = dr.block_reduce(dr.ReduceOp.Max, density, across**2).numpy()
     cell = 4 * rays.box_mm[:, 2] * rays.box_mm[:, 3] / across**2
     return np.asarray(highest * cell * np.cos(np.radians(sun_deg)), dtype=np.float64)
-
-
-def surface_interactions_per_second(
-    lens: Prescription, rays: int = 1_000_000, rounds: int = 5, *, light: bool = False
-) -> float:
-    """Measure how many surfaces rays meet per second straight through the lens; the median of `rounds` calls.
-
-    With `light`, the tracer also computes the fraction of the light that each surface transmits.
-    """
-    import time
-
-    made = Tracer(lens, np.array([D_NM]), routes_=[()])
-    across = int(np.ceil(np.sqrt(rays)))
-    radius = paraxial_properties(lens).entrance_pupil_diameter_mm / 2 / np.sqrt(2)
-    bundle = Rays(
-        route=np.zeros(1, dtype=np.int64),
-        wavelength=np.zeros(1, dtype=np.int64),
-        box_mm=np.array([[0.0, 0.0, radius, radius]]),
-        direction=np.array([[0.0, 0.0, 1.0]]),
-    )
-    be, seconds = backend(), []
-    for _ in range(rounds + 1):
-        start = time.perf_counter()
-        made.trace(bundle, across, light=light, halved=False)
-        be.dr.sync_thread()
-        seconds.append(time.perf_counter() - start)
-    return across * across * len(lens.surfaces) / float(np.median(seconds[1:]))
