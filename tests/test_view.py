@@ -7,7 +7,6 @@ import json
 import os
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -138,27 +137,6 @@ def test_a_browser_leaves_out_the_port_of_http(served: Served, monkeypatch: pyte
     monkeypatch.setattr(server, "_PORT_OF_HTTP", served.viewer.port)  # as if it were that port
     assert served.ask("/", Host="127.0.0.1")[0] == served.ask("/", Host="localhost")[0] == 200
     assert served.ask("/", Host="evil.example")[0] == 403
-
-
-def test_connections_without_a_request_are_closed(described_store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One that sends half of a request is closed in time, and one too many at once; a page is served meanwhile."""
-    monkeypatch.setattr(server, "_MOST_CONNECTIONS", 3)
-    one = Served(st.open_store(described_store))
-    address = ("127.0.0.1", one.viewer.port)
-    held = [socket.create_connection(address, timeout=60) for _ in range(2)]
-    for connection in held:
-        connection.sendall(b"GET / HTTP/1.1\r\nHost: ")
-    assert one.ask("/")[0] == 200
-    while len(one.viewer.server.asking) < 2:  # until both threads wait
-        pass
-    held.append(socket.create_connection(address, timeout=60))
-    with socket.create_connection(address, timeout=60) as fourth:
-        assert fourth.recv(1) == b""
-    monkeypatch.setattr(server, "_SECONDS_TO_ASK", 0.0)
-    for connection in held:
-        assert connection.recv(1) == b""
-        connection.close()
-    one.stop()
 
 
 def test_a_folder_that_is_a_link_is_not_served(described_store: Path, tmp_path: Path) -> None:

@@ -11,14 +11,11 @@ that no page of the web can reach it by a name that resolves to this address, an
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
 import re
-import socket
 import sys
 import threading
-import time
 from collections.abc import Callable
 from functools import cached_property, lru_cache
 from http import HTTPStatus
@@ -58,8 +55,6 @@ _JPEG_QUALITY = 82
 _ROOTS = np.sqrt(255 * np.arange(256)).round().astype(np.uint8)  # black and white stay as they are
 _COORDINATES = ("fault", "channel", "sample", "layer")
 _MOST_OF_COORDINATE = 1 << 20  # bytes of a chunk
-# A connection that has sent no whole request for so long is closed, and so is one too many: a page opens six.
-_SECONDS_TO_ASK, _MOST_CONNECTIONS = 20.0, 64
 _MOST_SMALL = 3000  # small images that are kept, of some 10 kB each
 _KEPT_S = 60
 _PORT_OF_HTTP = 80
@@ -345,38 +340,9 @@ def _json(value: Any) -> bytes:
 
 
 class _Server(ThreadingHTTPServer):
-    """Serve a few connections, and close those that ask for nothing."""
+    """Serve each connection in a thread that ends with the process."""
 
     daemon_threads = True
-
-    def __init__(self, *given: Any) -> None:
-        self.asking: dict[socket.socket, float] = {}  # since when a connection is waited for
-        self._open = threading.BoundedSemaphore(_MOST_CONNECTIONS)
-        super().__init__(*given)
-
-    def process_request(self, request: Any, client_address: Any) -> None:
-        """Answer a connection in a thread; close it where there are too many."""
-        if not self._open.acquire(blocking=False):
-            self.shutdown_request(request)
-            return
-        super().process_request(request, client_address)
-
-    def process_request_thread(self, request: Any, client_address: Any) -> None:
-        """Answer a connection."""
-        try:
-            super().process_request_thread(request, client_address)
-        finally:
-            self.asking.pop(request, None)
-            self._open.release()
-
-    def service_actions(self) -> None:
-        """Close, again and again, the connections whose request does not arrive."""
-        now = time.monotonic()
-        for connection, since in [*self.asking.items()]:
-            if now - since > _SECONDS_TO_ASK:
-                self.asking.pop(connection, None)
-                with contextlib.suppress(OSError):
-                    connection.shutdown(socket.SHUT_RDWR)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Print nothing of a connection that ended early."""
@@ -394,14 +360,8 @@ class _Handler(BaseHTTPRequestHandler):
     server_version, sys_version = "vbnfault", ""
     disable_nagle_algorithm = True
 
-    def handle_one_request(self) -> None:
-        """Answer a request, which must arrive in time."""
-        self.server.asking[self.connection] = time.monotonic()  # type: ignore[attr-defined]
-        super().handle_one_request()
-
     def do_GET(self) -> None:
         """Answer a request."""
-        self.server.asking.pop(self.connection, None)  # type: ignore[attr-defined]
         self._reply(*self._answered())
 
     do_HEAD = do_GET
