@@ -40,7 +40,8 @@ import zarr
 from synthetic import fake_sample, make_spec
 
 from vbnfault import store as st
-from vbnfault.body import Body, cache, choose_sites
+from vbnfault.body import Body, choose_sites
+from vbnfault.body import patch as cache
 from vbnfault.body.patch import build_patch
 from vbnfault.body.spec import PatchSpec
 from vbnfault.core.errors import VbnfaultError

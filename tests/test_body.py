@@ -11,9 +11,9 @@ import pytest
 import trimesh
 
 from vbnfault.body import Body, check_mesh, choose_sites, embedded_nucleus, load_body, load_shape, local_level
+from vbnfault.body.geometry import face_normals_areas, signed_volume
 from vbnfault.body.noise import gradient_noise
 from vbnfault.body.nucleus import made_nucleus
-from vbnfault.body.shape import face_normals_areas, signed_volume
 from vbnfault.core.errors import InputError
 
 REAL_SHAPE = Path(__file__).parents[2] / "shared/data/shapes/67p_18k.obj"

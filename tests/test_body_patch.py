@@ -13,7 +13,8 @@ from scipy import stats
 
 from vbnfault.body import Body, Patch, PatchSpec, Site, boulders, build_patch, choose_sites, load_body, refine
 from vbnfault.body.boulders import PER_KM2, SizeLaw, scatter, smallest_at
-from vbnfault.body.shape import check_mesh, signed_volume
+from vbnfault.body.geometry import signed_volume
+from vbnfault.body.shape import check_mesh
 from vbnfault.core.errors import InputError
 from vbnfault.pipeline import Session
 from vbnfault.scene.config import load_scene

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vbnfault.body import formats, load_shape
-from vbnfault.body.shape import signed_volume
+from vbnfault.body.geometry import signed_volume
 from vbnfault.core import spice
 from vbnfault.core.errors import InputError
 
@@ -412,7 +412,7 @@ def changed(lines: list[str], line: int, text: str) -> str:
         (changed(NUMBERED, 6, "9 1.0 2.0 3.0"), "order.tab", "line 6: expected number 5 in front of a vertex"),
         (changed(NUMBERED, 14, "1 2 3 4"), "nocount.tab", "line 14: expected the number of facets after 12"),
         ("".join(NUMBERED[:13]), "nofacets.tab", "line 13: expected the number of facets .*found the end"),
-        (letters(V, F).replace("f ", "g ", 1).replace("v ", "q ", 1), "q.tab", "line .*: expected vertex numbers from 1 to 11, found 12"),
+        (letters(V, F).replace("v ", "q ", 1), "q.tab", "line .*: expected vertex numbers from 1 to 11, found 12"),
         (letters(V, F).replace("v ", "v x", 1), "vx.tab", "line 1: expected 'v x y z', finite numbers"),
         (rows(V, "%g", lead="v "), "points.tab", "mesh has 0 faces"),
         (letters(V, F) + "f 1 2\n", "two.tab", "line 33: expected 'f a b c', three vertex numbers"),

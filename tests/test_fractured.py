@@ -21,10 +21,9 @@ from vbnfault.body import (
     site_at,
 )
 from vbnfault.body.boulders import GroundMesh, _favour
-from vbnfault.body.fields import PLANES_STD, Points
-from vbnfault.body.octaves import Octaves
+from vbnfault.body.fields import PLANES_STD, Octaves, Points
+from vbnfault.body.geometry import vertex_normals
 from vbnfault.body.roughness import Roughness
-from vbnfault.body.shape import vertex_normals
 from vbnfault.core.errors import InputError
 from vbnfault.scene.config import load_scene
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from vbnfault.body import Body, Patch, Site, cache, choose_sites
-from vbnfault.body.cache import PATCHES, arrays_of, cached_patch, patch_key
-from vbnfault.body.patch import build_patch
+from vbnfault.body import Body, Patch, Site, choose_sites
+from vbnfault.body import patch as patch_module
+from vbnfault.body.patch import PATCHES, arrays_of, build_patch, cached_patch, patch_key
 from vbnfault.body.spec import PatchSpec
 from vbnfault.core import activity, array_files
 from vbnfault.core.array_files import cache_folder
@@ -57,7 +57,7 @@ def test_read_is_what_was_built(body: Body, site: Site, folder: Path, monkeypatc
     assert told == ["terrain of site 0 (new patch)"]
     assert same(built, build_patch(body, site, PatchSpec(**COARSE)))
     assert [path.suffix for path in folder.iterdir()] == [".patch"]
-    monkeypatch.setattr(cache, "build_patch", refuse)
+    monkeypatch.setattr(patch_module, "build_patch", refuse)
     with activity.reported_to(told.append):
         read = cached_patch(body, site, PatchSpec(**COARSE))
     assert len(told) == 1
@@ -120,7 +120,7 @@ def test_any_damage_means_that_the_patch_is_built_again(
         return False
 
     with monkeypatch.context() as patch:
-        patch.setattr(cache, "build_patch", instead)
+        patch.setattr(patch_module, "build_patch", instead)
         assert not damaged()
         # every bit of the header and of the checksum, and some of each array
         rng = np.random.default_rng(1)

@@ -1,4 +1,4 @@
-"""Generate a two-lobed nucleus with the published dimensions of 67P, so that everything works without a download.
+"""Generate bodies without a shape file: a two-lobed nucleus with the published dimensions of 67P, and ellipsoids.
 
 Dimensions and volume are from Jorda et al. 2016 (Icarus 277), the lobe centres from Preusker et al. 2015 (Table 4),
 in the axes of 67P/C-G_FIXED. The orientation of the lobes and all relief are invented to resemble 67P: a smooth
@@ -16,8 +16,9 @@ import scipy.sparse.csgraph
 from numpy.typing import NDArray
 
 from ..core.array_files import ArrayFiles, code_hash
+from .geometry import Float64, Int32, vertex_normals
 from .noise import fractal_noise, gradient_noise
-from .shape import Float64, Int32, check_mesh, vertex_normals
+from .shape import check_mesh
 
 NUCLEI = ArrayFiles(kind="nucleus", content="embedded nucleus")
 _SOURCES, _ARRAYS = ("noise", "shape"), ("vertices_m", "faces")
@@ -235,3 +236,41 @@ def _largest_piece(faces: Int32, count: int) -> Int32:
     graph = scipy.sparse.csr_matrix((ones, (rows, columns)), shape=(count, count))
     label = scipy.sparse.csgraph.connected_components(graph, directed=False)[1][faces[:, 0]]
     return faces[label == np.argmax(np.bincount(label))]
+
+
+# --- ellipsoids -------------------------------------------------------------------------------------------------
+
+# Wavelengths of the relief in mean radii. The shortest is four edges of the mesh; below its facets, a patch
+# continues the roughness that it measures on the mesh.
+_WAVELENGTHS = np.array([1.2, 0.6, 0.3, 0.15, 0.075])
+# Exponent of the amplitude with the wavelength; assumed, within the 0.3 to 1 of natural surfaces (`roughness`).
+_HURST = 0.9
+_RELIEF_SEED = 20_260
+_GRADIENT_NOISE_STD = 0.22  # `noise.gradient_noise`
+
+
+def ellipsoid(semi_axes_m: tuple[float, float, float], relief_m: float = 0.0) -> tuple[Float64, Int32]:
+    """Return a triaxial ellipsoid as a closed mesh of 82,000 triangles: vertices float64[n, 3], m; faces int32.
+
+    Parameters
+    ----------
+    semi_axes_m
+        Semi-axes along x, y and z.
+    relief_m
+        Root mean square height of random relief, normal to the ellipsoid. It is the same for the same axes. With 0,
+        the ellipsoid is smooth.
+    """
+    import trimesh
+
+    sphere = trimesh.creation.icosphere(subdivisions=6)
+    axes = np.array(semi_axes_m)
+    points, faces = np.asarray(sphere.vertices) * axes, np.asarray(sphere.faces, dtype=np.int32)
+    if not relief_m:
+        return points, faces
+    wavelengths = _WAVELENGTHS * float(np.prod(axes)) ** (1 / 3)
+    amplitudes = _WAVELENGTHS**_HURST
+    amplitudes *= relief_m / (_GRADIENT_NOISE_STD * float(np.linalg.norm(amplitudes)))
+    normals = points / axes**2
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    height = fractal_noise(points + wavelengths[0] / 3, _RELIEF_SEED, wavelengths, amplitudes)
+    return points + height[:, None] * normals, faces

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, overload
+from typing import overload
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ..core.errors import InputError
-from .shape import Float64, face_normals_areas
-
-if TYPE_CHECKING:
-    from . import Body
+from .body import Body
+from .geometry import Float64, face_normals_areas
 
 MAX_SLOPE_DEG = 35.0
 _ATTEMPTS = 1000

@@ -36,8 +36,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..core import spectra
 from ..core.errors import InputError
-from ..core.fine_light import splat
-from ..core.quantities import Irradiance, Radiance
+from ..core.quantities import Irradiance, Radiance, splat
 from ..core.sundisc import Floats, add_mean, pixel_sums
 from .distortion import RadialModel
 from .glass import D_NM, RANGE_NM

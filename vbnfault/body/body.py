@@ -1,0 +1,156 @@
+"""Describe a homogeneous, rotating body, and load one from a shape file."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..core.errors import InputError
+from .geometry import Float64, Int32, centre_of_mass, face_normals_areas, signed_volume, vertex_normals
+from .gravity import PolyhedronGravity
+from .nucleus import embedded_nucleus
+from .roughness import Roughness, model_roughness, sharpened
+from .shape import Unit, load_shape
+
+DENSITY_67P_KG_M3 = 537.8  # Preusker et al. 2017, A&A 607, L1
+ROTATION_PERIOD_67P_S = 44654.8  # 12.4041 h, before perihelion (Scholten, Cheops frame document)
+EMBEDDED = "embedded"
+
+_laws: dict[str, Roughness] = {}  # of the shapes that this process has measured, by their content
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Body:
+    """Describe a homogeneous body that rotates at a constant rate.
+
+    Attributes
+    ----------
+    name
+        Free text; it names the body in messages.
+    vertices_m
+        float64[n, 3] in metres, frame T. The pole, about which the body rotates, is +z.
+    faces
+        int32[m, 3], closed, outward winding.
+    density_kg_m3, rotation_period_s
+        Bulk density and sidereal rotation period, both > 0. The defaults are those of 67P.
+    """
+
+    name: str
+    vertices_m: Float64
+    faces: Int32
+    density_kg_m3: float = DENSITY_67P_KG_M3
+    rotation_period_s: float = ROTATION_PERIOD_67P_S
+
+    def __post_init__(self) -> None:
+        for key in ("density_kg_m3", "rotation_period_s"):
+            value = getattr(self, key)
+            if not (math.isfinite(value) and value > 0):
+                raise InputError(f"{self.name}: {key} must be positive and finite; got {value}.")
+        for key, dtype in (("vertices_m", "<f8"), ("faces", "<i4")):
+            array = np.array(getattr(self, key), dtype=dtype)
+            array.setflags(write=False)
+            object.__setattr__(self, key, array)
+
+    @cached_property
+    def content_hash(self) -> str:
+        """Return the sha256 (hex) of the vertices' little-endian float64 bytes and the faces' int32 bytes."""
+        return hashlib.sha256(self.vertices_m.tobytes() + self.faces.tobytes()).hexdigest()
+
+    @cached_property
+    def volume_m3(self) -> float:
+        """Return the volume that the mesh encloses."""
+        return signed_volume(self.vertices_m, self.faces)
+
+    @cached_property
+    def centre_of_mass_T_m(self) -> Float64:
+        """Return the centre of mass of the homogeneous body in T, float64[3] in m."""
+        return centre_of_mass(self.vertices_m, self.faces)
+
+    @cached_property
+    def area_m2(self) -> float:
+        """Return the area of the surface."""
+        return float(face_normals_areas(self.vertices_m, self.faces)[1].sum())
+
+    @cached_property
+    def vertex_normals(self) -> Float64:
+        """Return the outward unit normals at the vertices, float64[n, 3]."""
+        return vertex_normals(self.vertices_m, self.faces)
+
+    @cached_property
+    def gravity(self) -> PolyhedronGravity:
+        """Return the gravity field of the body's polyhedron."""
+        return PolyhedronGravity(self.vertices_m, self.faces, self.density_kg_m3)
+
+    @cached_property
+    def roughness(self) -> Roughness:
+        """Return the law that continues the roughness of the shape below its facets."""
+        if self.content_hash not in _laws:
+            _laws[self.content_hash] = model_roughness(self.vertices_m, self.faces)
+        return _laws[self.content_hash]
+
+    @property
+    def omega_rad_s(self) -> float:
+        """Return the rotation rate about T's +z axis."""
+        return 2.0 * math.pi / self.rotation_period_s
+
+    def effective_gravity(self, points_T_m: ArrayLike) -> Float64:
+        """Return attraction plus centrifugal term, float64[k, 3] in m/s², at float64[k, 3] or [3] metres in T."""
+        return self.gravity.effective(points_T_m, self.omega_rad_s)
+
+
+def load_body(
+    shape: str | Path = EMBEDDED,
+    *,
+    unit: Unit = "auto",
+    name: str | None = None,
+    sharpen: float | Literal["auto"] = 0.0,
+    volume_m3: float | None = None,
+    density_kg_m3: float = DENSITY_67P_KG_M3,
+    rotation_period_s: float = ROTATION_PERIOD_67P_S,
+) -> Body:
+    """Load the packaged procedural nucleus ("embedded") or a shape file.
+
+    Frame T takes its origin and axes from the file; +z is the pole. For 67P models in the Cheops frame (SHAP5,
+    SHAP7), T is 67P/C-G_FIXED. The embedded nucleus uses the same axes.
+
+    Parameters
+    ----------
+    shape
+        "embedded" or the path of a shape file.
+    unit
+        Unit of the file, see `load_shape`; not used for the embedded nucleus.
+    name
+        Default: "embedded" or the file's name without its suffix.
+    sharpen
+        Gain with which relief lost by smoothing is restored, see `sharpened`; not used for the embedded nucleus.
+    volume_m3
+        Volume to which the shape is scaled about its origin; default: as it is.
+
+    Raises
+    ------
+    InputError
+        The shape cannot be used, or volume, density or period is not positive.
+    """
+    if str(shape) == EMBEDDED:
+        vertices_m, faces = embedded_nucleus()
+    else:
+        vertices_m, faces = load_shape(shape, unit)
+        vertices_m = sharpened(vertices_m, faces, sharpen)
+    if volume_m3 is not None:
+        if not 0 < volume_m3 < np.inf:
+            raise InputError(f"volume_m3 = {volume_m3:g}: must be positive and finite")
+        vertices_m = vertices_m * (volume_m3 / signed_volume(vertices_m, faces)) ** (1 / 3)
+    return Body(
+        name=name or (EMBEDDED if str(shape) == EMBEDDED else Path(shape).stem),
+        vertices_m=vertices_m,
+        faces=faces,
+        density_kg_m3=density_kg_m3,
+        rotation_period_s=rotation_period_s,
+    )
