@@ -1,10 +1,10 @@
 """Keep arrays that take seconds to compute on disk: to read them takes a fraction of a second.
 
 All kinds of arrays share one folder and one limit of its size. A file's name is a hash of everything that
-determines its content. The file is one of numpy (.npz) that ends with a checksum of its bytes and of that hash. It is
-written under another name and then renamed, so that a reader sees a whole file or none, whoever is killed and however many
-processes write it. A damaged file is reported to the user, and its arrays are computed again. If the folder cannot
-be written, the user is told once, and only time is lost.
+determines its content. The file is one of numpy (.npz) that ends with a checksum of its bytes and of that hash. It
+is written under another name and then renamed, so that a reader sees a whole file or none, whoever is killed and
+however many processes write it. A damaged file is reported to the user, and its arrays are computed again. If the
+folder cannot be written, the user is told once, and only time is lost.
 """
 
 from __future__ import annotations
@@ -178,7 +178,9 @@ class ArrayFiles:
 
 def _digest(key: str, content: bytes) -> bytes:
     """Return the checksum of a file's content and of the key that determines it."""
-    return hashlib.sha256(key.encode() + content).digest()
+    total = hashlib.sha256(key.encode())
+    total.update(content)
+    return total.digest()
 
 
 @lru_cache
