@@ -3,11 +3,10 @@
 Frame T is fixed to the body. It has the origin and the axes of the shape file, and the body rotates about +z.
 """
 
-from .body import Body, load_body
+from .body import Body, ellipsoid, load_body
 from .gravity import PolyhedronGravity
-from .nucleus import ellipsoid, embedded_nucleus
 from .patch import Patch, build_patch, cached_patch
-from .shape import check_mesh, load_shape
+from .shape import check_mesh, embedded_nucleus, load_shape
 from .sites import Site, Sites, choose_sites, local_level, site_at
 from .spec import Fractured, PatchSpec
 

@@ -1,4 +1,4 @@
-"""Describe a homogeneous, rotating body, and load one from a shape file."""
+"""Describe a homogeneous, rotating body, load one from a shape file, or make an ellipsoid."""
 
 from __future__ import annotations
 
@@ -15,13 +15,21 @@ from numpy.typing import ArrayLike
 from ..core.errors import InputError
 from .geometry import Float64, Int32, centre_of_mass, face_normals_areas, signed_volume, vertex_normals
 from .gravity import PolyhedronGravity
-from .nucleus import embedded_nucleus
+from .noise import fractal_noise
 from .roughness import Roughness, model_roughness, sharpened
-from .shape import Unit, load_shape
+from .shape import Unit, embedded_nucleus, load_shape
 
 DENSITY_67P_KG_M3 = 537.8  # Preusker et al. 2017, A&A 607, L1
 ROTATION_PERIOD_67P_S = 44654.8  # 12.4041 h, before perihelion (Scholten, Cheops frame document)
 EMBEDDED = "embedded"
+
+# Wavelengths of the relief in mean radii. The shortest is four edges of the mesh; below its facets, a patch
+# continues the roughness that it measures on the mesh.
+_WAVELENGTHS = np.array([1.2, 0.6, 0.3, 0.15, 0.075])
+# Exponent of the amplitude with the wavelength; assumed, within the 0.3 to 1 of natural surfaces (`roughness`).
+_HURST = 0.9
+_RELIEF_SEED = 20_260
+_GRADIENT_NOISE_STD = 0.22  # `noise.gradient_noise`
 
 _laws: dict[str, Roughness] = {}  # of the shapes that this process has measured, by their content
 
@@ -154,3 +162,30 @@ def load_body(
         density_kg_m3=density_kg_m3,
         rotation_period_s=rotation_period_s,
     )
+
+
+def ellipsoid(semi_axes_m: tuple[float, float, float], relief_m: float = 0.0) -> tuple[Float64, Int32]:
+    """Return a triaxial ellipsoid as a closed mesh of 82,000 triangles: vertices float64[n, 3], m; faces int32.
+
+    Parameters
+    ----------
+    semi_axes_m
+        Semi-axes along x, y and z.
+    relief_m
+        Root mean square height of random relief, normal to the ellipsoid. It is the same for the same axes. With 0,
+        the ellipsoid is smooth.
+    """
+    import trimesh
+
+    sphere = trimesh.creation.icosphere(subdivisions=6)
+    axes = np.array(semi_axes_m)
+    points, faces = np.asarray(sphere.vertices) * axes, np.asarray(sphere.faces, dtype=np.int32)
+    if not relief_m:
+        return points, faces
+    wavelengths = _WAVELENGTHS * float(np.prod(axes)) ** (1 / 3)
+    amplitudes = _WAVELENGTHS**_HURST
+    amplitudes *= relief_m / (_GRADIENT_NOISE_STD * float(np.linalg.norm(amplitudes)))
+    normals = points / axes**2
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    height = fractal_noise(points + wavelengths[0] / 3, _RELIEF_SEED, wavelengths, amplitudes)
+    return points + height[:, None] * normals, faces

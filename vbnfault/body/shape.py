@@ -6,6 +6,7 @@ import io
 import logging
 import warnings
 from collections import deque
+from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Literal
@@ -13,7 +14,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import meshes, user_files
+from ..core import meshes, resources, user_files
 from ..core.errors import InputError
 from . import formats
 from .geometry import Float64, Int32, face_normals_areas, signed_volume
@@ -87,6 +88,20 @@ def load_shape(path: str | Path, unit: Unit = "auto") -> tuple[Float64, Int32]:
     if suffix in _SPLIT_VERTEX_TYPES:
         vertices, faces, _ = _weld(vertices, faces)
     return check_mesh(vertices, faces, str(path))
+
+
+@lru_cache(maxsize=1)
+def embedded_nucleus() -> tuple[Float64, Int32]:
+    """Return the packaged nucleus: float64[n, 3] in metres and int32[m, 3], closed, wound outwards, read-only.
+
+    It has two lobes, the published dimensions of 67P and the axes of 67P/C-G_FIXED. So everything works without a
+    download. `benchmarks/embedded_nucleus.py` has made the file and says how.
+    """
+    with np.load(resources.data_dir("scenes") / "bodies" / "embedded.npz") as file:
+        vertices, faces = file["vertices_m"], file["faces"]
+    vertices.setflags(write=False)
+    faces.setflags(write=False)
+    return vertices, faces
 
 
 def _read_with_trimesh(path: Path, data: bytes) -> tuple[Float64, NDArray[np.int64]]:

@@ -40,7 +40,7 @@ DEFAULT_GIB = 4.0
 _LIBRARIES = ("numpy", "scipy", "drjit")
 _DIGEST_BYTES = hashlib.sha256().digest_size
 _STALE_S = 3600.0  # an unfinished file older than this belongs to no running process
-_KINDS = ("patch", "ghosts", "nucleus", "mie")  # prefixes of names; the suffix is the same word
+_KINDS = ("patch", "ghosts", "mie", "nucleus")  # prefixes and suffixes of names; the last is of earlier versions
 _UNFINISHED = ".part"
 
 

@@ -1,4 +1,8 @@
-"""Generate bodies without a shape file: a two-lobed nucleus with the published dimensions of 67P, and ellipsoids.
+"""Make the two-lobed nucleus that ships with vbnfault, with the published dimensions of 67P.
+
+    python benchmarks/embedded_nucleus.py
+
+writes `scenes/bodies/embedded.npz`: `vertices_m` float64[n, 3] and `faces` int32[m, 3].
 
 Dimensions and volume are from Jorda et al. 2016 (Icarus 277), the lobe centres from Preusker et al. 2015 (Table 4),
 in the axes of 67P/C-G_FIXED. The orientation of the lobes and all relief are invented to resemble 67P: a smooth
@@ -7,21 +11,15 @@ neck, layered cliffs, plains with flat floors, and pits with steep walls.
 
 from __future__ import annotations
 
-from functools import lru_cache
-from pathlib import Path
-
 import numpy as np
 import scipy.sparse
 import scipy.sparse.csgraph
 from numpy.typing import NDArray
 
-from ..core.array_files import ArrayFiles, code_hash
-from .geometry import Float64, Int32, vertex_normals
-from .noise import fractal_noise, gradient_noise
-from .shape import check_mesh
-
-NUCLEI = ArrayFiles(kind="nucleus", content="embedded nucleus")
-_SOURCES, _ARRAYS = ("noise", "shape"), ("vertices_m", "faces")
+from vbnfault.body.geometry import Float64, Int32, vertex_normals
+from vbnfault.body.noise import fractal_noise, gradient_noise
+from vbnfault.body.shape import check_mesh
+from vbnfault.core.resources import data_dir
 
 _SEED = 67
 _SPACING_KM = 0.066
@@ -178,28 +176,8 @@ def _umbrella(faces: Int32, count: int) -> scipy.sparse.csr_matrix:
     return scipy.sparse.diags(1.0 / np.asarray(matrix.sum(axis=1)).ravel()) @ matrix
 
 
-@lru_cache(maxsize=1)
-def embedded_nucleus() -> tuple[Float64, Int32]:
-    """Return the procedural nucleus: float64[n, 3] in metres and int32[m, 3], closed, wound outwards, read-only.
-
-    The result is deterministic. It is made once per machine, in about a second, and kept on disk (`array_files`).
-
-    Raises
-    ------
-    InputError
-        $VBNFAULT_CACHE_GIB is unusable.
-    """
-    here = Path(__file__)
-    key = code_hash([here, *(here.with_name(f"{name}.py") for name in _SOURCES)], ["scikit-image"])
-    kept = NUCLEI.kept(key, lambda: dict(zip(_ARRAYS, made_nucleus(), strict=True)))
-    vertices, faces = (kept[name] for name in _ARRAYS)
-    vertices.setflags(write=False)
-    faces.setflags(write=False)
-    return vertices, faces
-
-
 def made_nucleus() -> tuple[Float64, Int32]:
-    """Compute the vertices and faces of `embedded_nucleus` without the cache on disk."""
+    """Return the vertices float64[n, 3] in metres and the faces int32[m, 3], closed, wound outwards."""
     import skimage.measure
 
     low, high = np.array([-2.95, -2.25, -2.15]), np.array([2.95, 2.35, 2.10])
@@ -238,39 +216,6 @@ def _largest_piece(faces: Int32, count: int) -> Int32:
     return faces[label == np.argmax(np.bincount(label))]
 
 
-# --- ellipsoids -------------------------------------------------------------------------------------------------
-
-# Wavelengths of the relief in mean radii. The shortest is four edges of the mesh; below its facets, a patch
-# continues the roughness that it measures on the mesh.
-_WAVELENGTHS = np.array([1.2, 0.6, 0.3, 0.15, 0.075])
-# Exponent of the amplitude with the wavelength; assumed, within the 0.3 to 1 of natural surfaces (`roughness`).
-_HURST = 0.9
-_RELIEF_SEED = 20_260
-_GRADIENT_NOISE_STD = 0.22  # `noise.gradient_noise`
-
-
-def ellipsoid(semi_axes_m: tuple[float, float, float], relief_m: float = 0.0) -> tuple[Float64, Int32]:
-    """Return a triaxial ellipsoid as a closed mesh of 82,000 triangles: vertices float64[n, 3], m; faces int32.
-
-    Parameters
-    ----------
-    semi_axes_m
-        Semi-axes along x, y and z.
-    relief_m
-        Root mean square height of random relief, normal to the ellipsoid. It is the same for the same axes. With 0,
-        the ellipsoid is smooth.
-    """
-    import trimesh
-
-    sphere = trimesh.creation.icosphere(subdivisions=6)
-    axes = np.array(semi_axes_m)
-    points, faces = np.asarray(sphere.vertices) * axes, np.asarray(sphere.faces, dtype=np.int32)
-    if not relief_m:
-        return points, faces
-    wavelengths = _WAVELENGTHS * float(np.prod(axes)) ** (1 / 3)
-    amplitudes = _WAVELENGTHS**_HURST
-    amplitudes *= relief_m / (_GRADIENT_NOISE_STD * float(np.linalg.norm(amplitudes)))
-    normals = points / axes**2
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    height = fractal_noise(points + wavelengths[0] / 3, _RELIEF_SEED, wavelengths, amplitudes)
-    return points + height[:, None] * normals, faces
+if __name__ == "__main__":
+    vertices_m, faces = made_nucleus()
+    np.savez_compressed(data_dir("scenes") / "bodies" / "embedded.npz", vertices_m=vertices_m, faces=faces)
