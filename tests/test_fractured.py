@@ -234,5 +234,3 @@ def test_keys_of_the_scene() -> None:
     for key, value in (("dust_slope_deg", [40.0, 20.0]), ("apron", 0.0), ("border_m", 0.0), ("strata", -1.0)):
         with pytest.raises(InputError, match=key):
             load_scene("quickstart", {f"patch.fractured.{key}": value})
-    with pytest.raises(InputError, match="joints"):
-        Fractured(joints=5.0)

@@ -224,46 +224,25 @@ def test_wrong_files(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("settings", "says"),
     [
-        ({"unit": "km"}, "unit must be one of m, cm, mm; got 'km'"),
         ({"materials": {"wng": 0.5}}, "spacecraft material 'wng': no such name; the vehicle has bus, cells, "),
         (
             {"materials": {"wing": "chrome"}},
             "spacecraft material 'wing' = 'chrome': must be a grey value 0 to 1, a",
         ),
-        ({"materials": {"wing": 1.5}}, "spacecraft material 'wing' = 1.5: a grey value must be 0 to 1"),
-        ({"materials": {"wing": True}}, "a grey value must be 0 to 1"),
-        ({"default_material": float("nan")}, "spacecraft material 'default' = nan"),
-        ({"materials": {"wing": {"value": [1]}}}, "needs the keys wavelength_nm and value, got value"),
-        ({"materials": {"wing": {"wavelength_nm": [400, 500], "value": [0.1]}}}, "lists of equal length"),
-        (
-            {"materials": {"wing": {"wavelength_nm": [500, 400], "value": [0.1, 0.2]}}},
-            "must be above 0 and increase",
-        ),
-        ({"materials": {"wing": {"wavelength_nm": [400], "value": [1.2]}}}, r"value = \[1.2\]: must be 0 to 1"),
-        ({"materials": {"wing": {"wavelength_nm": ["red"], "value": [1]}}}, "must be lists of numbers"),
         (
             {"poses": {"leg": HingePose(hinge_B_m=(0, 0, 0), axis_B=(1, 0, 0))}},
             "spacecraft pose 'leg': no such name; the vehicle has bus, panel, wing, wing/panel, wing/yoke, yoke",
         ),
-        ({"placement": ModelPlacement(yaw_deg=float("inf"))}, "placement has numbers that are not finite"),
-        (
-            {"placement": ModelPlacement(translation_B_m=(0, 0, float("nan")))},
-            "placement has numbers that are not finite",
-        ),
     ],
 )
 def test_refused_settings(obj: Path, settings: dict[str, Any], says: str) -> None:
-    with np.errstate(invalid="ignore"), pytest.raises(InputError, match=says):
+    with pytest.raises(InputError, match=says):
         load_spacecraft(obj, **settings)
 
 
 def test_refused_poses() -> None:
     with pytest.raises(InputError, match=r"axis = \[0, 0, 0\]"):
         HingePose(hinge_B_m=(0, 0, 0), axis_B=(0, 0, 0))
-    with pytest.raises(InputError, match="finite numbers"):
-        HingePose(hinge_B_m=(0, 0, 0), axis_B=(0, 0, 1), angle_deg=float("nan"))
-    with pytest.raises(InputError, match="finite numbers"):
-        HingePose(hinge_B_m=(0, 0), axis_B=(0, 0, 1))  # type: ignore[arg-type]
 
 
 # ------------------------------------------------------------------------------------ poses

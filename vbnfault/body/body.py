@@ -12,7 +12,6 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core.errors import InputError
 from .geometry import Float64, Int32, centre_of_mass, face_normals_areas, signed_volume, vertex_normals
 from .gravity import PolyhedronGravity
 from .noise import fractal_noise
@@ -57,10 +56,6 @@ class Body:
     rotation_period_s: float = ROTATION_PERIOD_67P_S
 
     def __post_init__(self) -> None:
-        for key in ("density_kg_m3", "rotation_period_s"):
-            value = getattr(self, key)
-            if not (math.isfinite(value) and value > 0):
-                raise InputError(f"{self.name}: {key} must be positive and finite; got {value}.")
         for key, dtype in (("vertices_m", "<f8"), ("faces", "<i4")):
             array = np.array(getattr(self, key), dtype=dtype)
             array.setflags(write=False)
@@ -144,7 +139,7 @@ def load_body(
     Raises
     ------
     InputError
-        The shape cannot be used, or volume, density or period is not positive.
+        The shape cannot be used.
     """
     if str(shape) == EMBEDDED:
         vertices_m, faces = embedded_nucleus()
@@ -152,8 +147,6 @@ def load_body(
         vertices_m, faces = load_shape(shape, unit)
         vertices_m = sharpened(vertices_m, faces, sharpen)
     if volume_m3 is not None:
-        if not 0 < volume_m3 < np.inf:
-            raise InputError(f"volume_m3 = {volume_m3:g}: must be positive and finite")
         vertices_m = vertices_m * (volume_m3 / signed_volume(vertices_m, faces)) ** (1 / 3)
     return Body(
         name=name or (EMBEDDED if str(shape) == EMBEDDED else Path(shape).stem),

@@ -126,14 +126,8 @@ def choose_sites(body: Body, count: int, seed: int, *, max_slope_deg: float = MA
     Raises
     ------
     InputError
-        A parameter is out of its range. A site raises it at its first use if 1000 draws give no position.
+        A site raises it at its first use if 1000 draws give no position.
     """
-    if count < 0:
-        raise InputError(f"sites: must be 0 or more; got {count}.")
-    if seed < 0:
-        raise InputError(f"seed: must be 0 or more; got {seed}.")
-    if not 0.0 < max_slope_deg <= 90.0:
-        raise InputError(f"max_slope_deg: must be in (0, 90]; got {max_slope_deg}.")
     normals, areas = face_normals_areas(body.vertices_m, body.faces)
     cumulative = np.cumsum(areas)
     cos_bound = np.cos(np.radians(max_slope_deg))
