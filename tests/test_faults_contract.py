@@ -16,6 +16,7 @@ from test_faults_kit import make, make_context, noisy, noisy_electrons, with_mos
 
 from vbnfault.core.errors import InputError
 from vbnfault.core.quantities import LUMINANCE, RGBI
+from vbnfault.core.registry import undoing_registrations
 from vbnfault.detector.display import with_luminance
 from vbnfault.detector.mosaic import pattern
 from vbnfault.faults import (
@@ -29,7 +30,6 @@ from vbnfault.faults import (
     physical_order,
     registry,
 )
-from vbnfault.faults.models import undoing_registrations
 from vbnfault.faults.planes import scale_by_intensity
 from vbnfault.testing import check_fault
 

@@ -124,7 +124,7 @@ def _draw_fault(
 
 def _check_declaration(model: type[Fault], required: Mapping[str, Any]) -> None:
     """Check the class attributes and the fields of a model."""
-    assert models.is_registered(model), "is not registered; another class of this name has replaced it"
+    models.register(model)  # the same file may have been loaded again, as a scene's plug-in
     assert model.fault in physical_order([model.fault])
     assert model.__doc__, "has no docstring"
     assert set(model.steps) <= set(STEPS), f"acts at {model.steps}; must be among {STEPS}"
