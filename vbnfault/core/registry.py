@@ -125,7 +125,8 @@ def is_name(name: object) -> bool:
 
 def source_file(module: str) -> str:
     """Return the real path of a module's file, or the module's name; several modules may be made of one file."""
-    return os.path.realpath(getattr(sys.modules.get(module), "__file__", None) or module)
+    file = getattr(sys.modules.get(module), "__file__", None)
+    return os.path.realpath(file) if file else module
 
 
 def forget(file: str) -> None:

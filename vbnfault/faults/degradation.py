@@ -75,14 +75,6 @@ class GaussianDegradation(Fault):
         kernel = np.asarray(taps, dtype=np.float32)
         return quantity.with_array(_blur(quantity.array, quantity.white_e, kernel))
 
-    def reach_rows(self, params: Params) -> int:
-        """Return half the filter's size."""
-        return int(params["kernel_px"]) // 2
-
-    def apply_to_rows(self, quantity: Any, rows: slice, params: Params, context: FaultContext) -> Any:
-        """Return the expected electrons of some rows, first clipped to white, then filtered."""
-        return self.apply(quantity, params, context)
-
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
         """Return the whole image as bool[y, x]."""
         return np.ones(context.shape, dtype=bool)

@@ -212,15 +212,6 @@ class TextureStraylight(Fault):
         layer = self._layer_once(params, context, quantity.white_e)
         return quantity if layer is None else quantity.with_array(plus(quantity.array, layer))
 
-    def reach_rows(self, params: Params) -> int:
-        """Return 0: light is added to each pixel."""
-        return 0
-
-    def apply_to_rows(self, quantity: Any, rows: slice, params: Params, context: FaultContext) -> Any:
-        """Return the expected electrons of some rows plus flares and glare."""
-        layer = self._layer_once(params, context, quantity.white_e)
-        return quantity if layer is None else quantity.with_array(plus(quantity.array, layer[rows]))
-
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
         """Return the pixels where any channel gains at least `mask_level_dn`, bool[y, x]."""
         white = context.camera.detector.white_e

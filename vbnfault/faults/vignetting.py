@@ -67,15 +67,7 @@ class Cos4Vignetting(Fault):
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
         """Return the expected electrons times the factor of each pixel."""
-        return self.apply_to_rows(quantity, slice(None), params, context)
-
-    def reach_rows(self, params: Params) -> int:
-        """Return 0: each pixel has its own factor."""
-        return 0
-
-    def apply_to_rows(self, quantity: Any, rows: slice, params: Params, context: FaultContext) -> Any:
-        """Return the expected electrons of some rows times the factor of each pixel."""
-        cos4 = _cos4_planes(context.shape, context.camera.focal_length_px, quantity.array.shape[2])[rows]
+        cos4 = _cos4_planes(context.shape, context.camera.focal_length_px, quantity.array.shape[2])
         e0 = params["on_axis_illuminance_dn"] / 255
         out = buffers.empty(cos4.shape)
         cv2.multiply(quantity.array, cos4, dst=out, scale=e0)
