@@ -12,7 +12,6 @@ from typing import Any, ClassVar, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from . import buffers
 from .fine_light import FineLight
 
 CHANNELS = ("R", "G", "B", "I")
@@ -143,8 +142,7 @@ class Electrons(Quantity):
         """Return all light in one array, as the detector needs it. It is added anew, so that no copy is kept."""
         if self.past_rims is None:
             return self
-        array = buffers.empty(self.array.shape, self.array.dtype)
-        return replace(self, array=np.add(self.array, self.past_rims, out=array), past_rims=None)
+        return replace(self, array=self.array + self.past_rims, past_rims=None)
 
     def scaled(self, factor: float) -> Electrons:
         """Return all light multiplied by a factor; a plane of no light past the rims becomes None."""

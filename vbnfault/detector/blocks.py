@@ -9,9 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
-
-from ..core import buffers
 
 ROWS_PER_BLOCK = 64  # measured as the fastest for steps on one plane and on three colours
 
@@ -29,7 +28,7 @@ def blockwise(step: Callable[..., NDArray[Any]], array: NDArray[Any], *more: NDA
     first = of_block(0)
     if len(array) <= ROWS_PER_BLOCK:
         return first
-    out = buffers.empty((len(array), *first.shape[1:]), first.dtype)
+    out = np.empty((len(array), *first.shape[1:]), first.dtype)
     out[:ROWS_PER_BLOCK] = first
     for start in range(ROWS_PER_BLOCK, len(array), ROWS_PER_BLOCK):
         out[start : start + ROWS_PER_BLOCK] = of_block(start)

@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from ..core import buffers
 from ..core.architecture import READOUT_DIRECTIONS
 from ..core.errors import InputError
 from ..core.tables import table_class
@@ -452,8 +451,7 @@ def parasitic_light(
     if not exposure_s > 0:
         raise InputError(f"exposure_s = {exposure_s:g}: must be above 0")
     wait = row_wait_s(len(signal_e), row_period_s=row_period_s, direction=direction)
-    out: F32 = buffers.empty(signal_e.shape)
-    return np.multiply(signal_e, (1 + sensitivity / exposure_s * wait).astype(np.float32)[:, None], out=out)
+    return signal_e * (1 + sensitivity / exposure_s * wait).astype(np.float32)[:, None]
 
 
 # ---------------------------------------------------------------------------------------------------- helpers

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
-from ..core import buffers
 from ..core.llvm import backend
 from .poisson import poisson_cumulative, poisson_least_count
 
@@ -82,7 +81,7 @@ class NormalField:
     def values(self) -> F32:
         """Return the variates, float32[y, x, ...]."""
         codes, table = self.codes.reshape(-1), variates_by_code()
-        out = buffers.empty(codes.shape)
+        out = np.empty(codes.shape, np.float32)
         for start in range(0, codes.size, _CODES_AT_ONCE):
             part = slice(start, start + _CODES_AT_ONCE)
             np.take(table, codes[part], mode="clip", out=out[part])

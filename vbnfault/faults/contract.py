@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..camera import Camera
-from ..core import buffers
 from ..core.errors import under_key
 from ..core.quantities import RGBI, Charge, Electrons, Offset, Quantity, RawMosaic, soft_kind
 from ..core.registry import DeclarationError
@@ -260,7 +259,7 @@ def act(fault: Fault, light: Electrons, params: Params, context: FaultContext) -
     rims becomes the result for all light minus the result for the light before the rims, at least 0.
     """
     if fault.adds_past_rims:
-        past = buffers.zeros(light.array.shape) if light.past_rims is None else light.past_rims
+        past = np.zeros_like(light.array) if light.past_rims is None else light.past_rims
         return fault.apply(replace(light, past_rims=past), params, context)
     if light.past_rims is None:
         return fault.apply(light, params, context)
@@ -268,8 +267,7 @@ def act(fault: Fault, light: Electrons, params: Params, context: FaultContext) -
     if fault.at_rims:
         return replace(rest, past_rims=light.past_rims * np.float32(fault.passed_to_sun(params, context)))
     whole = fault.apply(light.merged, params, context)
-    past = np.subtract(whole.array, rest.array, out=buffers.empty(rest.array.shape))
-    return replace(rest, past_rims=np.maximum(past, 0, out=past))
+    return replace(rest, past_rims=np.maximum(whole.array - rest.array, 0))
 
 
 @dataclass(frozen=True, kw_only=True)

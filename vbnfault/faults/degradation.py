@@ -24,7 +24,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import buffers
 from .context import FaultContext, Params
 from .contract import Fault
 from .fields import Interval, Severity, bounds, flag
@@ -98,7 +97,7 @@ def _blur(
     height, width = array.shape[:2]
     white_row = np.tile(white_e, width)  # flat rows of width · channels values: far faster than broadcasting
     reach = len(kernel) // 2
-    out = buffers.empty(array.shape)
+    out = np.empty_like(array)
 
     def filter_rows(start: int) -> None:
         stop = min(height, start + step)

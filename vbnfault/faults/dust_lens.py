@@ -49,7 +49,7 @@ from ..lens.straylight.particles import DUST_INDEX
 from .context import FaultContext, Params
 from .contract import LensFault
 from .fields import Interval, Severity, bounds, number
-from .planes import add_to, reaches, times
+from .planes import reaches, times
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -139,7 +139,7 @@ class DefocusedDust(LensFault):
         """Return the expected electrons times the transmission of all grains, plus their glow."""
         out = times(quantity.array, _shadows_once(params, context).transmission)
         light = _glow_once(params, context)
-        return quantity.with_array(out if light is None else add_to(out, light))
+        return quantity.with_array(out if light is None else out + light)
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
         """Return the pixels where the loss reaches `mask_loss`, or the glow that fraction of white, bool[y, x].

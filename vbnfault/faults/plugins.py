@@ -203,10 +203,10 @@ def _load_file(path: str) -> Plugin:
     if known is not None and known.sha256 == digest:
         return known
     registry.forget(path)
-    for module, file in _imported_beside(path).items():  # so that what runs is what the digest covers
-        if getattr(sys.modules.get(module), "__file__", None) == str(file):
+    for helper, file in _imported_beside(path).items():  # so that what runs is what the digest covers
+        if registry.source_file(helper) == os.path.realpath(file):
             registry.forget(str(file))
-            del sys.modules[module]
+            del sys.modules[helper]
     stem = re.sub(r"\W", "_", Path(path).stem)
     name = f"{_FILE_MODULE}{stem}_{user_files.sha256(f'{path} {digest}'.encode())[:16]}"
     sys.modules[name] = module = ModuleType(name)  # a dataclass looks its module up
@@ -290,8 +290,9 @@ class _Finder(ModuleFinder):
         """Load a package as `ModuleFinder` does, or else only its folder."""
         with contextlib.suppress(ImportError):
             return super().load_package(fqname, pathname)
-        self.modules[fqname].__file__ = None
-        return self.modules[fqname]
+        package: Any = self.modules[fqname]
+        package.__file__ = None
+        return package
 
 
 def _imported_beside(path: str) -> dict[str, Path]:
@@ -302,8 +303,8 @@ def _imported_beside(path: str) -> dict[str, Path]:
     finder = _Finder(path=[folder], excludes=[PACKAGE.name])
     with contextlib.suppress(SyntaxError, ValueError):  # its execution will report them
         finder.run_script(path)
-    found = {name: Path(module.__file__) for name, module in finder.modules.items() if module.__file__}
-    return {name: file for name, file in found.items() if name != "__main__" and file != Path(path)}
+    files = {name: getattr(module, "__file__", None) for name, module in finder.modules.items()}
+    return {name: Path(file) for name, file in files.items() if file and file != path}
 
 
 # --- errors -------------------------------------------------------------------------------------------------

@@ -38,7 +38,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core import buffers
 from ...core.memory import release_unused
 from ...core.spectra import Bands
 from ..paraxial import paraxial_properties
@@ -540,7 +539,7 @@ class GlareSamples:
         """
         channels = table.astype(np.float32)
         index = self.index.astype(np.intp)  # numpy would convert it for every channel
-        out = buffers.empty((len(channels), *index.shape))
+        out = np.empty((len(channels), *index.shape), np.float32)
 
         def take(channel: int) -> None:
             plane = out[channel]
