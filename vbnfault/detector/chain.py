@@ -22,8 +22,9 @@ from numpy.typing import NDArray
 
 from ..core.errors import VbnfaultError
 from ..core.quantities import DEAD, HOT, RGBI, RTS, RTS_HIGH, STUCK, TRAP
+from .charge import transfer_dark_e
+from .compiled import luminance
 from .demosaic import bounded_at_edges, correct_defects, demosaic, interpolate
-from .display import luminance
 from .effects import Acts, Effect, Exposure, chain_of, is_packaged
 from .effects.electrons import upper_fraction
 from .effects.output import full_well_to_codes
@@ -33,7 +34,6 @@ from .mosaic import channel_of
 from .noise import NormalField, draw_normals
 from .readout import ReadoutIndividual, ReadoutNoise, read_out
 from .sensor import Sensor
-from .transfer import transfer_dark_e
 
 F32 = NDArray[np.float32]
 Raw = NDArray[np.uint16]

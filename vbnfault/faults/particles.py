@@ -58,7 +58,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core import spectra
-from ..detector.poisson import poisson_above_0
+from ..detector.noise import poisson_above_0
 from ..lens.streaks import Streaks, drawn, inside, pupil_support
 from .context import FaultContext, Params
 from .contract import Fault

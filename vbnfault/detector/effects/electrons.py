@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import compiled
+from ..charge import passing_dark_e
 from ..dark import Telegraph, silicon_factor
-from ..transfer import passing_dark_e
 from .contract import F32, Effect, Exposure, FaultStep
 
 

@@ -8,8 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from ..charge import parasitic_light, smear, smear_interline
-from ..transfer import along_columns
+from ..charge import along_columns, parasitic_light, smear, smear_interline
 from .contract import F32, Effect, Exposure, FaultStep
 
 
