@@ -25,7 +25,7 @@ from ..core.sundisc import Pinhole, add_mean, axes, bounds_px
 from .bsdf import Reflection, has_bands
 from .description import RenderInput, Sunlight, View, may_see_sun
 from .detail import Detail
-from .runtime import dr, mi
+from .runtime import columns, dr, mi
 from .sampling import SUN_DIMENSION, Limb, Optics, Pixels, Strata, SunDisc, mu, polynomial
 from .surface import TerrainMesh
 
@@ -150,15 +150,10 @@ def _traced_disc(surface: TerrainMesh, view: View, sun: Sunlight) -> SunInView |
     start_L = (
         view.position_L_m + np.column_stack([radius * np.cos(turn), radius * np.sin(turn)]) @ view.L_from_C.T[:2]
     )
-    rays = mi.Ray3f(mi.Point3f(*_columns(start_L)), mi.Vector3f(*_columns(towards_L)))
+    rays = mi.Ray3f(mi.Point3f(*columns(start_L)), mi.Vector3f(*columns(towards_L)))
     hidden = surface.seen_from(view).occluded(rays, mi.Bool(True)).numpy().astype(bool)
     visible = 1 - hidden.reshape(side, side, several).mean(axis=2)
     return replace(disc, visible=visible.astype(np.float32))
-
-
-def _columns(vectors: NDArray[np.float64]) -> list[Any]:
-    """Return the columns of an array as drjit floats."""
-    return [mi.Float(np.ascontiguousarray(column, np.float32)) for column in vectors.T]
 
 
 class Light:
