@@ -5,6 +5,7 @@ Arrays have their channels in the order R, G, B, alpha.
 
 from __future__ import annotations
 
+import io
 import struct
 import zlib
 from collections.abc import Mapping, Sequence
@@ -14,6 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from PIL import Image
 
 from .errors import InputError, VbnfaultError
 from .path_checks import real
@@ -115,24 +117,11 @@ def indexed_png(values: NDArray[np.uint8], palette: Sequence[tuple[int, int, int
     palette
         Up to four colours as R, G, B, opacity, 0 to 255.
     """
-    height, width = values.shape
-    padded = np.zeros((height, -(-width // 4) * 4), np.uint8)
-    padded[:, :width] = values
-    four = padded.reshape(height, -1, 4)
-    packed = four[..., 0] << 6 | four[..., 1] << 4 | four[..., 2] << 2 | four[..., 3]
-    lines = np.pad(packed, ((0, 0), (1, 0)))  # a line begins with the number of its filter, 0 for none
-    chunks = {
-        b"IHDR": struct.pack(">IIBBBBB", width, height, 2, 3, 0, 0, 0),
-        b"PLTE": bytes(value for colour in palette for value in colour[:3]),
-        b"tRNS": bytes(colour[3] for colour in palette),
-        b"IDAT": zlib.compress(lines.tobytes(), 9),
-        b"IEND": b"",
-    }
-    parts = [
-        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-        for kind, data in chunks.items()
-    ]
-    return b"".join([_PNG, *parts])
+    image = Image.fromarray(values, "P")
+    image.putpalette(bytes(value for colour in palette for value in colour[:3]))
+    file = io.BytesIO()
+    image.save(file, "png", bits=2, optimize=True, transparency=bytes(colour[3] for colour in palette))
+    return file.getvalue()
 
 
 def encoded(rgb: NDArray[np.uint8], ending: str, quality: int = 0) -> bytes:
