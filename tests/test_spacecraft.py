@@ -180,14 +180,6 @@ def test_placement(obj: Path) -> None:
         ("", "file is empty"),
         ("hello\n", "has no faces"),
         (CORNERS, "has no faces"),
-        (
-            CORNERS.replace("1 1 0", "1 nan 0") + "o wing\nf 1 2 3\n",
-            "line 3: expected 'v x y z', finite numbers, found '1 nan 0'",
-        ),
-        (
-            CORNERS.replace("1 1 0", "1 inf 0") + "o wing\nf 1 2 3\n",
-            "line 3: expected 'v x y z', finite numbers, found '1 inf 0'",
-        ),
         (CORNERS + "f 1 2 9\n", "line 8: expected vertex numbers from 1 to 7, found 9"),
         (CORNERS + "f 1 2 x\n", "line 8: expected 'f a b c', three vertex numbers or more, found '1 2 x'"),
         (CORNERS + "f 1 1 2\nf 3 3 3\n", "no face has an area"),
@@ -213,10 +205,6 @@ def test_malformed_glb(tmp_path: Path, content: bytes) -> None:
 
 
 def test_wrong_files(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="spacecraft file not found"):
-        load_spacecraft(tmp_path / "none.obj")
-    with pytest.raises(InputError, match="spacecraft is not a file"):
-        load_spacecraft(tmp_path)
     with pytest.raises(InputError, match=r"unsupported spacecraft type '\.stl'; allowed are \.obj, \.glb, \.gltf"):
         load_spacecraft(write(tmp_path, "solid", "a.stl"))
 
