@@ -376,7 +376,33 @@ def direct_in_cells(
         float32[cell]: half the signed difference between the mean signals of two halves of the cell's samples; 0 if
         there is one sample.
     """
-    return _InCells(surface, scene).means(cells, samples, weights)
+    tracer = Direct(surface, scene)
+    per_term = (tracer.weights / samples).astype(np.float32)
+    limb = tracer.mean_limb(weights)
+    count = len(cells.pixel)
+    out = np.zeros((per_term.shape[1], count), dtype=np.float32)
+    seen, halves = np.zeros(count, dtype=np.float32), np.zeros(count, dtype=np.float32)
+    factors = per_term.astype(np.float64) @ weights
+    done = 0
+    for part in cells.parts(max(1, WAVEFRONT // (samples * len(per_term)))):
+        strata = CellStrata(part, samples, scene.key, limb)
+        terms = tracer.terms(strata)
+        total = tracer.signal(terms, factors)
+        terms = [*terms, total, total * strata.checkered()]
+        dr.eval(*terms)
+        if samples > 1:
+            terms = [dr.block_sum(term, samples) for term in terms]
+            dr.eval(*terms)
+        span = slice(done, done + len(part.pixel))
+        done += len(part.pixel)
+        for row, term in zip(per_term, terms, strict=False):
+            values = term.numpy()
+            for band in np.flatnonzero(row):
+                out[band, span] += values * row[band]
+        seen[span] = terms[-2].numpy()
+        if samples > 1:
+            halves[span] = terms[-1].numpy()
+    return out, seen, halves
 
 
 class CellStrata(Strata):
@@ -422,36 +448,3 @@ class CellStrata(Strata):
         """Return +1 and -1 as on a chessboard: two halves of the samples that each cover the cell."""
         parity = (self.index ^ (self.index >> self._across)) & 1
         return 1 - 2 * mi.Float(parity)
-
-
-class _InCells(Direct):
-    """Compute the light of cells."""
-
-    def means(self, cells: Cells, samples: int, signal: NDArray[np.float64]) -> tuple[F32, F32, F32]:
-        """Return the outputs of `direct_in_cells`."""
-        weights = (self.weights / samples).astype(np.float32)
-        limb = self.mean_limb(signal)
-        count = len(cells.pixel)
-        out = np.zeros((weights.shape[1], count), dtype=np.float32)
-        seen, halves = np.zeros(count, dtype=np.float32), np.zeros(count, dtype=np.float32)
-        factors = weights.astype(np.float64) @ signal
-        done = 0
-        for part in cells.parts(max(1, WAVEFRONT // (samples * len(weights)))):
-            strata = CellStrata(part, samples, self.scene.key, limb)
-            terms = self.terms(strata)
-            total = self.signal(terms, factors)
-            terms = [*terms, total, total * strata.checkered()]
-            dr.eval(*terms)
-            if samples > 1:
-                terms = [dr.block_sum(term, samples) for term in terms]
-                dr.eval(*terms)
-            span = slice(done, done + len(part.pixel))
-            done += len(part.pixel)
-            for row, term in zip(weights, terms, strict=False):
-                values = term.numpy()
-                for band in np.flatnonzero(row):
-                    out[band, span] += values * row[band]
-            seen[span] = terms[-2].numpy()
-            if samples > 1:
-                halves[span] = terms[-1].numpy()
-        return out, seen, halves
