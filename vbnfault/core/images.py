@@ -5,17 +5,15 @@ Arrays have their channels in the order R, G, B, alpha.
 
 from __future__ import annotations
 
-import io
 import struct
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from PIL import Image
 
 from .errors import InputError, VbnfaultError
 from .path_checks import real
@@ -105,23 +103,6 @@ def write_png(path: Path, image: NDArray[Any], *, smallest: bool = False) -> Pat
         raise VbnfaultError(f"{path}: the image cannot be encoded as PNG")
     write_whole(path, data.tobytes())
     return path
-
-
-def indexed_png(values: NDArray[np.uint8], palette: Sequence[tuple[int, int, int, int]]) -> bytes:
-    """Return a PNG file of two bits a pixel: small masks of up to four colours.
-
-    Parameters
-    ----------
-    values
-        Number of the colour of each pixel, 0 to 3, [y, x].
-    palette
-        Up to four colours as R, G, B, opacity, 0 to 255.
-    """
-    image = Image.fromarray(values, "P")
-    image.putpalette(bytes(value for colour in palette for value in colour[:3]))
-    file = io.BytesIO()
-    image.save(file, "png", bits=2, optimize=True, transparency=bytes(colour[3] for colour in palette))
-    return file.getvalue()
 
 
 def encoded(rgb: NDArray[np.uint8], ending: str, quality: int = 0) -> bytes:

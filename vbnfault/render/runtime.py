@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import buffers, llvm
+from ..core import llvm
 
 llvm.prepare()
 
@@ -36,7 +36,7 @@ def packets(kind: Any, values: NDArray[Any]) -> Any:
     aligned, drjit fetches single numbers, by another kernel: the one in its cache on disk would serve only some of
     the processes.
     """
-    return kind(buffers.flat(values))
+    return kind(llvm.flat(values))
 
 
 def columns(vectors: NDArray[Any]) -> list[Any]:
