@@ -9,7 +9,6 @@ number.
 from __future__ import annotations
 
 import re
-import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import islice
@@ -21,7 +20,7 @@ from numpy.typing import NDArray
 
 from ..core import spice
 from ..core.errors import InputError
-from ..core.meshes import fans, joined, read_obj
+from ..core.meshes import fans, joined, numbers_of, read_obj
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
@@ -201,14 +200,8 @@ def _parsed(data: bytes) -> Float64 | None:
     text = data.translate(_FORTRAN)
     if not text.strip():
         return np.empty(0)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")  # some versions of numpy warn here, others raise
-        for clean in (lambda: text, lambda: _clean(text)):  # few files need the search for glued numbers
-            try:
-                return np.fromstring(clean(), dtype=np.float64, sep=" ")  # type: ignore[call-overload]
-            except (ValueError, DeprecationWarning):
-                continue
-    return None
+    values = numbers_of(text)
+    return numbers_of(_clean(text)) if values is None else values  # few files need the search for glued numbers
 
 
 def _numbers(data: bytes, source: str, lines: Lines = lambda line: line) -> Float64:
