@@ -89,8 +89,8 @@ def read_plate_table(data: bytes, source: str) -> Mesh:
 
     The numbers of vertices and plates stand at the start of the file, or each above its table. A vertex is `x y z`,
     a plate is three vertex numbers; each has a line of its own. Each may be preceded by its own number; a plate may
-    instead be preceded by the count 3, also on a line above it, as in OSIRIS's .ver files. Vertex numbers are counted
-    from 1, or from 0 if a 0 occurs. Columns of any width, commas and D exponents are accepted.
+    instead be preceded by the count 3, also on a line above it, as in OSIRIS's .ver files. Vertex numbers are
+    counted from 1, or from 0 if a 0 occurs. Columns of any width, commas and D exponents are accepted.
 
     Raises
     ------
