@@ -241,13 +241,6 @@ def test_67p_has_its_published_phase_coefficient_with_the_shadows_of_its_shape()
     assert np.polyfit(phases, sphere, 1)[0] < 0.95 * 0.047
 
 
-def test_67ps_albedos_per_filter() -> None:
-    # Fornasier et al. 2015, table 3
-    filters = {480: 0.0554, 535: 0.0589, 649: 0.0677, 700: 0.0720, 743: 0.0766, 882: 0.0780}
-    got = [sphere_flux(ground_at("67P", nm), 1e-5)[0] for nm in filters]
-    np.testing.assert_allclose(got, [*filters.values()], rtol=0.05)
-
-
 def test_the_light_of_a_sphere_falls_to_nothing_behind_150_deg() -> None:
     for ground in (registry()["hg"](), registry()["phase_curve"]()):
         model = ground.at(np.array([550.0]), np.array([0.1]))

@@ -8,7 +8,6 @@ from conftest import small_scene
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
-from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation as Reference
 
 from vbnfault.core import frames
@@ -50,12 +49,6 @@ def test_elementary_rotations_agree_with_scipy(degrees: float) -> None:
         expected = Reference.from_euler(name, degrees, degrees=True).as_matrix()
         # radians(720) carries 9e-16 of rounding into the entries
         np.testing.assert_allclose(make(np.radians(degrees)), expected, atol=5e-15)
-
-
-def test_quarter_turns_carry_the_axes_round() -> None:
-    x, y, z = np.eye(3)
-    for make, before, after in ((frames.rx, y, z), (frames.ry, z, x), (frames.rz, x, y)):
-        np.testing.assert_allclose(make(np.pi / 2) @ before, after, atol=1e-16)
 
 
 # -------------------------------------------------------------------------------------------- directions in L
@@ -110,11 +103,6 @@ def test_c0_has_the_axes_of_appendix_a(sun: np.ndarray) -> None:
     assert y @ down > 0
     np.testing.assert_allclose(x, np.cross(y, z), atol=1e-15)
     assert np.linalg.det(np.column_stack([x, y, z])) == pytest.approx(1, abs=1e-9)
-
-
-def test_c0_for_a_sun_in_the_north_is_written_out() -> None:
-    # Sun on the northern horizon: the picture's down is down, its right is east
-    np.testing.assert_allclose(frames.L_from_C0(np.array([1.0, 0, 0])).T, [[0, 1, 0], [0, 0, 1], [1, 0, 0]])
 
 
 @pytest.mark.parametrize("vertical", [1.0, -1.0])
@@ -175,14 +163,6 @@ def test_boresight_angle_agrees_with_the_matrices(sun: np.ndarray, roll: float, 
     assert float(frames.boresight_angle_deg(roll, pitch)) == pytest.approx(expected, abs=4e-6)
 
 
-def test_boresight_angle_takes_arrays() -> None:
-    np.testing.assert_allclose(
-        frames.boresight_angle_deg(np.array([0.0, 60.0, 180.0, 180.0]), np.array([30.0, 60.0, 0.0, 180.0])),
-        [30.0, np.degrees(np.arccos(0.25)), 180.0, 0.0],  # two half turns look at the Sun again
-        atol=1e-6,
-    )
-
-
 # ------------------------------------------------------------------------------------------------- quaternion
 
 
@@ -198,13 +178,6 @@ def test_quaternion_is_unit_w_first_and_gives_back_the_matrix(a: float, b: float
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
     np.testing.assert_allclose(back, matrix, atol=1e-13)
-
-
-def test_quaternion_of_known_turns() -> None:
-    h = np.sqrt(0.5)
-    np.testing.assert_allclose(frames.quaternion(np.eye(3)), [1, 0, 0, 0], atol=1e-16)
-    np.testing.assert_allclose(frames.quaternion(frames.rz(np.pi / 2)), [h, 0, 0, h], atol=1e-15)
-    np.testing.assert_allclose(frames.quaternion(frames.rx(-np.pi / 2)), [h, -h, 0, 0], atol=1e-15)
 
 
 # ------------------------------------------------------------------------------------------ smallest rotation
@@ -270,34 +243,6 @@ def test_subsolar_latitudes_of_67p(julian_date: float, subsolar_latitude_deg: fl
 def test_distance_of_67p() -> None:
     assert np.linalg.norm(ORBIT.position_J_au(2456875.5)) == pytest.approx(3.6007, abs=5e-5)
     assert np.linalg.norm(ORBIT.position_J_au(ORBIT.perihelion_jd)) == pytest.approx(ORBIT.perihelion_au, rel=1e-12)
-
-
-def test_orbit_obeys_keplers_laws() -> None:
-    e, q, n = ORBIT.eccentricity, ORBIT.perihelion_au, np.radians(ORBIT.mean_motion_deg_day)
-    a = q / (1 - e)
-    # third law with the Gaussian constant: n² a³ = k², the mean motion being printed to nine digits
-    assert n**2 * a**3 == pytest.approx(0.01720209895**2, rel=1e-7)
-    period = 2 * np.pi / n
-    dates = ORBIT.perihelion_jd + period * np.linspace(-0.5, 1.7, 23)
-    for date in dates:
-        # Kepler's equation by bisection; the conic r = a(1 - e cos E); one plane
-        mean = n * (date - ORBIT.perihelion_jd)
-        anomaly = brentq(lambda E, mean=mean: E - e * np.sin(E) - mean, mean - 2, mean + 2, xtol=1e-14)
-        r = ORBIT.position_J_au(date)
-        assert np.linalg.norm(r) == pytest.approx(a * (1 - e * np.cos(anomaly)), rel=1e-9)
-        np.testing.assert_allclose(ORBIT.position_J_au(date + period), r, atol=1e-7)
-    # second law: the areal velocity by central differences over 2 h is h = n a² √(1-e²), with one pole
-    h = 1 / 24
-    for date in dates:
-        velocity = (ORBIT.position_J_au(date + h) - ORBIT.position_J_au(date - h)) / (2 * h)
-        momentum = np.cross(ORBIT.position_J_au(date), velocity)
-        # truncation h²/6 · r‴/r' is below 1e-6 at perihelion
-        assert np.linalg.norm(momentum) == pytest.approx(n * a**2 * np.sqrt(1 - e * e), rel=1e-5)
-        ecliptic = frames.rx(np.radians(-23.4392911)) @ frames.unit(momentum)
-        assert np.degrees(np.arccos(ecliptic[2])) == pytest.approx(ORBIT.inclination_deg, abs=1e-4)
-        # the ascending node lies 90° behind the pole's projection
-        node = np.degrees(np.arctan2(ecliptic[0], -ecliptic[1])) % 360
-        assert node == pytest.approx(ORBIT.node_deg, abs=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -420,25 +365,6 @@ def test_commanded_attitude_puts_the_sun_where_commanded(
     commanded = frames.T_from_J_commanded(own, sun_J, sun_T)
     assert_proper_rotation(commanded)
     np.testing.assert_allclose(commanded @ sun_J, sun_T, atol=1e-14)
-
-
-def test_commanded_attitude_is_the_nearest_of_all_that_do_it() -> None:
-    rng = np.random.default_rng(8)
-    for _ in range(20):
-        own = Reference.random(random_state=rng).as_matrix()
-        sun_J, sun_T = (frames.unit(rng.normal(size=3)) for _ in range(2))
-        commanded = frames.T_from_J_commanded(own, sun_J, sun_T)
-
-        def turn_deg(attitude: np.ndarray, own: np.ndarray = own) -> float:
-            return float(np.degrees(Reference.from_matrix(attitude @ own.T).magnitude()))
-
-        # every other attitude that does it differs by a spin about the commanded Sun
-        spun = [
-            Reference.from_rotvec(s * sun_T, degrees=True).as_matrix() @ commanded
-            for s in np.r_[-170:181:10, -1, 1]
-            if s
-        ]
-        assert turn_deg(commanded) < min(turn_deg(a) for a in spun)
 
 
 def test_commanded_where_it_already_is_changes_nothing() -> None:

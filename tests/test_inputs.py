@@ -296,7 +296,7 @@ def test_objs_in_other_words_are_the_same_body(load: Callable[[Path], Any], tmp_
 @BOTH
 def test_vertices_of_an_obj_have_three_numbers(load: Callable[[Path], Any], tmp_path: Path) -> None:
     path = tmp_path / "cube.obj"
-    for bad in ("v 200.0 0.0", "v 200.0 0.0 x", "v 1 nan 1", "v 1 2 3 4 5", "v 1e400 0 0"):
+    for bad in ("v 200.0 0.0", "v 200.0 0.0 x", "v 1 nan 1", "v 1 inf 1", "v 1 2 3 4 5", "v 1e400 0 0"):
         path.write_text(obj(CUBE_F + 1).replace("v 200.0 0.0 0.0", bad, 1))
         assert f"line 6: expected 'v x y z', finite numbers, found {bad[2:]!r}" in refused(load, path)
 

@@ -26,7 +26,7 @@ from vbnfault.pipeline.stars import add_stars
 from vbnfault.render import sampling
 from vbnfault.render.detail import _LEVELS, _SIDE, _UNIT, _pyramid
 from vbnfault.render.runtime import mi
-from vbnfault.render.vehicle import World
+from vbnfault.render.surface import World
 from vbnfault.scene import config
 from vbnfault.world import assemble, sky
 

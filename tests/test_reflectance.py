@@ -15,7 +15,7 @@ from pydantic import Field
 from vbnfault import render
 from vbnfault.core.errors import InputError
 from vbnfault.reflectance import DiscReflectance, radiance_factor, registry
-from vbnfault.reflectance.hapke import COLUMNS, HAPKE_TABLES, Hapke, geometric_albedo, hapke_at, porosity_factor
+from vbnfault.reflectance.hapke import COLUMNS, HAPKE_TABLES, Hapke, geometric_albedo, hapke_at
 from vbnfault.render.description import RenderInput, Sunlight, View
 from vbnfault.scene import config
 from vbnfault.world import assemble
@@ -147,19 +147,6 @@ def test_hapke_against_eradiate() -> None:
 
 
 @pytest.mark.parametrize("name", SETS)
-def test_hapke_in_the_renderers_float32(name: str) -> None:
-    from vbnfault.render.runtime import dr, mi
-
-    expected = np.array([by_angles(*angles, SETS[name]) for angles in GRID])
-    light, view = (
-        tuple(mi.Float(np.ascontiguousarray(column)) for column in d.astype(np.float32).T) for d in directions(GRID)
-    )
-    got = model(SETS[name]).evaluate(dr, light, view)[0].numpy()
-    # cos 89.5° keeps 6e-8 / 9e-3 of itself, and two such cosines with their roughness factors multiply: 1e-4 asked
-    np.testing.assert_allclose(got, expected, rtol=1e-4)
-
-
-@pytest.mark.parametrize("name", SETS)
 def test_reciprocity(name: str) -> None:
     light, view = directions(GRID)
     there = radiance_factor(model(SETS[name]), light, view)[0] / light[:, 2]
@@ -214,11 +201,6 @@ def test_parameters_by_wavelength() -> None:
     own = ((500.0, 0.1, -0.3, 1.0, 0.05, 0.0, 1.0, 20.0, 1.0),)
     assert hapke_at(np.array([400.0]), own).roughness_deg == pytest.approx([20.0])
     assert all(len(row) == 1 + len(COLUMNS) for rows in HAPKE_TABLES.values() for row in rows)
-
-
-def test_porosity_factor() -> None:
-    # Hapke 2012 for 67P: K = 1.20 at a porosity of 87 % (Fornasier et al. 2015, table 4)
-    assert porosity_factor(1 - 0.87) == pytest.approx(1.20, abs=0.01)
 
 
 def test_disc_functions() -> None:

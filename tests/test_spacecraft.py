@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+import sys
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -15,12 +16,16 @@ import trimesh
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
-from vbnfault.core import spectra
+from vbnfault.core import meshes, spectra
 from vbnfault.core.errors import InputError
 from vbnfault.pipeline import Session
 from vbnfault.scene.config import parse_scene
 from vbnfault.world import spacecraft
 from vbnfault.world.spacecraft import HingePose, Material, ModelPlacement, Part, Spacecraft, load_spacecraft
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+
+import lander
 
 CORNERS = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv 0 0 1\nv 1 0 1\nv 1 1 1\n"
 OBJ = (
@@ -180,14 +185,6 @@ def test_placement(obj: Path) -> None:
         ("", "file is empty"),
         ("hello\n", "has no faces"),
         (CORNERS, "has no faces"),
-        (
-            CORNERS.replace("1 1 0", "1 nan 0") + "o wing\nf 1 2 3\n",
-            "line 3: expected 'v x y z', finite numbers, found '1 nan 0'",
-        ),
-        (
-            CORNERS.replace("1 1 0", "1 inf 0") + "o wing\nf 1 2 3\n",
-            "line 3: expected 'v x y z', finite numbers, found '1 inf 0'",
-        ),
         (CORNERS + "f 1 2 9\n", "line 8: expected vertex numbers from 1 to 7, found 9"),
         (CORNERS + "f 1 2 x\n", "line 8: expected 'f a b c', three vertex numbers or more, found '1 2 x'"),
         (CORNERS + "f 1 1 2\nf 3 3 3\n", "no face has an area"),
@@ -213,10 +210,6 @@ def test_malformed_glb(tmp_path: Path, content: bytes) -> None:
 
 
 def test_wrong_files(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="spacecraft file not found"):
-        load_spacecraft(tmp_path / "none.obj")
-    with pytest.raises(InputError, match="spacecraft is not a file"):
-        load_spacecraft(tmp_path)
     with pytest.raises(InputError, match=r"unsupported spacecraft type '\.stl'; allowed are \.obj, \.glb, \.gltf"):
         load_spacecraft(write(tmp_path, "solid", "a.stl"))
 
@@ -350,6 +343,13 @@ def posed(**angles_deg: float) -> Spacecraft:
 
 
 POSES: list[dict[str, float]] = [{}, {"solar": -90}, {"solar": 37, "antenna": -40, "leg": 100}]
+
+
+def test_the_default_vehicle_is_what_its_maker_makes() -> None:
+    made = meshes.read_obj(lander.lander().encode(), "made")
+    for part, kept in zip(made, spacecraft.default_spacecraft().parts, strict=True):
+        assert (part.name, part.material) == (kept.name, kept.material.name)
+        np.testing.assert_allclose(part.vertices[part.faces], kept.vertices_B_m[kept.faces], atol=1e-12)
 
 
 @pytest.mark.parametrize("angles", POSES)

@@ -266,6 +266,7 @@ _FADE = (1.6, 2.8)
 
 _CRATER_WIDTHS_M = (72.0, 36.0, 18.0, 9.0)  # cells; diameters are a third to two thirds of their width
 _CRATER_SHARE_PER_DENSITY = 1534e-6  # fraction of the cells, per crater of 10 m or more in a square kilometre
+_CLOD_CELLS_M = (2.1, 1.2, 0.7)
 _CRACK_DEPTH = 0.30  # of the cracks between blocks, per unit of the blocks' height
 
 
@@ -373,11 +374,31 @@ class Octaves:
             total += self._full(part, shows)
         return total
 
-    def clods(self, width_m: float, stream: int, fraction: float) -> Float32:
-        """Return the height of half-buried stones on cells of that width, metres."""
-        shows = 0.7 * width_m
-        part = self._points.clods(width_m, noise_key(self.seed, stream), self._count(shows), fraction)
-        return self._full(part, shows)
+    def clods(self) -> Float32:
+        """Return the height of half-buried stones of all sizes, metres."""
+        highest = np.zeros(len(self.facet_m), dtype=np.float32)
+        for number, width in enumerate(_CLOD_CELLS_M):
+            shows = 0.7 * width
+            part = self._points.clods(width, noise_key(self.seed, 160 + number), self._count(shows), 0.55)
+            highest = np.maximum(highest, self._full(part, shows))
+        return highest
+
+    def ledge(self, thickness_m: float, reach_m: float, hard: Float32, index: NDArray, inside: Float32) -> Float32:
+        """Return how far layers of one thickness stand out of a cliff, metres.
+
+        Parameters
+        ----------
+        reach_m
+            How far a hard layer stands out.
+        hard
+            Random hardness of layers, float32[k]; k is a power of two.
+        index, inside
+            Number of each point's layer, int64[n], and its position in it from 0 to 1.
+        """
+        ramp = np.clip(1.5 * self.facet_m / thickness_m, 0.12, 0.5).astype(np.float32)
+        below, here = hard[(index - 1) & (len(hard) - 1)], hard[index & (len(hard) - 1)]
+        blend = smooth_step(0, 1, inside / ramp)
+        return self.shown(thickness_m) * np.float32(reach_m) * (below + blend * (here - below) - 0.5)
 
 
 @lru_cache(maxsize=16)

@@ -9,7 +9,6 @@ number.
 from __future__ import annotations
 
 import re
-import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import islice
@@ -21,7 +20,7 @@ from numpy.typing import NDArray
 
 from ..core import spice
 from ..core.errors import InputError
-from ..core.meshes import fans, joined, read_obj
+from ..core.meshes import fans, joined, numbers_of, read_obj
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
@@ -89,9 +88,9 @@ def read_plate_table(data: bytes, source: str) -> Mesh:
     """Read a table of vertices and a table of triangular plates, as in the PDS Small Bodies Node's models.
 
     The numbers of vertices and plates stand at the start of the file, or each above its table. A vertex is `x y z`,
-    a plate is three vertex numbers. Each may be preceded by its own number; a plate may instead be preceded by the
-    count 3, as in OSIRIS's .ver files. Vertex numbers are counted from 1, or from 0 if a 0 occurs. Fixed and free
-    format, commas and D exponents are accepted.
+    a plate is three vertex numbers; each has a line of its own. Each may be preceded by its own number; a plate may
+    instead be preceded by the count 3, also on a line above it, as in OSIRIS's .ver files. Vertex numbers are
+    counted from 1, or from 0 if a 0 occurs. Columns of any width, commas and D exponents are accepted.
 
     Raises
     ------
@@ -99,34 +98,30 @@ def read_plate_table(data: bytes, source: str) -> Mesh:
         With the line: a token is not a number, a table differs from its count, a vertex number is out of range, or
         the vertices are given as latitude, longitude and radius.
     """
-    table = _numbers(data, source)
-    first = table[0]
+    table = _PlateTable(data, source)
+    counts = table.row(0)
+    first = counts[0]
     if not (first == np.floor(first) and 4 <= first < 2**31):
-        number = _token_line(data, 0)
-        raise InputError(
-            f"{source}: line {number}: expected the number of vertices, an integer of at least 4, found {first:g}."
-        )
-    layout = _layout(table)
-    if layout is None:
-        raise _table_error(data, table, source)
-    vertex_at, vertex_width, face_at, face_width, faces_n = layout
-    vertices_n = int(first)
-    vertices = table[vertex_at : vertex_at + vertex_width * vertices_n].reshape(-1, vertex_width)[:, -3:]
-    faces = table[face_at : face_at + face_width * faces_n].reshape(-1, face_width)[:, -3:]
-
-    def line(row: int) -> int:
-        """Return the line of a plate."""
-        return _token_line(data, face_at + face_width * row + face_width - 3)
-
-    mesh = _from_one(vertices, faces, source, line)
+        raise table.error(0, "the number of vertices, an integer of at least 4", f"{first:g}")
+    if len(counts) > 2:
+        raise table.error(0, "the number of vertices and of facets", f"{len(counts)} numbers")
+    vertices, at = table.block(1, int(first), "vertex", "vertices")
+    if len(counts) == 1:
+        counts = np.append(counts, table.row(at))
+        if len(counts) != 2 or counts[1] != np.floor(counts[1]):
+            given = _listed(counts[1:]) or "the end"
+            raise table.error(at, f"the number of facets after {len(vertices)} vertices", given)
+        at += 1
+    table.leave_out_corner_counts(at)
+    faces, end = table.block(at, int(counts[1]), "facet", "facets")
+    if end < len(table.lines):
+        expected = f"the end after {len(vertices)} vertices and {len(faces)} facets"
+        raise table.error(end, expected, f"{len(table.row(end))} more numbers")
+    mesh = _from_one(vertices, faces, source, lambda row: int(table.lines[at + row]))
     x, y, z = mesh[0].T
     # A Cartesian model centred on the body has vertices on both sides of the equator, so z is not always positive.
     if z.min() > 0 and np.abs(x).max() <= 90 and np.ptp(x) > 150 and y.min() >= -180 and np.ptp(y) > 300:
-        number = _token_line(data, vertex_at)
-        raise InputError(
-            f"{source}: line {number}: expected Cartesian coordinates, found what looks like latitude, longitude "
-            "and radius."
-        )
+        raise table.error(1, "Cartesian coordinates", "what looks like latitude, longitude and radius")
     return mesh
 
 
@@ -205,14 +200,8 @@ def _parsed(data: bytes) -> Float64 | None:
     text = data.translate(_FORTRAN)
     if not text.strip():
         return np.empty(0)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")  # some versions of numpy warn here, others raise
-        for clean in (lambda: text, lambda: _clean(text)):  # few files need the search for glued numbers
-            try:
-                return np.fromstring(clean(), dtype=np.float64, sep=" ")  # type: ignore[call-overload]
-            except (ValueError, DeprecationWarning):
-                continue
-    return None
+    values = numbers_of(text)
+    return numbers_of(_clean(text)) if values is None else values  # few files need the search for glued numbers
 
 
 def _numbers(data: bytes, source: str, lines: Lines = lambda line: line) -> Float64:
@@ -268,83 +257,63 @@ def _is_icq(data: bytes) -> bool:
     return after is not None and len(after[0].split()) > 1
 
 
-def _counted(column: Float64) -> bool:
-    """Return whether a column counts rows from 0 or from 1."""
-    return bool((column == np.arange(len(column)) + column[0]).all() and column[0] in (0, 1))
+class _PlateTable:
+    """Hold the rows of a text that have numbers, and their lines."""
 
+    def __init__(self, data: bytes, source: str) -> None:
+        self.source = source
+        # a NaN marks the end of every line
+        marked = _parsed(b" nan\n".join([*data.split(b"\n"), b""]))
+        ends = np.empty(0, np.int64) if marked is None else np.flatnonzero(~np.isfinite(marked))
+        if marked is None or len(ends) != data.count(b"\n") + 1:
+            _numbers(data, source)
+            raise InputError(f"{source}: its numbers are unreadable.")
+        self._values, self._widths = marked, np.diff(ends, prepend=-1) - 1
+        self._starts, self.lines = ends - self._widths, np.arange(1, len(ends) + 1)
+        self._keep(self._widths > 0)
 
-def _layout(table: Float64) -> tuple[int, int, int, int, int] | None:
-    """Return the first layout that fits the whole table, or None.
+    def _keep(self, chosen: NDArray[np.bool_]) -> None:
+        """Leave out all other rows."""
+        self._widths, self._starts, self.lines = (of[chosen] for of in (self._widths, self._starts, self.lines))
 
-    The layout is start and width of the vertices, then start, width and number of the facets.
-    """
-    vertices_n = int(table[0])
-    for both_first in (True, False):
-        for vertex_width in (4, 3):
-            vertex_at = 2 if both_first else 1
-            vertices_end = vertex_at + vertex_width * vertices_n
-            count_at = 1 if both_first else vertices_end
-            if count_at >= len(table) or vertices_end > len(table):
-                continue
-            faces_n = table[count_at]
-            face_at = vertices_end + (0 if both_first else 1)
-            for face_width in (4, 3):
-                if not (
-                    faces_n == np.floor(faces_n) and faces_n >= 1 and len(table) == face_at + face_width * faces_n
-                ):
-                    continue
-                vertices = table[vertex_at:vertices_end].reshape(-1, vertex_width)
-                faces = table[face_at:].reshape(-1, face_width)
-                if vertex_width == 4 and not _counted(vertices[:, 0]):
-                    continue
-                if face_width == 4 and not (_counted(faces[:, 0]) or (faces[:, 0] == 3).all()):
-                    continue
-                return vertex_at, vertex_width, face_at, face_width, int(faces_n)
-    return None
+    def row(self, number: int) -> Float64:
+        """Return the numbers of a row; none behind the last."""
+        if number >= len(self.lines):
+            return np.empty(0)
+        return self._values[self._starts[number] :][: self._widths[number]]
 
+    def leave_out_corner_counts(self, start: int) -> None:
+        """Leave out rows from `start` on that only say how many corners the facet in the next row has."""
+        if list(self.row(start)) == [3]:
+            self._keep((np.arange(len(self.lines)) < start) | (self._widths > 1))
 
-def _table_error(data: bytes, table: Float64, source: str) -> InputError:
-    """Return the error for a table without a layout, with the first line that contradicts the counts."""
+    def block(self, start: int, count: int, kind: str, kinds: str) -> tuple[Float64, int]:
+        """Return the last three numbers of `count` rows, float64[count, 3], and the row behind them.
 
-    def error(line: int, expected: str, given: str) -> InputError:
-        return InputError(f"{source}: line {line}: expected {expected}, found {given}.")
+        Rows may have a number in front, which counts them from 0 or 1, or is 3 of each.
+        """
+        widths = self._widths[start : start + count]
+        width = int(widths[0]) if len(widths) else 3
+        other = np.flatnonzero(widths != width) if width in (3, 4) else np.zeros(1, np.int64)
+        if len(other):
+            k = int(other[0])
+            allowed = f"{width} numbers" if width in (3, 4) else "3 or 4 numbers"
+            raise self.error(start + k, f"{allowed} for {kind} {k + 1} of {count}", str(widths[k]))
+        if len(widths) < count:
+            raise self.error(start + len(widths), f"{count} {kinds}", f"the end after {len(widths)}")
+        table = self._values[self._starts[start : start + count][:, None] + np.arange(width)]
+        if width == 4:
+            number, first = np.arange(count), table[0, 0] if count else 0
+            wrong = table[:, 0] != (3 if first == 3 else number + (1 if first else 0))
+            if wrong.any():
+                k = int(np.argmax(wrong))
+                raise self.error(start + k, f"number {k + 1} in front of a {kind}", f"{table[k, 0]:g}")
+        return table[:, -3:], start + count
 
-    rows: Iterator[tuple[int, list[bytes]]] = (
-        (number, row.split()) for number, row in enumerate(_clean(data).split(b"\n"), 1) if row.strip()
-    )
-    line, header = next(rows)
-    vertices_n = int(table[0])
-    if len(header) > 2:
-        return error(line, "the number of vertices and of facets", f"{len(header)} numbers")
-    faces_n = int(table[1]) if len(header) == 2 else 0
-    for kind, length in (("vertex", vertices_n), ("facet", None)):
-        if kind == "facet" and len(header) == 1:
-            line, row = next(rows, (line, []))
-            if len(row) != 1 or not row[0].isdigit():
-                return error(
-                    line, f"the number of facets after {vertices_n} vertices", b" ".join(row).decode() or "the end"
-                )
-            faces_n = int(row[0])
-        total = faces_n if length is None else length
-        width = 0
-        for k in range(1, total + 1):
-            line, row = next(rows, (line, []))
-            if not row:
-                return error(
-                    line, f"{total} {'vertices' if kind == 'vertex' else 'facets'}", f"the end after {k - 1}"
-                )
-            width = width or len(row)
-            if len(row) != width or width not in (3, 4):
-                width_allowed = f"{width} numbers" if width in (3, 4) else "3 or 4 numbers"
-                return error(line, f"{width_allowed} for {kind} {k} of {total}", str(len(row)))
-            if width == 4 and float(row[0]) not in (k, k - 1, 3):
-                return error(line, f"number {k} in front of a {kind}", row[0].decode())
-    line, row = next(rows, (line, []))
-    if row:
-        return error(line, f"the end after {vertices_n} vertices and {faces_n} facets", f"{len(row)} more numbers")
-    return error(
-        1, "the number of vertices and of facets, then the two tables", f"{len(table)} numbers in no such order"
-    )
+    def error(self, row: int, expected: str, given: str) -> InputError:
+        """Return the error for a row, or for the end."""
+        line = self.lines[min(row, len(self.lines) - 1)]
+        return InputError(f"{self.source}: line {line}: expected {expected}, found {given}.")
 
 
 # --- ICQ ----------------------------------------------------------------------------------------------------

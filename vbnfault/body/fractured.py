@@ -45,7 +45,6 @@ _LEDGES_M = ((9.0, 1.5), (3.3, 0.7), (1.2, 0.25))  # thickness of a layer, and h
 _JOINTS_M = ((46.0, 4.5), (17.0, 1.3), (6.5, 0.35))
 _POLYGONS_M = ((3.0, 0.22), (1.3, 0.10))
 _BASIN_M = (420.0, 170.0)
-_CLOD_CELLS_M = (2.1, 1.2, 0.7)
 _SHARED_M = 20.0  # longer octaves shape the large planes
 _SCARP_FACETS = 4.0  # least width of a scarp on the ground
 
@@ -221,11 +220,8 @@ def surface(noise: Octaves, rocks: Bedrock, broad: Float32, lie: Lie, spec: Frac
     for k, wavelength in noise.wavelengths(7.0, max(1.8 * float(noise.facet_m[0]), 0.05)):
         grit += np.float32(0.02 * wavelength**0.65) * noise.gradient(wavelength, 300 + k)
     dust = floor + depth + grit
-    clods = np.zeros_like(rock)
-    for number, width in enumerate(_CLOD_CELLS_M):
-        clods = np.maximum(clods, noise.clods(width, 160 + number, 0.55))
     strewn = 0.1 + 0.9 * smooth_step(-0.4, 1.4, noise.gradient(13.0, 170) + 0.6 * noise.gradient(41.0, 171))
-    dust = dust + clods * np.maximum(strewn, lie.talus)
+    dust = dust + noise.clods() * np.maximum(strewn, lie.talus)
     above = dust - rock
     cover = smooth_step(-0.5 * spec.border_m, spec.border_m, above) * rests
     # thin dust varies the albedo softly
@@ -271,8 +267,5 @@ def _ledges(noise: Octaves, elevation_m: Float64) -> Float32:
         coordinate = elevation_m + 0.25 * thickness * noise.gradient(5 * thickness, 150 + number)
         index, inside, _ = _layers(coordinate, thickness, (noise.seed, 5, number))
         hard = _random((noise.seed, 6, number))
-        ramp = np.clip(1.5 * noise.facet_m / thickness, 0.12, 0.5).astype(np.float32)
-        below, here = hard[(index - 1) & _LAST], hard[index & _LAST]
-        blend = smooth_step(0, 1, inside / ramp)
-        total += noise.shown(thickness) * np.float32(reach) * (below + blend * (here - below) - 0.5)
+        total += noise.ledge(thickness, reach, hard, index, inside)
     return total

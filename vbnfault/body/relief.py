@@ -46,8 +46,6 @@ _TERRACE_M = (5.5, 2.6)  # height of a step, and of the smaller steps between th
 _BLOCKS_M = ((17.0, 1.9), (6.0, 0.95), (2.2, 0.40), (0.85, 0.14))
 _STRATA_M = ((9.0, 1.3), (3.1, 0.55), (1.1, 0.20))  # thickness of a layer, and how far a hard layer stands out
 
-_CLOD_CELLS_M = (2.1, 1.2, 0.7)
-
 _DUST_LEAVES_DEG = (27.0, 40.0)  # dust lies on slopes below the first, and has slid off slopes above the second
 _BARE_DEG = (30.0, 44.0)  # slopes below the first are loose ground, slopes above the second consolidated
 _CLIFF_DEG = (38.0, 52.0)
@@ -269,11 +267,8 @@ def _surface(
     depth -= 9.0 * smooth_step(*_DUST_LEAVES_DEG, slope)
     ripples = 0.5 + 0.5 * np.tanh(noise.gradient(40.0, 132))
     dust = broad + depth + grit + 0.05 * ripples * noise.gradient(4.5, 133)
-    clods = np.zeros_like(rock)
-    for number, width in enumerate(_CLOD_CELLS_M):
-        clods = np.maximum(clods, noise.clods(width, 160 + number, 0.55))
     strewn = 0.15 + 0.85 * smooth_step(-0.4, 1.4, noise.gradient(13.0, 170) + 0.6 * noise.gradient(41.0, 171))
-    dust = dust + clods * np.maximum(strewn, talus)
+    dust = dust + noise.clods() * np.maximum(strewn, talus)
     cover = smooth_step(-0.12, 0.30, dust - rock)
     # Stones and lumps of the ground below show through thin dust.
     return smooth_max(rock, dust, 0.30), cover
@@ -288,10 +283,7 @@ def _strata(noise: Octaves, elevation: Float64) -> Float32:
         layer = np.floor(u)
         k = layer.astype(np.int64)
         inside = (u - layer).astype(np.float32)
-        ramp = np.clip(1.5 * noise.facet_m / thickness, 0.12, 0.5).astype(np.float32)
-        blend = smooth_step(0, 1, inside / ramp)
-        below, here = hard[(k - 1) & 4095], hard[k & 4095]
-        total += noise.shown(thickness) * np.float32(reach) * (below + blend * (here - below) - 0.5)
+        total += noise.ledge(thickness, reach, hard, k, inside)
     return total
 
 

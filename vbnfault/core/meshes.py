@@ -191,15 +191,19 @@ def _values(lines: list[bytes]) -> tuple[F64, I64]:
 
     Both are empty where the text holds anything but numbers. A "nan" in the text shows as an additional index.
     """
-    if not lines:
-        return np.empty(0), np.empty(0, dtype=np.int64)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")  # some versions of numpy warn here, others raise
-            values = np.fromstring(b" nan\n".join([*lines, b""]), dtype=np.float64, sep=" ")  # type: ignore[call-overload]
-    except (ValueError, DeprecationWarning):
-        return np.empty(0), np.empty(0, dtype=np.int64)
+    values = numbers_of(b" nan\n".join([*lines, b""])) if lines else None
+    values = np.empty(0) if values is None else values
     return values, np.flatnonzero(np.isnan(values))
+
+
+def numbers_of(text: bytes) -> F64 | None:
+    """Return all numbers of a text, or None if anything else is in it; "nan" and overflows are accepted."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # some versions of numpy warn here, others raise
+        try:
+            return np.fromstring(text, dtype=np.float64, sep=" ")  # type: ignore[call-overload]
+        except (ValueError, DeprecationWarning):
+            return None
 
 
 def fans(index: I64, corners: I64) -> I64:
@@ -342,32 +346,33 @@ class _Gltf:
                 c for node in nodes if isinstance(node, dict) for c in _list(node.get("children")) if type(c) is int
             }
             roots = [k for k in range(len(nodes)) if k not in below]
-        base = ""  # path of the root node "world", which some writers add without need
-        seen: set[int] = set()
-        waiting = [(k, "", np.eye(4), 0) for k in reversed(_list(roots))]
-        only = len(waiting) == 1
-        while waiting:
-            k, path, V_from_above, depth = waiting.pop()
-            node = self.item("nodes", k, "node")
-            where = f"nodes[{k}]"
-            if k in seen:
-                raise InputError(f"{self.source}: {where}: is below two nodes, or below itself.")
-            if depth > MAX_NODE_DEPTH:
-                raise InputError(f"{self.source}: {where}: lies below more than {MAX_NODE_DEPTH} nodes.")
-            seen.add(k)
-            name = str(node.get("name", f"node_{k}"))[:_LONGEST_NAME].replace("/", "_")
-            children = node.get("children", [])
-            if not isinstance(children, list):
-                raise self.error(f"{where}.children", children, "a list")
-            if only and depth == 0 and name == "world" and "mesh" not in node:
-                own = base
-            else:
-                own = f"{path}/{name}" if path else name
-            with np.errstate(over="ignore", invalid="ignore"):
-                V_from_node = V_from_above @ self.transform(node, where)
-            if "mesh" in node:
-                yield own, node["mesh"], V_from_node
-            waiting += [(c, own, V_from_node, depth + 1) for c in reversed(children)]
+        roots, seen = _list(roots), set[int]()
+        for k in roots:
+            yield from self._below(k, "", np.eye(4), 0, seen, alone=len(roots) == 1)
+
+    def _below(
+        self, k: Any, path: str, V_from_above: F64, depth: int, seen: set[int], *, alone: bool = False
+    ) -> Iterator[tuple[str, int, F64]]:
+        """Yield what `instances` yields of a node and of the nodes below it."""
+        node = self.item("nodes", k, "node")
+        where = f"nodes[{k}]"
+        if k in seen:
+            raise InputError(f"{self.source}: {where}: is below two nodes, or below itself.")
+        if depth > MAX_NODE_DEPTH:
+            raise InputError(f"{self.source}: {where}: lies below more than {MAX_NODE_DEPTH} nodes.")
+        seen.add(k)
+        name = str(node.get("name", f"node_{k}"))[:_LONGEST_NAME].replace("/", "_")
+        children = node.get("children", [])
+        if not isinstance(children, list):
+            raise self.error(f"{where}.children", children, "a list")
+        if not (alone and name == "world" and "mesh" not in node):  # a root that some writers add without need
+            path = f"{path}/{name}" if path else name
+        with np.errstate(over="ignore", invalid="ignore"):
+            V_from_node = V_from_above @ self.transform(node, where)
+        if "mesh" in node:
+            yield path, node["mesh"], V_from_node
+        for child in children:
+            yield from self._below(child, path, V_from_node, depth + 1, seen)
 
     def transform(self, node: Mapping[str, Any], where: str) -> F64:
         """Return the matrix float64[4, 4] from a node's axes to those of the node above."""

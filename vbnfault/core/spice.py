@@ -11,7 +11,7 @@ module neither sees nor changes the program's kernels. The separate process keep
 are therefore loaded only within a `with` block:
 
     with kernels("mission.tm"):
-        et_s = et_s_from_utc("2014-08-06T00:00:00")
+        et_s = et_s_from_julian_date(2456875.5)
         sun_J_au = sun_position_J_au("CHURYUMOV-GERASIMENKO", et_s)
         T_from_J = J_from_T("67P/C-G_CK", et_s).T
 """
@@ -61,8 +61,6 @@ _MEANINGS = {
     "SPICE(KERNELVARNOTFOUND)": "a constant of that body is missing from the kernels",
     "SPICE(UNKNOWNFRAME)": "the kernels define no such frame",
     "SPICE(IDCODENOTFOUND)": "the kernels know no body of that name",
-    "SPICE(NOLEAPSECONDS)": "no leap-second kernel is loaded",
-    "SPICE(MISSINGTIMEINFO)": "no leap-second kernel is loaded",
 }
 
 
@@ -122,11 +120,6 @@ def kernels(*paths: str | Path) -> Iterator[None]:
                 _ask("SPICE kernels", "unload", before)
 
 
-def loaded() -> int:
-    """Return the number of kernels that are currently loaded."""
-    return int(_ask("SPICE kernels", "loaded"))
-
-
 def read_dsk(path: str | Path) -> tuple[F64, NDArray[np.int64]]:
     """Return the triangular plates of a NAIF DSK: those of all its segments of type 2.
 
@@ -167,17 +160,6 @@ def et_s_from_julian_date(julian_date: float) -> float:
 def julian_date_from_et_s(et_s: float) -> float:
     """Return the TDB Julian date of an ephemeris time, which is in seconds TDB past J2000.0."""
     return J2000_JD + et_s / SECONDS_PER_DAY
-
-
-def et_s_from_utc(utc: str) -> float:
-    """Return the ephemeris time, in seconds TDB past J2000.0, of a UTC text such as "2014-08-06T12:00:00".
-
-    Raises
-    ------
-    InputError
-        No leap-second kernel is loaded, or the text does not state a time.
-    """
-    return float(_ask(f"UTC {utc!r}", "str2et", utc))
 
 
 def sun_position_J_au(target: str, et_s: float) -> F64:
@@ -531,7 +513,6 @@ _QUESTIONS: dict[str, Callable[..., Any]] = {
     "load": _load,
     "unload": _unload,
     "loaded": lambda spiceypy: spiceypy.ktotal("ALL"),
-    "str2et": lambda spiceypy, utc: spiceypy.str2et(utc),
     "position_km": lambda spiceypy, body, et_s, frame, target: np.asarray(
         spiceypy.spkpos(body, et_s, frame, "NONE", target)[0], dtype=np.float64
     ),

@@ -11,8 +11,8 @@ import hashlib
 import os
 import stat
 from collections.abc import Sequence
+from io import BufferedReader
 from pathlib import Path
-from typing import BinaryIO
 
 from . import path_checks
 from .errors import InputError
@@ -38,7 +38,6 @@ LIMIT_BYTES: dict[str, int] = {
     "star catalogue": 64 * MIB,
     "SPICE text kernel": 256 * MIB,
 }
-_READ_BYTES = 16 * MIB
 
 
 def read_input(path: str | Path, what: str, *, types: Sequence[str] = (), limit_bytes: int | None = None) -> bytes:
@@ -98,15 +97,12 @@ def sha256_of_input(path: str | Path, what: str) -> str:
         return _sha256_of(file)
 
 
-def _sha256_of(file: BinaryIO) -> str:
+def _sha256_of(file: BufferedReader) -> str:
     """Return the SHA-256 (hex) of an open file, read in pieces."""
-    digest = hashlib.sha256()
-    while data := file.read(_READ_BYTES):
-        digest.update(data)
-    return digest.hexdigest()
+    return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _opened(path: Path, what: str, types: Sequence[str], limit_bytes: int) -> BinaryIO:
+def _opened(path: Path, what: str, types: Sequence[str], limit_bytes: int) -> BufferedReader:
     """Return an open, regular file of one of `types`, neither empty nor too large. Raises InputError."""
     try:
         return _opened_now(path, what, types, limit_bytes)
@@ -116,7 +112,7 @@ def _opened(path: Path, what: str, types: Sequence[str], limit_bytes: int) -> Bi
         raise
 
 
-def _opened_now(path: Path, what: str, types: Sequence[str], limit_bytes: int) -> BinaryIO:
+def _opened_now(path: Path, what: str, types: Sequence[str], limit_bytes: int) -> BufferedReader:
     """Return the open file as `_opened` does, but without comparing it with an earlier reading."""
     status = path_checks.file_status(path)
     if status is None:

@@ -204,12 +204,6 @@ def hapke_at(wavelength_nm: ArrayLike, table: str | tuple[tuple[float, ...], ...
     return Hapke(**columns)
 
 
-def porosity_factor(filling: float) -> float:
-    """Return K for a filling factor φ, 0 < φ < 0.75 (Hapke 2008, Icarus 195, 918); a dilute medium has K = 1."""
-    x = 1.209 * filling ** (2 / 3)
-    return float(-np.log(1 - x) / x)
-
-
 def geometric_albedo(model: Hapke) -> F64:
     """Return the geometric albedo A_geo of a smooth sphere, float64[band] (Hapke 2012, eq. 11.34 with K = 1).
 

@@ -44,7 +44,43 @@ class GroundPoints:
     sun_L: Any
 
 
-class AlbedoMap:
+class GroundAlbedo:
+    """Hold what albedos of the ground in three colours share.
+
+    Parameters
+    ----------
+    wavelength_nm
+        Bands, float64[band].
+    reference_band
+        Index of the band of `at_reference`.
+    T_from_L, site_T_m
+        Rotation float64[3, 3] and position float64[3] in m of the axes L in the body-fixed frame T.
+    """
+
+    def __init__(self, *, wavelength_nm: F64, reference_band: int, T_from_L: F64, site_T_m: F64) -> None:
+        order = np.argsort(_RGB_NM)
+        hats = [np.interp(wavelength_nm, np.array(_RGB_NM)[order], np.eye(3)[k][order]) for k in range(3)]
+        self._weights = np.stack(hats, axis=1)
+        self._reference = reference_band
+        self._axes = [mi.Vector3f(*map(float, row)) for row in T_from_L]
+        self._site = [float(x) for x in site_T_m]
+
+    def _in_T(self, ground: GroundPoints) -> list[Any]:
+        """Return the coordinates of points in T; those of a ray that hits nothing are finite, too."""
+        point = dr.select(ground.valid, mi.Vector3f(ground.point_L_m), 0)
+        return [dr.dot(axis, point) + s for axis, s in zip(self._axes, self._site, strict=True)]
+
+    def _in_bands(self, colours: Any) -> list[Any]:
+        """Return the sum of the colours in each band."""
+        return [self._in_band(k, colours) for k in range(len(self._weights))]
+
+    def _in_band(self, band: int, colours: Any) -> Any:
+        """Return the sum of the colours in a band."""
+        weights = self._weights[band]
+        return sum((v * float(w) for w, v in zip(weights, colours, strict=True) if w), mi.Float(0))
+
+
+class AlbedoMap(GroundAlbedo):
     """Hold an equirectangular map of factors on the albedo, at several levels of resolution.
 
     Parameters
@@ -54,24 +90,12 @@ class AlbedoMap:
         north to south; the first and the last row hold the value at the pole.
     left_longitude_deg
         East longitude of the left edge.
-    wavelength_nm
-        Bands, float64[band].
-    reference_band
-        Index of the band of `at_reference`.
-    T_from_L, site_T_m
-        Rotation float64[3, 3] and position float64[3] in m of the axes L in the body-fixed frame T.
+    shared
+        Parameters of `GroundAlbedo`.
     """
 
-    def __init__(
-        self,
-        levels: Sequence[NDArray[np.float32]],
-        left_longitude_deg: float,
-        *,
-        wavelength_nm: F64,
-        reference_band: int,
-        T_from_L: F64,
-        site_T_m: F64,
-    ) -> None:
+    def __init__(self, levels: Sequence[NDArray[np.float32]], left_longitude_deg: float, **shared: Any) -> None:
+        super().__init__(**shared)
         channels = levels[0].shape[2]
         self.coloured = channels > 1
         sizes = np.array([level.shape[0] * level.shape[1] for level in levels])
@@ -84,14 +108,8 @@ class AlbedoMap:
             mi.Float(np.concatenate([level[..., k].ravel() for level in levels])) for k in range(channels)
         ]
         self._left_rad = float(np.radians(left_longitude_deg))
-        order = np.argsort(_RGB_NM)
-        self._weights = np.ones((len(wavelength_nm), 1))
-        if self.coloured:
-            hats = [np.interp(wavelength_nm, np.array(_RGB_NM)[order], np.eye(3)[k][order]) for k in range(3)]
-            self._weights = np.stack(hats, axis=1)
-        self._reference = reference_band
-        self._axes = [mi.Vector3f(*map(float, row)) for row in T_from_L]
-        self._site = [float(x) for x in site_T_m]
+        if not self.coloured:
+            self._weights = np.ones((len(self._weights), 1))
 
     def factors(self, ground: GroundPoints) -> tuple[list[Any], None]:
         """Return the factors on the albedo, for each band or one if the map is grey, and None: no water.
@@ -99,21 +117,17 @@ class AlbedoMap:
         Details of the map that are finer than the footprint of the points are averaged.
         """
         values = self._sampled(ground)
-        return ([_sum(row, values) for row in self._weights] if self.coloured else values), None
+        return (self._in_bands(values) if self.coloured else values), None
 
     def at_reference(self, ground: GroundPoints) -> Any:
         """Return the factor in the reference band at the valid points."""
-        return _sum(self._weights[self._reference], self._sampled(ground))
+        return self._in_band(self._reference, self._sampled(ground))
 
     def _sampled(self, ground: GroundPoints) -> list[Any]:
         """Return the value of each channel, bilinear within the level that fits the footprint."""
         # a ray that hits nothing ends at infinity, and an index made of that would lie outside the tables
-        valid = ground.valid
-        point, footprint_m = (
-            dr.select(valid, mi.Vector3f(ground.point_L_m), 0),
-            dr.select(valid, ground.footprint_m, 1),
-        )
-        x, y, z = (dr.dot(axis, point) + s for axis, s in zip(self._axes, self._site, strict=True))
+        footprint_m = dr.select(ground.valid, ground.footprint_m, 1)
+        x, y, z = self._in_T(ground)
         across = dr.sqrt(x * x + y * y)
         longitude, latitude = dr.atan2(y, x), dr.atan2(z, across)
         texels = footprint_m / dr.maximum(dr.sqrt(across * across + z * z) * self._texel_rad, 1e-6)
@@ -141,8 +155,3 @@ class AlbedoMap:
             )
             out.append(dr.lerp(upper, lower, v))
         return out
-
-
-def _sum(weights: F64, values: list[Any]) -> Any:
-    """Return the weighted sum of drjit values."""
-    return sum((v * float(w) for w, v in zip(weights, values, strict=True) if w), mi.Float(0))

@@ -20,13 +20,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .albedo import GroundPoints, Mirror
+from .albedo import GroundAlbedo, GroundPoints, Mirror
 from .runtime import dr, mi
 
 F64 = NDArray[np.float64]
 
 # Albedo at 650, 550 and 450 nm.
-_RGB_NM = (650.0, 550.0, 450.0)
 _OCEAN, _SHELF = (0.022, 0.035, 0.060), (0.035, 0.075, 0.095)
 _FOREST, _STEPPE = (0.050, 0.072, 0.034), (0.170, 0.150, 0.085)
 _DESERT, _ROCK = (0.420, 0.315, 0.200), (0.230, 0.185, 0.140)
@@ -67,44 +66,27 @@ _STORMS = (
 )
 
 
-class EarthAlbedo:
+class EarthAlbedo(GroundAlbedo):
     """Compute factors on the albedo in the way of `albedo.AlbedoMap`.
 
     Parameters
     ----------
     radius_m
         Radius of the body.
-    wavelength_nm
-        Bands, float64[band].
-    reference_band
-        Index of the band of `at_reference`.
-    T_from_L, site_T_m
-        Rotation float64[3, 3] and position float64[3] in m of the axes L in the body-fixed frame T.
     air_depth
         Optical depth of the air straight up, float64[band]. Air takes twice as much of a mirrored beam as of the
         light of other ground, for which `atmosphere` assumes that half of what is scattered still arrives.
+    shared
+        Parameters of `GroundAlbedo`.
     """
 
     coloured = True
 
-    def __init__(
-        self,
-        radius_m: float,
-        *,
-        wavelength_nm: F64,
-        reference_band: int,
-        T_from_L: F64,
-        site_T_m: F64,
-        air_depth: F64,
-    ) -> None:
-        order = np.argsort(_RGB_NM)
-        hats = [np.interp(wavelength_nm, np.array(_RGB_NM)[order], np.eye(3)[k][order]) for k in range(3)]
-        self._weights = np.stack(hats, axis=1) / MEAN_ALBEDO
-        self._reference = reference_band
+    def __init__(self, radius_m: float, *, air_depth: F64, **shared: Any) -> None:
+        super().__init__(**shared)
+        self._weights = self._weights / MEAN_ALBEDO
         self._radius_m = radius_m
         self._air_depth = [float(depth) for depth in air_depth]
-        self._axes = [mi.Vector3f(*map(float, row)) for row in T_from_L]
-        self._site = [float(x) for x in site_T_m]
 
     def factors(self, ground: GroundPoints) -> tuple[list[Any], Mirror]:
         """Return the factors on the albedo, one for each band, and a function for the light that water mirrors.
@@ -112,7 +94,7 @@ class EarthAlbedo:
         Details finer than the footprint of the points are left out.
         """
         colour, water = self._seen(ground, shadows=True)
-        return [_weighted(row, colour) for row in self._weights], partial(self._mirrored, water)
+        return self._in_bands(colour), partial(self._mirrored, water)
 
     def _mirrored(self, water: Any, light: Any, view: Any) -> list[Any]:
         """Return the radiance of water in each band over the irradiance on a plane that faces the Sun, in 1/sr.
@@ -124,14 +106,11 @@ class EarthAlbedo:
 
     def at_reference(self, ground: GroundPoints) -> Any:
         """Return the factor in the reference band, without the shadows of clouds."""
-        return _weighted(self._weights[self._reference], self._seen(ground, shadows=False)[0])
+        return self._in_band(self._reference, self._seen(ground, shadows=False)[0])
 
     def _seen(self, ground: GroundPoints, *, shadows: bool) -> tuple[Any, Any]:
         """Return the albedo at 650, 550 and 450 nm, and the fraction of open water."""
-        point = dr.select(ground.valid, mi.Vector3f(ground.point_L_m), 0)
-        up = dr.normalize(
-            mi.Vector3f(*(dr.dot(axis, point) + s for axis, s in zip(self._axes, self._site, strict=True)))
-        )
+        up = dr.normalize(mi.Vector3f(*self._in_T(ground)))
         footprint = dr.maximum(ground.footprint_m / self._radius_m, _SMALLEST_RAD)
         footprint = dr.select(ground.valid, footprint, _NO_DETAIL)
         view, sun = (mi.Vector3f(*(dr.dot(axis, d) for axis in self._axes)) for d in (ground.view_L, ground.sun_L))
@@ -331,8 +310,3 @@ def _noise(point: Any, seed: Any) -> Any:
             weight *= w if side else 1 - w
         value += weight * dr.dot(gradient, part - mi.Vector3f(offset))
     return value
-
-
-def _weighted(weights: F64, colour: Any) -> Any:
-    """Return the weighted sum of three channels."""
-    return sum((c * float(w) for w, c in zip(weights, colour, strict=True) if w), mi.Float(0))

@@ -25,7 +25,7 @@ from ..core.sundisc import Pinhole, add_mean, axes, bounds_px
 from .bsdf import Reflection, has_bands
 from .description import RenderInput, Sunlight, View, may_see_sun
 from .detail import Detail
-from .runtime import dr, mi
+from .runtime import columns, dr, mi
 from .sampling import SUN_DIMENSION, Limb, Optics, Pixels, Strata, SunDisc, mu, polynomial
 from .surface import TerrainMesh
 
@@ -150,15 +150,10 @@ def _traced_disc(surface: TerrainMesh, view: View, sun: Sunlight) -> SunInView |
     start_L = (
         view.position_L_m + np.column_stack([radius * np.cos(turn), radius * np.sin(turn)]) @ view.L_from_C.T[:2]
     )
-    rays = mi.Ray3f(mi.Point3f(*_columns(start_L)), mi.Vector3f(*_columns(towards_L)))
+    rays = mi.Ray3f(mi.Point3f(*columns(start_L)), mi.Vector3f(*columns(towards_L)))
     hidden = surface.seen_from(view).occluded(rays, mi.Bool(True)).numpy().astype(bool)
     visible = 1 - hidden.reshape(side, side, several).mean(axis=2)
     return replace(disc, visible=visible.astype(np.float32))
-
-
-def _columns(vectors: NDArray[np.float64]) -> list[Any]:
-    """Return the columns of an array as drjit floats."""
-    return [mi.Float(np.ascontiguousarray(column, np.float32)) for column in vectors.T]
 
 
 class Light:
@@ -381,7 +376,33 @@ def direct_in_cells(
         float32[cell]: half the signed difference between the mean signals of two halves of the cell's samples; 0 if
         there is one sample.
     """
-    return _InCells(surface, scene).means(cells, samples, weights)
+    tracer = Direct(surface, scene)
+    per_term = (tracer.weights / samples).astype(np.float32)
+    limb = tracer.mean_limb(weights)
+    count = len(cells.pixel)
+    out = np.zeros((per_term.shape[1], count), dtype=np.float32)
+    seen, halves = np.zeros(count, dtype=np.float32), np.zeros(count, dtype=np.float32)
+    factors = per_term.astype(np.float64) @ weights
+    done = 0
+    for part in cells.parts(max(1, WAVEFRONT // (samples * len(per_term)))):
+        strata = CellStrata(part, samples, scene.key, limb)
+        terms = tracer.terms(strata)
+        total = tracer.signal(terms, factors)
+        terms = [*terms, total, total * strata.checkered()]
+        dr.eval(*terms)
+        if samples > 1:
+            terms = [dr.block_sum(term, samples) for term in terms]
+            dr.eval(*terms)
+        span = slice(done, done + len(part.pixel))
+        done += len(part.pixel)
+        for row, term in zip(per_term, terms, strict=False):
+            values = term.numpy()
+            for band in np.flatnonzero(row):
+                out[band, span] += values * row[band]
+        seen[span] = terms[-2].numpy()
+        if samples > 1:
+            halves[span] = terms[-1].numpy()
+    return out, seen, halves
 
 
 class CellStrata(Strata):
@@ -427,36 +448,3 @@ class CellStrata(Strata):
         """Return +1 and -1 as on a chessboard: two halves of the samples that each cover the cell."""
         parity = (self.index ^ (self.index >> self._across)) & 1
         return 1 - 2 * mi.Float(parity)
-
-
-class _InCells(Direct):
-    """Compute the light of cells."""
-
-    def means(self, cells: Cells, samples: int, signal: NDArray[np.float64]) -> tuple[F32, F32, F32]:
-        """Return the outputs of `direct_in_cells`."""
-        weights = (self.weights / samples).astype(np.float32)
-        limb = self.mean_limb(signal)
-        count = len(cells.pixel)
-        out = np.zeros((weights.shape[1], count), dtype=np.float32)
-        seen, halves = np.zeros(count, dtype=np.float32), np.zeros(count, dtype=np.float32)
-        factors = weights.astype(np.float64) @ signal
-        done = 0
-        for part in cells.parts(max(1, WAVEFRONT // (samples * len(weights)))):
-            strata = CellStrata(part, samples, self.scene.key, limb)
-            terms = self.terms(strata)
-            total = self.signal(terms, factors)
-            terms = [*terms, total, total * strata.checkered()]
-            dr.eval(*terms)
-            if samples > 1:
-                terms = [dr.block_sum(term, samples) for term in terms]
-                dr.eval(*terms)
-            span = slice(done, done + len(part.pixel))
-            done += len(part.pixel)
-            for row, term in zip(weights, terms, strict=False):
-                values = term.numpy()
-                for band in np.flatnonzero(row):
-                    out[band, span] += values * row[band]
-            seen[span] = terms[-2].numpy()
-            if samples > 1:
-                halves[span] = terms[-1].numpy()
-        return out, seen, halves

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ..core.sundisc import axes, sunflower
 from .description import Sunlight
-from .runtime import dr, mi
+from .runtime import columns, dr, mi
 from .sampling import opaque_vector
 from .surface import TerrainMesh
 from .vehicle import Vehicle
@@ -33,8 +33,7 @@ def ground_height_m(surface: TerrainMesh, x_m: F64, y_m: F64, start_height_m: fl
     height = np.zeros(n)
     open_ = np.ones(n, dtype=bool)
     for _ in range(_GROUND_HITS):
-        points = mi.Point3f(*(mi.Float(np.ascontiguousarray(c, np.float32)) for c in origin.T))
-        hit = surface.intersect(mi.Ray3f(points, down))
+        hit = surface.intersect(mi.Ray3f(mi.Point3f(*columns(origin)), down))
         normal, distance, valid = hit.normal, hit.distance_m, hit.valid
         dr.eval(normal, distance, valid)
         met, up = valid.numpy().astype(bool), normal.z.numpy() < 0
@@ -98,11 +97,8 @@ def first_ground(surface: TerrainMesh, position_L_m: F64, direction_L: F64) -> t
     tuple[float, bool]
         The distance in m, infinite without a surface, and False only if the ray begins below the ground.
     """
-    start, towards = (
-        [mi.Float(np.array([value], dtype=np.float32)) for value in vector]
-        for vector in (position_L_m, direction_L)
-    )
-    (met,) = surface.trace(mi.Ray3f(mi.Point3f(*start), mi.Vector3f(*towards)))
+    rays = mi.Ray3f(mi.Point3f(*columns(position_L_m[None])), mi.Vector3f(*columns(direction_L[None])))
+    (met,) = surface.trace(rays)
     distance, facet, valid = met.t, met.prim_index, met.is_valid()
     dr.eval(distance, facet, valid)
     if not valid.numpy()[0]:
@@ -118,11 +114,8 @@ def first_hit_m(surface: TerrainMesh, origin_m: F64, direction: F64) -> F64:
 
     `origin_m` and the unit vectors `direction` are float64[n, 3], in the axes of the surface.
     """
-    start, towards = (
-        [mi.Float(np.ascontiguousarray(column, np.float32)) for column in vectors.T]
-        for vectors in (origin_m, direction)
-    )
-    (met,) = surface.trace(mi.Ray3f(mi.Point3f(*start), mi.Vector3f(*towards)), coherent=False)
+    rays = mi.Ray3f(mi.Point3f(*columns(origin_m)), mi.Vector3f(*columns(direction)))
+    (met,) = surface.trace(rays, coherent=False)
     distance, valid = met.t, met.is_valid()
     dr.eval(distance, valid)
     return np.where(valid.numpy(), distance.numpy().astype(np.float64), np.inf)
@@ -183,8 +176,7 @@ def sunlit_ground(surface: TerrainMesh, position_L_m: F64, rays_L: F64, sun_L: F
 
     def each(vectors: F64) -> Any:
         """Return the components of one vector per ray."""
-        rows = np.broadcast_to(vectors, (views, count, 3)).reshape(-1, 3).astype(np.float32)
-        return [mi.Float(np.ascontiguousarray(column)) for column in rows.T]
+        return columns(np.broadcast_to(vectors, (views, count, 3)).reshape(-1, 3))
 
     sun = mi.Vector3f(*each(sun_L[:, None]))
     rays = mi.Ray3f(mi.Point3f(*each(position_L_m[:, None])), mi.Vector3f(*each(rays_L)))
@@ -205,9 +197,7 @@ def _any_hit(
     n, k = len(position), directions.shape[1]
     origins = np.repeat(position, k, axis=0)
     d = np.broadcast_to(directions, (n, k, 3)).reshape(-1, 3)
-    o = mi.Point3f(*(mi.Float(np.ascontiguousarray(c, np.float32)) for c in origins.T))
-    v = mi.Vector3f(*(mi.Float(np.ascontiguousarray(c, np.float32)) for c in d.T))
-    rays = mi.Ray3f(o, v)
+    rays = mi.Ray3f(mi.Point3f(*columns(origins)), mi.Vector3f(*columns(d)))
     rays.maxt = mi.Float(np.minimum(reach_m, 3e38).astype(np.float32))
     hits = surface.occluded(rays, mi.Bool(True), coherent=False)
     return hits.numpy().astype(bool).reshape(n, k)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from ..core import llvm
@@ -20,7 +21,7 @@ mitsuba.set_log_level(mitsuba.LogLevel.Error)
 dr: Any = drjit
 mi: Any = mitsuba
 
-__all__ = ["dr", "mi", "packets", "set_threads"]
+__all__ = ["columns", "dr", "mi", "packets", "set_threads"]
 
 
 def set_threads(count: int) -> None:
@@ -36,3 +37,8 @@ def packets(kind: Any, values: NDArray[Any]) -> Any:
     the processes.
     """
     return kind(llvm.flat(values))
+
+
+def columns(vectors: NDArray[Any]) -> list[Any]:
+    """Return the columns of an array [n, k] as drjit floats, such as the components of vectors."""
+    return [mi.Float(np.ascontiguousarray(column, np.float32)) for column in vectors.T]

@@ -27,7 +27,7 @@ from ..core.quantities import FineLight, Radiance
 from ..core.sundisc import sunflower
 from .description import RenderInput, View
 from .light import Cells, CellStrata, Direct
-from .runtime import dr, mi
+from .runtime import columns, dr, mi
 from .surface import TerrainMesh
 
 F32 = NDArray[np.float32]
@@ -107,10 +107,7 @@ class CloseUp:
         shape = (_ACROSS, _ACROSS)
         if self.vehicle.vehicle is None:
             return np.ones(shape, dtype=bool)
-        x, y, across, down = (
-            mi.Float(np.ascontiguousarray(column, np.float32))
-            for column in (*self._lens_m.T, *self.slopes.reshape(-1, 2).T)
-        )
+        (x, y), (across, down) = columns(self._lens_m), columns(self.slopes.reshape(-1, 2))
         rays = mi.Ray3f(mi.Point3f(x, y, 0), dr.normalize(mi.Vector3f(across, down, 1)))
         hidden = self.vehicle.vehicle.occluded(rays, mi.Bool(True))
         return np.asarray(~hidden.numpy().astype(bool).reshape(shape))
@@ -213,7 +210,7 @@ def thin_parts(surface: TerrainMesh, scene: RenderInput) -> FineLight | None:
     area_px = fx * fy * np.abs((normal[owner] * points).sum(axis=1)) / points[:, 2] ** 3 / count[owner]
     direct = Direct(surface, scene)
     ax, ay, az = direct.optics.axes
-    across, down = (mi.Float(np.ascontiguousarray(column, np.float32)) for column in slopes.T)
+    across, down = columns(slopes)
     rays = mi.Ray3f(direct.optics.origin, dr.normalize(across * ax + down * ay + az))
     cells = Cells(pixel=np.arange(len(owner), dtype=np.uint32), cell=np.zeros(len(owner), np.uint32), side=1)
     strata = CellStrata(cells, 1, scene.key ^ _FACET_KEY, None)

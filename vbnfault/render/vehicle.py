@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .description import View
-from .runtime import dr, mi, packets
+from .runtime import columns, dr, mi, packets
 
 # Facets narrower than this are sampled by themselves, if they are wholly farther than so many metres.
 _THIN_PX, _NEAREST_M = 1.0, 0.05
@@ -48,7 +48,7 @@ class Vehicle:
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
         # four floats per facet, fetched in one packet: its normal and its material
         self._facets = packets(mi.Float, np.column_stack([normal, face_material]).astype(np.float32))
-        self._reflectance = [mi.Float(np.ascontiguousarray(column, np.float32)) for column in reflectance.T]
+        self._reflectance = columns(reflectance)
         dr.eval(self._facets, *self._reflectance)
 
     def facet(self, index: Any, active: Any) -> tuple[Any, Any]:
