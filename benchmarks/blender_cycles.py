@@ -3,7 +3,7 @@
 Blender is optional and runs in its own process. Its wheel (`pip install bpy`, Blender 5.0, Python 3.11) requires
 numpy < 2, and vbnfault requires numpy >= 2.1, so the two cannot share an environment. Make another environment,
 
-    python3.11 -m venv blender && blender/bin/pip install bpy==5.0.1 --extra-index-url https://download.blender.org/pypi/
+    python3.11 -m venv blender && blender/bin/pip install bpy
 
 and set VBNFAULT_BPY_PYTHON to its interpreter. The wheel needs these Debian packages, which most desktop
 installations include: libx11-6 libxfixes3 libxi6 libxrender1 libxkbcommon0 libsm6 libice6 libgl1.

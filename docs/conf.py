@@ -14,7 +14,7 @@ author = "The vbnfault developers"
 copyright = "The vbnfault developers, BSD-3-Clause"
 version = release = vbnfault.__version__
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "reference"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "notebooks", "reference"]
 exclude_patterns = ["_build", "_ext"]
 
 myst_enable_extensions = ["deflist"]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import json
 import re
 import shutil
 import sys
@@ -31,12 +32,18 @@ DOCS = ROOT / "docs"
 sys.path.insert(0, str(DOCS / "_ext"))
 
 import blocks  # noqa: E402
+import notebooks  # noqa: E402
 import reference  # noqa: E402
 
-PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
+NOTEBOOK = DOCS / "quickstart.ipynb"
+PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md")), NOTEBOOK]
 TERRAIN = {"patch.facet_m": 12.0, "patch.radius_m": 60.0, "patch.min_boulder_m": 6.0}
 LONGEST_PX = 64
-SAMPLES_OF_PAGES = {"README.md": 4, "docs/tutorial.md": 4}  # they show the fourth sample
+SAMPLES_OF_PAGES = {
+    "README.md": 4,
+    "docs/tutorial.md": 4,
+    "docs/quickstart.ipynb": 4,
+}  # they show the fourth sample
 SMALLER = {
     "detector": ["--pixels", "64", "--points", "12", "--stack", "4"],
     "flare": ["--pixels", "64", "--wavelength-nm", "550"],
@@ -54,8 +61,13 @@ def page_name(page: Path) -> str:
     return str(page.relative_to(ROOT))
 
 
+def page_text(page: Path) -> str:
+    text = page.read_text(encoding="utf-8")
+    return notebooks.markdown(text, outputs=False) if page.suffix == ".ipynb" else text
+
+
 def page_blocks(page: Path) -> list[blocks.Block]:
-    return blocks.blocks(page.read_text(encoding="utf-8"), page_name(page))
+    return blocks.blocks(page_text(page), page_name(page))
 
 
 def small_values(scene: vbnfault.Scene) -> dict[str, Any]:
@@ -158,7 +170,7 @@ def test_every_block_runs_in_order(
     monkeypatch.setattr(vbnfault, "load_scene", small_scene)
     monkeypatch.setattr(vbnfault.study, "study", small_study)
     monkeypatch.setattr(ghosts, "FINE", RAYS_ACROSS)
-    if "67p.obj" in page.read_text(encoding="utf-8"):
+    if "67p.obj" in page_text(page):
         # a user's own shape: the real comet's name, the embedded body's form
         body = load_body("embedded")
         rows = [f"v {x:.3f} {y:.3f} {z:.3f}" for x, y, z in body.vertices_m]
@@ -169,7 +181,7 @@ def test_every_block_runs_in_order(
 
 def test_every_fence_is_a_block_that_is_known() -> None:
     for page in PAGES:
-        text = page.read_text(encoding="utf-8")
+        text = page_text(page)
         fences = re.findall(r"^```(\w*)", text, flags=re.MULTILINE)
         opened = [language for language in fences if language]
         assert set(opened) <= set(blocks.LANGUAGES), page_name(page)
@@ -194,7 +206,7 @@ def test_a_block_with_a_wrong_option_is_refused(tmp_path: Path) -> None:
 
 def test_inline_commands_name_real_commands() -> None:
     known = {words[0] for words, _ in reference.walk_commands()}
-    texts = [page.read_text(encoding="utf-8") for page in PAGES]
+    texts = [page_text(page) for page in PAGES]
     named = {word for text in texts for word in re.findall(r"`vbnfault ([a-z]+)", text)}
     assert len(named) > 5
     assert named <= known
@@ -245,6 +257,28 @@ def test_the_reference_has_every_key_of_packaged_files(page: str, folder: str) -
     }
     assert len(keys) >= 12
     assert not [key for key in sorted(keys) if f"| `{key}` |" not in text]
+
+
+def test_the_notebook_holds_the_outputs_of_one_run_in_order() -> None:
+    text = NOTEBOOK.read_text(encoding="utf-8")
+    cells = [cell for cell in json.loads(text)["cells"] if cell["cell_type"] == "code"]
+    assert [cell["execution_count"] for cell in cells] == list(range(1, len(cells) + 1))
+    kinds = {output["output_type"] for cell in cells for output in cell["outputs"]}
+    assert kinds == {"stream", "display_data"}  # no errors
+    shown = notebooks.markdown(text)
+    assert shown.count("](data:image/png;base64,") == 1
+    assert "0 problems, digest" in shown
+    assert len(text) < 300_000
+
+
+def test_the_gallery_shows_every_figure() -> None:
+    shown = re.findall(r"!\[[^\]]+\]\(([^)]+\.png)\)", (DOCS / "gallery.md").read_text(encoding="utf-8"))
+    figures = [
+        *(ROOT / "scenes").glob("*.png"),
+        *(ROOT / "scenes/studies").glob("*.png"),
+        *DOCS.glob("figures/*.png"),
+    ]
+    assert sorted((DOCS / path).resolve() for path in shown) == sorted(figure.resolve() for figure in figures)
 
 
 def test_figures_are_small() -> None:

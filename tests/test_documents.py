@@ -1,4 +1,4 @@
-"""CONTRIBUTING.md, CHANGELOG.md and CITATION.cff say what the project holds."""
+"""CONTRIBUTING.md with its recipes, CHANGELOG.md and CITATION.cff say what the project holds."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ import vbnfault
 ROOT = Path(__file__).parents[1]
 CONTRIBUTING = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
 CHANGELOG = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+RECIPES = sorted((ROOT / "docs" / "contribute").glob("*.md"))
+DOCUMENTS = [ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *RECIPES]
 
 # Files that the commands in the text write or that a reader of it adds.
 _WRITTEN = {"after.json", "digests.json", "docs/_build", "survivors.json"}
@@ -26,24 +28,31 @@ def code_spans(text: str) -> list[str]:
     return [*re.findall(r"`([^`]+)`", rest), *"".join(fenced).splitlines()]
 
 
-def paths(text: str) -> set[str]:
-    """Return every path that a Markdown text names, in code or as the target of a link."""
+def paths(document: Path) -> set[str]:
+    """Return every path from the root that a Markdown page names in code, or from its folder as a link's target."""
+    text = document.read_text(encoding="utf-8")
     words = {word for span in code_spans(text) for word in span.split()}
     found = {w for w in words if re.fullmatch(r"[\w.-]+(/[\w.-]*)+|[\w-]+\.(py|md|toml|cff|json|png)", w)}
     modules = {m.replace(".", "/") + ".py" for m in re.findall(r"python -m (tests(?:\.\w+)+)", text)}
-    linked = {link for link in re.findall(r"\]\(([^)]+)\)", text) if "://" not in link}
+    links = [link for link in re.findall(r"\]\(([^)]+)\)", text) if "://" not in link]
+    linked = {str((document.parent / link.partition("#")[0]).resolve().relative_to(ROOT)) for link in links}
     return {path for path in found | modules | linked if "NAME" not in path} - _WRITTEN
 
 
-@pytest.mark.parametrize("document", ["CONTRIBUTING.md", "CHANGELOG.md"])
-def test_every_path_that_is_named_exists(document: str) -> None:
-    named = paths((ROOT / document).read_text(encoding="utf-8"))
-    assert len(named) > (40 if document == "CONTRIBUTING.md" else 0)
+def test_every_path_that_is_named_exists() -> None:
+    named = set().union(*(paths(document) for document in DOCUMENTS))
+    assert len(named) > 100
     assert not sorted(path for path in named if not (ROOT / path).exists())
 
 
+def test_contributing_is_short_and_names_every_recipe() -> None:
+    assert len(CONTRIBUTING.encode()) <= 8192
+    assert {str(recipe.relative_to(ROOT)) for recipe in RECIPES} <= paths(ROOT / "CONTRIBUTING.md")
+
+
 def test_every_name_beside_a_file_is_in_that_file() -> None:
-    beside = re.findall(r"`([\w./]+\.py)`\s+\((`\w+`(?:[,;\s]+`\w+`)*)", CONTRIBUTING)
+    text = "\n".join(document.read_text(encoding="utf-8") for document in DOCUMENTS)
+    beside = re.findall(r"`([\w./]+\.py)`\s+\((`\w+`(?:[,;\s]+`\w+`)*)", text)
     assert len(beside) > 20
     missing = [
         f"{path}: {name}"
@@ -54,14 +63,30 @@ def test_every_name_beside_a_file_is_in_that_file() -> None:
     assert not missing
 
 
-def test_the_table_of_packages_is_that_of_the_architecture() -> None:
+def documented_imports() -> dict[str, set[str]]:
+    """Return the packages that each row of the table lets its package import, `core` included."""
     table = CONTRIBUTING.partition("| package |")[2].partition("\n\n")[0]
     rows = [line.strip("|").split("|") for line in table.splitlines() if line.startswith("| `")]
-    documented = {re.findall(r"\w+", cells[0])[0]: set(re.findall(r"`(\w+)`", cells[3])) for cells in rows}
-    # a package may import itself, which the page does not say
-    assert documented == {unit: allowed - {unit} for unit, allowed in MAY_IMPORT.items()}
-    assert len(rows) == len(MAY_IMPORT)
     assert all(len(cells) == 4 for cells in rows)
+    meaning = CONTRIBUTING.partition("Words in capitals stand for several packages: ")[2].partition("\n\n")[0]
+    groups: dict[str, set[str]] = {}
+
+    def packages(text: str) -> set[str]:
+        return set(re.findall(r"`(\w+)`", text)).union(*(groups[word] for word in re.findall("[A-Z]{2,}", text)))
+
+    for words, members in re.findall(r"([A-Z]+) for ([^;]+)", meaning):
+        groups[words] = packages(members)
+    names = [re.findall(r"\w+", cells[0])[0] for cells in rows]
+    assert len(set(names)) == len(names)
+    return {name: packages(cells[3]) | {"core"} for name, cells in zip(names, rows, strict=True)}
+
+
+def test_the_table_of_packages_is_that_of_the_architecture() -> None:
+    # a package may import itself, which the page does not say
+    assert {unit: allowed - {unit} for unit, allowed in documented_imports().items()} == {
+        unit: (allowed | {"core"}) - {unit} for unit, allowed in MAY_IMPORT.items()
+    }
+    assert all("core" in allowed for unit, allowed in MAY_IMPORT.items() if unit != "core")
 
 
 def test_the_changelog_begins_with_this_version() -> None:

@@ -9,7 +9,6 @@ from typing import Any
 
 from ..store import SPLITS, Store
 
-_URL = "https://pypi.org/project/vbnfault/"
 _CONTEXT = {
     "@language": "en",
     "@vocab": "https://schema.org/",
@@ -88,7 +87,8 @@ def croissant(
     shared = [inline("splits", "Splits; no site is in two of them", [{"name": name} for name in SPLITS])]
     if classes:
         shared.append(inline("fault_classes", "Fault classes in the order of the fault axis", classes))
-    # Croissant requires a citation, a URL and a version with three numbers
+    # Croissant requires a citation, a URL and a version with three numbers. The URL is that of the dataset: the
+    # folder of this description, wherever it is copied to.
     return {
         "@context": _CONTEXT,
         "@type": "sc:Dataset",
@@ -97,10 +97,10 @@ def croissant(
         "description": str(attributes.get("description") or f"Fault-injected camera images: {title}"),
         "license": str(attributes.get("licence") or "not stated"),
         "citeAs": str(attributes.get("citation") or f"{title}, made with vbnfault"),
-        "url": _URL,
+        "url": "./",
         "version": f"{store.root_attributes.get('format_version', 0)}.0.0",
         "keywords": ["camera faults", "vision-based navigation", "comet", "segmentation", *spec.faults],
-        "creator": {"@type": "sc:Organization", "name": "vbnfault", "url": _URL},
+        "creator": {"@type": "sc:Organization", "name": "vbnfault"},
         "distribution": list(files),
         "recordSet": [*shared, *records],
     }
