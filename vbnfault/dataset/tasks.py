@@ -19,7 +19,6 @@ from .. import store as store_module
 from ..core import activity
 from ..core.errors import InputChanged, VbnfaultError
 from ..core.interrupts import check, finishing
-from ..core.memory import release_unused
 from ..core.quantities import Sample
 from ..store import Encoded, Location, Planned, SampleDigests, Store
 from .errors import BuildFailed
@@ -132,7 +131,6 @@ def work(simulate: Callable[[int], Sample], store: Store, task: Task, tick: Tick
         finally:
             with finishing():
                 shard.write_rest()
-                release_unused(always=True)
     if shard.lost:
         named = ", ".join(map(str, sorted(shard.lost)))
         raise VbnfaultError(

@@ -23,8 +23,8 @@ from ..core.errors import under_key
 from ..core.quantities import RGBI, Charge, Electrons, Offset, Quantity, RawMosaic, soft_kind
 from ..core.registry import DeclarationError
 from ..detector.effects import STEPS as MOSAIC_STEPS
-from ..lens import load_lens
-from ..lens.footprint import DEFAULT_LENS
+from ..lens import Prescription, load_lens
+from ..lens.image_frame import DEFAULT_LENS, ImageFrame
 from .context import FaultContext, Params
 from .fields import Interval, Severity, parse_field, path
 from .models import register
@@ -180,9 +180,24 @@ class Fault:
         """Return the drawn parameters: plain, JSON-able data, sufficient to inject the same fault again."""
         return {}
 
+    def draw_state(self, context: FaultContext, rng: np.random.Generator) -> Params:
+        """Return the parameters of `draw` on which the image depends; the others only describe the fault."""
+        return self.draw(context, rng)
+
+    def added_light(self, params: Params, context: FaultContext, once: Any, *, spikes: Any = None) -> Any:
+        """Return what the fault adds by its parts, for studies (`straylight_lens.AddedLight`); None: unknown.
+
+        `once` remembers results by function and arguments (`lens.straylight.total.Once`).
+        """
+        return None
+
     def alter(self, camera: Camera, params: Params) -> Camera:
         """Return the camera with this fault, if the fault changes a parameter of the instrument."""
         return camera
+
+    def prescription(self, frame: ImageFrame) -> Prescription | None:
+        """Return the prescription that the model traces behind a camera; None if it traces none."""
+        return None
 
     def inform(self, context: FaultContext, params: Params) -> FaultContext:
         """Return the context for the models with `informed`, if this fault changes what they act on."""
@@ -291,6 +306,10 @@ class LensFault(Fault):
         if self.lens:
             with under_key("lens"):
                 load_lens(self.lens)
+
+    def prescription(self, frame: ImageFrame) -> Prescription:
+        """Return the named lens or the camera's own."""
+        return frame.real_lens(self.lens).prescription
 
 
 def with_sensor(camera: Camera, **changes: Any) -> Camera:
