@@ -462,7 +462,7 @@ def test_results_do_not_depend_on_the_blocks(rows: int, monkeypatch: pytest.Monk
         return [q.array for q in (expected, electrons, raw, image, detector.develop(expected, 1.0, noise))]
 
     reference = steps()
-    monkeypatch.setattr("vbnfault.detector.three_colour._ROWS_PER_BLOCK", rows)
+    monkeypatch.setattr("vbnfault.detector.interface._ROWS_PER_BLOCK", rows)
     for a, b in zip(reference, steps(), strict=True):
         np.testing.assert_array_equal(a, b)
     assert 0 < reference[3].mean() < 255
