@@ -11,8 +11,8 @@ from pathlib import Path
 from .errors import InputError, shown
 from .resources import PACKAGE
 
-# The most threads that an environment variable or option may ask for: more than any machine has.
-MOST_THREADS = 4096
+# The most threads or processes that a variable, an option or a call may ask for: more than any machine has.
+MOST_THREADS = 1024
 _M_ARENA_MAX, _ARENAS = -8, 2  # option of `mallopt` in the GNU C library, and its value
 
 
