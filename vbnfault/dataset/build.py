@@ -143,7 +143,7 @@ class BuildOptions:
 
 
 def _checked(option: str, value: int) -> int:
-    """Return an option's value. Raises InputError unless it is a whole number from 1 to `environment.MOST_THREADS`."""
+    """Return the value of an option. Raises InputError unless it is a whole number from 1 to `MOST_THREADS`."""
     number = tables.whole(value)
     if number is None or number < 1:
         raise InputError(f"--{option} {shown(value)}: must be at least 1, and a whole number")
