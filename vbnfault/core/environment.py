@@ -84,3 +84,16 @@ def share_arenas() -> None:
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform.startswith("linux") else None
     if mallopt is not None and "MALLOC_ARENA_MAX" not in os.environ:
         mallopt(_M_ARENA_MAX, _ARENAS)
+
+
+def release_unused() -> None:
+    """Return to the system what drjit and the C library keep of freed memory, which takes some milliseconds.
+
+    After each shard of a build, this leaves a fifth less of the process's memory resident. Within a sample it saves
+    nothing: the next stage takes as much.
+    """
+    if "drjit" in sys.modules:
+        sys.modules["drjit"].flush_malloc_cache()
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform.startswith("linux") else None
+    if trim is not None:
+        trim(0)

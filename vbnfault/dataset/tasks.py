@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from .. import store as store_module
 from ..core import activity
+from ..core.environment import release_unused
 from ..core.errors import InputChanged, VbnfaultError
 from ..core.interrupts import check, finishing
 from ..core.quantities import Sample
@@ -131,6 +132,7 @@ def work(simulate: Callable[[int], Sample], store: Store, task: Task, tick: Tick
         finally:
             with finishing():
                 shard.write_rest()
+                release_unused()
     if shard.lost:
         named = ", ".join(map(str, sorted(shard.lost)))
         raise VbnfaultError(
