@@ -48,7 +48,6 @@ __all__ = [
 ]
 
 
-
 @dataclass(frozen=True, kw_only=True)
 class BuildOptions:
     """Hold the options of how a build does its work. No option changes a stored value.
