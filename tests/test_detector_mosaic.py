@@ -20,11 +20,16 @@ from vbnfault.detector.demosaic import (
     interpolate,
     mended_from,
 )
-from vbnfault.detector.mosaic import BAYER, PATTERNS, Pattern, channel_mask, channel_of, pattern, sample, separate
+from vbnfault.detector.mosaic import BAYER, PATTERNS, Pattern, channel_of, pattern, plane_of, sample
 
 METHODS = ("bilinear", "malvar", "menon")
 FITTING = [(f, m) for f in map(str.lower, BAYER) for m in METHODS]
 FITTING += [(f, "bilinear") for f in ("rgbw", "rgb_nir", "mono")]
+
+
+def channel_mask(pattern: Pattern, shape: tuple[int, int], channel: str) -> np.ndarray:
+    """The pixels of one channel."""
+    return channel_of(pattern, shape) == pattern.index(channel)
 
 
 def random_raw(shape: tuple[int, int] = (42, 50), seed: int = 1) -> np.ndarray:
@@ -80,7 +85,7 @@ def test_sample_takes_each_pixels_own_filter(p: Pattern, shape: tuple[int, int])
     np.testing.assert_array_equal(raw, np.take_along_axis(planes, own[..., None].astype(int), 2)[..., 0])
     assert raw.dtype == np.float32
     np.testing.assert_array_equal(planes, before)
-    sparse = separate(raw, p)
+    sparse = np.stack([plane_of(raw, p, channel) for channel in p.channels], axis=-1)
     np.testing.assert_array_equal(sample(sparse, p), raw)
     np.testing.assert_array_equal(np.count_nonzero(sparse, axis=2), 1)
     masks = [channel_mask(p, shape, c) for c in p.channels]
@@ -98,16 +103,7 @@ def test_bad_patterns_are_told_in_a_sentence() -> None:
             r"tile = \[\[0, 0\], \[0\]\]: must have rows of one length",
         ),
         (lambda: Pattern(name="a", channels=("R", "G"), tile=((0, 0),)), "every index 0 to 1"),
-        (lambda: sample(np.zeros((8, 8, 2), np.float32), pattern("rggb")), r"shape \(8, 8, 2\)"),
-        (lambda: interpolate(np.zeros((8, 8)), pattern("rggb"), "W"), "channel is 'W'"),
-        (lambda: demosaic(np.zeros((8, 8)), pattern("rggb"), "linear"), "demosaic method is 'linear'"),
-        (lambda: demosaic(np.zeros((8, 8)), pattern("rgbw"), "menon"), "no Bayer pattern: use bilinear"),
-        (lambda: footprint(np.zeros((8, 8), bool), pattern("mono"), "malvar"), "no Bayer pattern: use bilinear"),
-        (lambda: demosaic(np.zeros((5, 8)), pattern("rggb")), "at least 6 × 6"),
-        (lambda: demosaic(np.zeros((8, 8, 3)), pattern("rggb")), r"must be \[y, x\]"),
         (lambda: interpolate(np.zeros((8, 8)), LONG, "W"), r"must hold the \(9, 1\) tile"),
-        (lambda: correct_defects(np.zeros((8, 8)), np.zeros((8, 7), bool), pattern("rggb")), r"shape \(8, 7\)"),
-        (lambda: correct_defects(np.zeros((8, 8)), np.zeros((8, 8), bool), pattern("rggb"), "mode"), "'mode'"),
     ):
         with pytest.raises(InputError, match=sentence):
             bad()
@@ -359,40 +355,6 @@ def test_noise_without_edges_is_demosaiced_as_published(name: str, method: str) 
             assert np.array_equal(kept, published)
 
 
-@pytest.mark.parametrize("method", ["malvar", "menon"])
-def test_frames_without_hard_edges_are_only_looked_at(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    p, rng = pattern("grbg"), np.random.default_rng(6)
-    y, x = np.indices((200, 150))
-    smooth = (364 + 3000 * np.exp(-((x - 70) ** 2 + (y - 90) ** 2) / 1800)).astype(np.float32)
-    flat = rng.normal(64, 3, smooth.shape).astype(np.float32)
-    worked: list[int] = []
-    kernels = module._support
-    monkeypatch.setattr(module, "_support", lambda method: (worked.append(1), kernels(method))[1])
-    for raw in (smooth, flat):
-        bounded(raw, p, method, black=64.0, noise=3.0, clipped=np.zeros(raw.shape, bool))
-    assert not worked
-    flat[150, 20] = 5000
-    bounded(flat, p, method, black=64.0, noise=3.0)
-    assert worked
-
-
-@pytest.mark.parametrize("method", ["malvar", "menon"])
-def test_the_first_look_misses_no_edge(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    p, rng = pattern("bggr"), np.random.default_rng(7)
-    for shape in ((67, 40), (128, 21), (131, 64), (6, 9)):
-        for spread in (0.2, 0.5, 1.0, 2.0):
-            raw = np.exp(rng.normal(5, spread, shape)).astype(np.float32)
-            # an edge in the last row of a block, or one row past it
-            raw[min(64, shape[0] - 1), 5] = raw[min(63, shape[0] - 1), 8] = 3e4
-            known = {"black": 2.0, "noise": 3.0, "clipped": raw > 2e4}
-            some = bounded(raw, p, method, **known)
-            with monkeypatch.context() as everywhere:
-                everywhere.setattr(
-                    module._Edges, "starts_of_blocks", lambda _self, rgb, *_: np.arange(0, len(rgb), 64)
-                )
-                np.testing.assert_array_equal(some, bounded(raw, p, method, **known))
-
-
 # ------------------------------------------------------------------------------------------------- footprints
 
 
@@ -469,19 +431,17 @@ def test_footprint_of_menon_holds_whatever_changes(name: str) -> None:
 # --------------------------------------------------------------------------------------------- defect mending
 
 
-@pytest.mark.parametrize("how", ["median", "mean"])
-def test_a_defect_takes_its_same_coloured_neighbours_value(how: str) -> None:
+def test_a_defect_takes_its_same_coloured_neighbours_value() -> None:
     raw = random_raw((12, 12))
     bad = np.zeros(raw.shape, bool)
     bad[4, 4] = bad[4, 5] = bad[4, 6] = True
-    got = correct_defects(raw, bad, pattern("rggb"), how)
-    middle = getattr(np, how)
+    got = correct_defects(raw, bad, pattern("rggb"))
     red = [raw[y, x] for y in (2, 4, 6) for x in (2, 4, 6) if (y, x) not in ((4, 4), (4, 6))]
     green = [raw[y, x] for y in range(2, 7) for x in range(3, 8) if (y + x) % 2 == 1 and (y, x) != (4, 5)]
     assert len(red) == 7
     assert len(green) == 12
-    assert got[4, 4] == np.rint(middle(red))
-    assert got[4, 5] == np.rint(middle(green))
+    assert got[4, 4] == np.rint(np.median(red))
+    assert got[4, 5] == np.rint(np.median(green))
     assert got.dtype == raw.dtype
     np.testing.assert_array_equal(got[~bad], raw[~bad])
 
@@ -522,8 +482,9 @@ def test_mended_pixels_know_what_they_are_made_of(name: str) -> None:
     bad[20:50, 30:52] = True  # those inside look four times as far
     changed = rng.random(raw.shape) < 0.01
     other = np.where(changed, raw ^ 2048, raw).astype(np.uint16)
-    differs = correct_defects(raw, bad, p, "mean") != correct_defects(other, bad, p, "mean")
+    differs = correct_defects(raw, bad, p) != correct_defects(other, bad, p)
     told = mended_from(changed, bad, p)
     assert not (differs & bad & ~told & ~changed).any()
-    assert (differs & told).sum() > 0.5 * told.sum()
+    # one changed neighbour of several may leave the median as it is
+    assert (differs & told).sum() > 0.2 * told.sum()
     assert not mended_from(np.zeros_like(bad), bad, p).any()

@@ -24,7 +24,7 @@ from scipy import stats
 from vbnfault.camera.characterise import Settings, VirtualCamera, characterise
 from vbnfault.detector.chain import Device, MosaicNoise
 from vbnfault.detector.charge import ChargeCloud, TrapSpecies, cti
-from vbnfault.detector.dark import dark_current_e_s
+from vbnfault.detector.dark import rate_e_s, silicon_factor
 from vbnfault.detector.individual import IndividualSpec, dark_rate_e_s, make_individual
 from vbnfault.detector.mosaic import pattern
 from vbnfault.detector.readout import ReadoutSpec, read_out
@@ -215,7 +215,7 @@ def test_dark_current_over_temperature(pyxel: Any, temperature_K: float) -> None
 
     theirs = detector(pyxel, (1, 1), temperature_K=temperature_K)
     dark_current(theirs, figure_of_merit=1.0, temporal_noise=False)
-    ours = dark_current_e_s(temperature_K, figure_of_merit_nA_cm2=1.0, pixel_pitch_um=PITCH_UM)
+    ours = rate_e_s(1.0, PITCH_UM) * silicon_factor(temperature_K, 300.0)
     # Boltzmann's constant is cut at ten digits, in an exponent of at most 44
     assert ours == pytest.approx(float(theirs.charge.array[0, 0]), rel=44e-10)
 
@@ -272,7 +272,9 @@ def same_distribution(ours: NDArray[Any], theirs: NDArray[Any]) -> bool:
 
 @pytest.mark.parametrize("name", ["parallel", "serial"])
 @pytest.mark.parametrize("release_time_s", [4e-4, 2e-3, 1e-2])
-def test_charge_transfer_where_two_models_meet(pyxel: Any, name: str, release_time_s: float) -> None:
+def test_charge_transfer_where_two_models_meet(
+    pyxel: Any, name: str, release_time_s: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """CDM (Short et al. 2013, MNRAS 430, 3078) and ours (ArCTIC's) have an exact limit in common.
 
     CDM counts the traps of a column in one pool, of which a packet S_i fills what is free of γ i S_i^β. Ours
@@ -284,6 +286,7 @@ def test_charge_transfer_where_two_models_meet(pyxel: Any, name: str, release_ti
     """
     from pyxel.models.charge_transfer import cdm
 
+    monkeypatch.setattr("vbnfault.detector.charge._TRAIL_LEFT_OUT", 1e-9)
     transfer_s, power, well_e, pool, volume_cm3 = 1e-3, 0.6, 1e6, 20.0, 1e-10
     stay = np.exp(-transfer_s / release_time_s)
     image = np.zeros((60, 4), np.float32)
@@ -297,7 +300,6 @@ def test_charge_transfer_where_two_models_meet(pyxel: Any, name: str, release_ti
         cloud=ChargeCloud(full_well_e=well_e, fill_power=power),
         transfer_s=transfer_s,
         direction="up" if name == "parallel" else "left",
-        trail_left_out=1e-9,
     )
     later = np.vstack([np.zeros((1, 4)), image])
     theirs = detector(pyxel, later.shape if name == "parallel" else later.T.shape)

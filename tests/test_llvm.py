@@ -267,26 +267,12 @@ def test_nothing_usable_says_what_was_looked_at(tmp_path: Path, monkeypatch: pyt
 # ------------------------------------------------------------------------------------------------ never abort
 
 
-@pytest.mark.parametrize(
-    "kind",
-    [
-        "garbage",
-        "elf_header",
-        pytest.param(
-            "cut_short",
-            marks=[
-                pytest.mark.skipif(sys.platform != "linux", reason="the loader of Linux is meant"),
-            ],
-        ),
-    ],
-)
+@pytest.mark.parametrize("kind", ["garbage", "elf_header"])
 def test_a_damaged_library_never_ends_the_process(kind: str, tmp_path: Path) -> None:
     path = tmp_path / "libLLVM.so.99"
     data = {
         "garbage": lambda: bytes(range(256)) * 64,
         "elf_header": lambda: b"\x7fELF\x02\x01\x01" + bytes(4096),
-        # an interrupted copy of some library: headers whole, most of its segments missing
-        "cut_short": lambda: NOT_LLVM.read_bytes()[: NOT_LLVM.stat().st_size // 4],
     }[kind]()
     path.write_bytes(data)
     script = "from vbnfault.core import llvm; c = next(llvm.candidates()); assert not c.usable; print(c.problem)"

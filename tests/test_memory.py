@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import gc
 import os
+import platform
 import subprocess
 import sys
 import tracemalloc
-from pathlib import Path
 
 import numpy as np
 import pytest
 from conftest import small_scene
 
-from vbnfault.core import memory
-from vbnfault.core.llvm import backend
 from vbnfault.pipeline import Session
 from vbnfault.pipeline import session as pipeline_session
 from vbnfault.pipeline.development import acting_at, without
@@ -86,60 +84,11 @@ def test_samples_leave_nothing_behind(session: Session) -> None:
     assert max(np.diff(held[1:])) < 4 * SIZE**2
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads the resident memory from /proc")
-def test_unused_memory_is_released() -> None:
-    """drjit keeps freed arrays; they no longer count as resident once they are released."""
-    dr, Float = backend().dr, backend().Float
-
-    def resident() -> int:
-        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-
-    memory.release_unused(always=True)
-    before = resident()
-    array = dr.arange(Float, 1 << 24) * 1.5
-    dr.eval(array)
-    dr.sync_thread()
-    held = resident()
-    assert held - before > 0.9 * 2**26
-    del array
-    memory.release_unused(always=True)
-    assert resident() < held - 0.9 * 2**26
-
-
-def test_memory_is_released_in_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nothing is released while a step fits below the limit; what drjit keeps only if the rest was not enough."""
-    held, released = [0], []
-
-    def frees(name: str, left: int) -> None:
-        def release() -> None:
-            released.append(name)
-            held[0] = left
-
-        monkeypatch.setattr(memory, name, release)
-
-    monkeypatch.setattr(memory, "_resident_bytes", lambda: held[0])
-    limit = memory._MOST
-    for before, coming, after_trim, want in (
-        (limit - 2, 1, 0, []),
-        (limit - 2, 2, limit - 3, ["_trim"]),
-        (limit, 0, limit - 1, ["_trim"]),
-        (limit, 9, limit - 9, ["_trim", "_forget"]),
-        (limit, 9, limit, ["_trim", "_forget", "_flush"]),
-    ):
-        held[0] = before
-        released.clear()
-        frees("_trim", after_trim)
-        frees("_forget", limit - 10 if after_trim < limit else after_trim)
-        frees("_flush", 0)
-        memory.release_unused(coming)
-        assert released == want, (before, coming)
-
-
 ARENAS = """
 import ctypes, sys, threading
-from vbnfault.core import memory
+from vbnfault.core import environment
 if sys.argv[1] == "shared":
-    memory.share_arenas()
+    environment.share_arenas()
 libc = ctypes.CDLL(None)
 libc.malloc.restype = ctypes.c_void_p
 all_run = threading.Barrier(8)
@@ -156,7 +105,7 @@ libc.fflush(None)
 """
 
 
-@pytest.mark.skipif(memory._malloc_trim() is None, reason="needs the GNU C library")
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="needs the GNU C library")
 def test_threads_share_two_arenas() -> None:
     """Eight threads at once would otherwise have one each; a number that the user sets is kept."""
 

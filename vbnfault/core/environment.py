@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
 import os
 import sys
@@ -10,8 +11,9 @@ from pathlib import Path
 from .errors import InputError, shown
 from .resources import PACKAGE
 
-# The most threads that an environment variable or option may ask for: more than any machine has.
-MOST_THREADS = 4096
+# The most threads or processes that a variable, an option or a call may ask for: more than any machine has.
+MOST_THREADS = 1024
+_M_ARENA_MAX, _ARENAS = -8, 2  # option of `mallopt` in the GNU C library, and its value
 
 
 def whole_number(name: str, high: int) -> int:
@@ -71,3 +73,27 @@ def import_path() -> list[str]:
         if where != here or here in wanted or after_library:
             path.append(entry)
     return [*path, package] if here == package and here not in wanted else path
+
+
+def share_arenas() -> None:
+    """Let all threads allocate from two arenas of the GNU C library, unless the user has set their number.
+
+    By default, it gives up to eight per core, each of which keeps what its threads have freed: together they held
+    100 MB of a process that renders with two threads. Call this before threads start.
+    """
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform.startswith("linux") else None
+    if mallopt is not None and "MALLOC_ARENA_MAX" not in os.environ:
+        mallopt(_M_ARENA_MAX, _ARENAS)
+
+
+def release_unused() -> None:
+    """Return to the system what drjit and the C library keep of freed memory, which takes some milliseconds.
+
+    After each shard of a build, this leaves a fifth less of the process's memory resident. Within a sample it saves
+    nothing: the next stage takes as much.
+    """
+    if "drjit" in sys.modules:
+        sys.modules["drjit"].flush_malloc_cache()
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform.startswith("linux") else None
+    if trim is not None:
+        trim(0)

@@ -20,7 +20,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -160,10 +160,7 @@ def _inspect(path: Path, origin: str) -> Candidate:
         return Candidate(path=path, origin=origin, version=None, problem="no such file")
     by_name = re.search(r"libLLVM[.-](?:so\.)?(\d+)", path.resolve().name)
     if by_name and int(by_name[1]) < OLDEST_USABLE:  # the name gives the version: do not load the library
-        version = (int(by_name[1]), 0, 0)
-        return Candidate(path=path, origin=origin, version=version, problem=_too_old(version))
-    if _is_cut_short(path):
-        return Candidate(path=path, origin=origin, version=None, problem="does not load: the file is cut short")
+        return _candidate(path, origin, (int(by_name[1]), 0, 0))
     try:
         library = _load(path, origin)
     except OSError as error:
@@ -175,37 +172,13 @@ def _inspect(path: Path, origin: str) -> Candidate:
         return Candidate(path=path, origin=origin, version=None, problem=problem)
     parts = [ctypes.c_uint() for _ in range(3)]
     get_version(*map(ctypes.byref, parts))
-    version = (parts[0].value, parts[1].value, parts[2].value)
-    return Candidate(
-        path=path,
-        origin=origin,
-        version=version,
-        problem=_too_old(version) if version[0] < OLDEST_USABLE else "",
-    )
+    return _candidate(path, origin, (parts[0].value, parts[1].value, parts[2].value))
 
 
-def _is_cut_short(path: Path) -> bool:
-    """Return whether a 64-bit ELF file ends before its segments do: loading such a file kills the process."""
-    with path.open("rb") as file:
-        header = file.read(64)
-        if len(header) < 64 or header[:5] != b"\x7fELF\x02":
-            return False
-        order: Literal["little", "big"] = "little" if header[5] == 1 else "big"
-        table, entry, count = (int.from_bytes(header[a:b], order) for a, b in ((32, 40), (54, 56), (56, 58)))
-        file.seek(table)
-        entries = file.read(entry * count)
-    size = path.stat().st_size
-    if len(entries) < entry * count:
-        return True
-    ends = (
-        int.from_bytes(row[8:16], order) + int.from_bytes(row[32:40], order)
-        for row in (entries[k * entry : (k + 1) * entry] for k in range(count))
-    )
-    return any(end > size for end in ends)
-
-
-def _too_old(version: tuple[int, int, int]) -> str:
-    return f"version {version[0]} aborts the first render"
+def _candidate(path: Path, origin: str, version: tuple[int, int, int]) -> Candidate:
+    """Return a library of a known version."""
+    problem = f"version {version[0]} aborts the first render" if version[0] < OLDEST_USABLE else ""
+    return Candidate(path=path, origin=origin, version=version, problem=problem)
 
 
 def _load(path: Path, origin: str) -> ctypes.CDLL:
@@ -213,7 +186,7 @@ def _load(path: Path, origin: str) -> ctypes.CDLL:
     try:
         return ctypes.CDLL(str(path))
     except OSError:
-        if _WHEEL not in (origin, _origin_of(path)):
+        if origin != _WHEEL and path.resolve() not in _wheel_files("libLLVM.so"):
             raise
     # Where site-packages is read-only, the wheel's start-up hook cannot link libc++.so.1. If the real files are
     # loaded globally first, the loader resolves their names.
@@ -221,8 +194,3 @@ def _load(path: Path, origin: str) -> ctypes.CDLL:
         for dependency in _wheel_files(stem)[:1]:
             ctypes.CDLL(str(dependency), mode=ctypes.RTLD_GLOBAL)
     return ctypes.CDLL(str(path))
-
-
-def _origin_of(path: Path) -> str:
-    """Return whether a library belongs to the wheel or to the system."""
-    return _WHEEL if path.resolve() in _wheel_files("libLLVM.so") else "system"

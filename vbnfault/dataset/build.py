@@ -47,8 +47,6 @@ __all__ = [
     "planned_blocks",
 ]
 
-_MOST_PROCESSES = 1024  # of workers and of threads: more than any machine has
-
 
 @dataclass(frozen=True, kw_only=True)
 class BuildOptions:
@@ -144,12 +142,12 @@ class BuildOptions:
 
 
 def _checked(option: str, value: int) -> int:
-    """Return an option's value. Raises InputError unless it is a whole number from 1 to `_MOST_PROCESSES`."""
+    """Return the value of an option. Raises InputError unless it is a whole number from 1 to `MOST_THREADS`."""
     number = tables.whole(value)
     if number is None or number < 1:
         raise InputError(f"--{option} {shown(value)}: must be at least 1, and a whole number")
-    if number > _MOST_PROCESSES:
-        raise InputError(f"--{option} {shown(value)}: must be at most {_MOST_PROCESSES}")
+    if number > environment.MOST_THREADS:
+        raise InputError(f"--{option} {shown(value)}: must be at most {environment.MOST_THREADS}")
     return number
 
 

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from .. import store as store_module
 from ..core import activity
+from ..core.environment import release_unused
 from ..core.errors import InputChanged, VbnfaultError
 from ..core.interrupts import check, finishing
-from ..core.memory import release_unused
 from ..core.quantities import Sample
 from ..store import Encoded, Location, Planned, SampleDigests, Store
 from .errors import BuildFailed
@@ -132,7 +132,7 @@ def work(simulate: Callable[[int], Sample], store: Store, task: Task, tick: Tick
         finally:
             with finishing():
                 shard.write_rest()
-                release_unused(always=True)
+                release_unused()
     if shard.lost:
         named = ", ".join(map(str, sorted(shard.lost)))
         raise VbnfaultError(

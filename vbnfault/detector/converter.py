@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.errors import InputError
 from ..core.llvm import backend, flat
 
 if TYPE_CHECKING:
@@ -23,7 +22,7 @@ def convert(analogue: F32, spec: ReadoutSpec, transitions_dn: F32 | None = None)
 
     With `transitions_dn` (see `ReadoutIndividual`) a code begins at its transition.
     """
-    return raw_of(Converter(spec, transitions_dn).codes(on_device(plane(analogue))), analogue.shape)
+    return raw_of(Converter(spec, transitions_dn).codes(on_device(analogue)), analogue.shape)
 
 
 def transitions_dn(dnl_lsb: NDArray[np.floating]) -> F32:
@@ -47,7 +46,6 @@ class Converter:
         self._table = spec.codes if spec.missing_codes or spec.stuck_bits else None
         self._transitions = transitions
         if transitions is not None:
-            check_shape("transitions_dn", transitions, (self._top,))
             # levels with integer part k have at least low[k] transitions at or below them, and at most `more`
             # further ones
             low = np.searchsorted(transitions, np.arange(self._top + 2), side="right")
@@ -88,16 +86,3 @@ def with_stuck_bits(raw: Raw, stuck_bits: Sequence[tuple[int, int]]) -> Raw:
     high = sum(1 << bit for bit, value in dict(stuck_bits).items() if value)
     low = sum(1 << bit for bit, value in dict(stuck_bits).items() if not value)
     return (raw | np.uint16(high)) & np.uint16(0xFFFF ^ low)
-
-
-def check_shape(name: str, array: F32 | None, shape: tuple[int, ...]) -> None:
-    """Raise InputError, which names the array, unless it is None or has the shape."""
-    if array is not None and array.shape != shape:
-        raise InputError(f"{name} has shape {array.shape}, but must have {shape}")
-
-
-def plane(array: F32) -> F32:
-    """Return an image as float32[y, x]. Raises InputError for another number of axes."""
-    if array.ndim != 2:
-        raise InputError(f"the image has shape {array.shape}, but must be [y, x]")
-    return np.asarray(array, dtype=np.float32)

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -24,15 +24,11 @@ Mask = NDArray[np.bool_]
 
 Method = Literal["bilinear", "malvar", "menon"]
 
-LEAST_PX = 6  # smallest height and width of a mosaic
-
 _MIRROR = cv2.BORDER_REFLECT_101
 
 # Both are even, so that every block begins with the same filters.
 _ROWS_PER_BLOCK = 64
 _HALO_PX = {"bilinear": 2, "malvar": 2, "menon": 8}
-# Rows whose extremes the first look for edges takes together: at least the halo, a divisor of the block.
-_ROWS_PER_LOOK = {"malvar": 4, "menon": 8}
 
 # A hard edge spans more standard deviations of the noise than this and more than this to one.
 HARD_NOISE, HARD_RATIO = 16.0, 8.0
@@ -85,23 +81,12 @@ def demosaic(raw: NDArray[Any], pattern: Pattern, method: Method = "bilinear") -
     method
         `malvar` (Malvar, He & Cutler 2004) and `menon` (DDFAPD: Menon, Andriani & Calvagno 2007, IEEE Trans. Image
         Process. 16, 132, doi 10.1109/TIP.2006.884928, with its refining step) need a Bayer pattern. `bilinear`
-        works with all patterns.
-
-    Raises
-    ------
-    InputError
-        The method is unknown or does not fit the pattern, or the mosaic is too small.
+        works with all patterns, and is used for those that are no Bayer pattern.
     """
-    if method not in get_args(Method):
-        raise InputError(f"demosaic method is '{method}', but must be one of {', '.join(get_args(Method))}")
-    signal = _checked(raw)
+    signal = np.ascontiguousarray(raw, dtype=np.float32)
     if pattern.is_bayer:
         return _in_blocks(
             {"bilinear": _bilinear, "malvar": _malvar, "menon": _menon}[method], signal, pattern, method
-        )
-    if method != "bilinear":
-        raise InputError(
-            f"demosaic method is '{method}', but pattern '{pattern.name}' is no Bayer pattern: use bilinear"
         )
     if pattern.channels == ("W",):
         return cv2.merge([signal] * 3)
@@ -148,19 +133,16 @@ def bounded_at_edges(
     """
     if method == "bilinear" or not pattern.is_bayer:
         return rgb
-    signal = _checked(raw)
+    signal = np.ascontiguousarray(raw, dtype=np.float32)
     bright = signal
     if clipped is not None and clipped.any():
         bright = np.where(clipped, np.float32(np.inf), signal)
     edges = _Edges(pattern, method, black, noise)
-    starts = edges.starts_of_blocks(rgb, signal, bright)
-    if not len(starts):
-        return rgb
     halo = _HALO_PX[method]
     measured = cv2.copyMakeBorder(signal, halo, halo, halo, halo, _MIRROR)
     brightest = measured if bright is signal else cv2.copyMakeBorder(bright, halo, halo, halo, halo, _MIRROR)
 
-    for start in starts:
+    for start in range(0, len(signal), _ROWS_PER_BLOCK):
         block = rgb[start : start + _ROWS_PER_BLOCK]
         rows = slice(start, start + len(block) + 2 * halo)
         edges.bound(block, measured[rows], brightest[rows])
@@ -205,45 +187,13 @@ class _Edges:
             value = np.where(hard & (value < low), low, value)
             block[y, x, k] = np.where(dark_side & (value > high), high, value)
 
-    def starts_of_blocks(self, rgb: F32, signal: F32, bright: F32) -> NDArray[np.intp]:
-        """Return the first rows, int[n], of the blocks of rows that may hold a hard edge.
-
-        This is a cheap first look, at the extremes of groups of rows: it finds every pixel that `bound` changes,
-        since the extremes of the groups are at least as far apart as those of the pixels that decide.
-        """
-        group, reach = _ROWS_PER_LOOK[self.method], _HALO_PX[self.method]
-        # a group and the two beside it hold all rows within reach
-        top = cv2.dilate(_by_groups(np.max, bright, group), np.ones((3, 2 * reach + 1), np.uint8))
-        low = cv2.erode(_by_groups(np.min, signal, group), np.ones((3, 3), np.uint8))
-        span, dark = top - low, low - self.black
-        clear = span > HARD_NOISE * self.noise
-        blocks = np.arange(0, len(span), _ROWS_PER_BLOCK // group)
-        hard, negative = (
-            np.logical_or.reduceat((clear & (span > ratio * dark)).any(axis=1), blocks)
-            for ratio in (HARD_RATIO - 1, 1)
-        )
-        starts = range(0, len(signal), _ROWS_PER_BLOCK)
-        with_edges = [
-            hard[i] or (negative[i] and rgb[start : start + _ROWS_PER_BLOCK].min() < self.black)
-            for i, start in enumerate(starts)
-        ]
-        return np.flatnonzero(with_edges) * _ROWS_PER_BLOCK
-
-
-def _by_groups(extreme: Callable[..., F32], array: F32, rows: int) -> F32:
-    """Return the extreme of each `rows` rows of an array [y, x], the last of which may be fewer."""
-    whole = len(array) - len(array) % rows
-    out = extreme(array[:whole].reshape(-1, rows, array.shape[1]), axis=1)
-    # not `reduceat`, which takes twenty times as long
-    return out if whole == len(array) else np.concatenate([out, extreme(array[whole:], axis=0, keepdims=True)])
-
 
 def interpolate(raw: NDArray[Any], pattern: Pattern, channel: str) -> F32:
     """Return one channel of a mosaic [y, x] at every pixel by bilinear interpolation, float32[y, x].
 
-    The W channel of an RGBW mosaic is its intensity. Raises InputError if the pattern lacks the channel.
+    The W channel of an RGBW mosaic is its intensity.
     """
-    return _normalised(_checked(raw), pattern, channel)
+    return _normalised(np.ascontiguousarray(raw, dtype=np.float32), pattern, channel)
 
 
 def footprint(mask: Mask, pattern: Pattern, method: Method = "bilinear") -> Mask:
@@ -253,7 +203,7 @@ def footprint(mask: Mask, pattern: Pattern, method: Method = "bilinear") -> Mask
     kernels. The methods of Malvar and Menon, with `bounded_at_edges`, choose by the signal. For them the result is
     the union over all choices, up to 2 and 8 pixels away; a single image shows a part of this.
     """
-    ones = _checked(mask)
+    ones = np.ascontiguousarray(mask, dtype=np.float32)
     if method != "bilinear" and pattern.is_bayer:
         return cv2.dilate(np.ascontiguousarray(mask, dtype=np.uint8), _support(method)).view(np.bool_)
     touched = demosaic(ones, pattern, method)
@@ -263,12 +213,10 @@ def footprint(mask: Mask, pattern: Pattern, method: Method = "bilinear") -> Mask
     return out
 
 
-def correct_defects(
-    raw: NDArray[Any], bad: Mask, pattern: Pattern, how: Literal["median", "mean"] = "median"
-) -> NDArray[Any]:
+def correct_defects(raw: NDArray[Any], bad: Mask, pattern: Pattern) -> NDArray[Any]:
     """Return a mosaic whose bad pixels are replaced by their good neighbours, as on-board software does.
 
-    Each bad pixel takes the median or mean of its good neighbours of the same channel. Neighbours lie within one
+    Each bad pixel takes the median of its good neighbours of the same channel. Neighbours lie within one
     tile (Bayer: 5 × 5 pixels, so 8 neighbours for red or blue and 12 for green; RGBW: 9 × 9; monochrome: 3 × 3). If
     none is good, the search goes four times as far. If none is good there either, the pixel is not changed.
     Integers round half to even.
@@ -281,23 +229,12 @@ def correct_defects(
         Bad pixels, bool[y, x].
     pattern
         Colour filter array.
-    how
-        "median" or "mean".
 
     Returns
     -------
     NDArray
         A new array with the shape and dtype of `raw`.
-
-    Raises
-    ------
-    InputError
-        `how` is unknown, or the shapes differ.
     """
-    if how not in ("median", "mean"):
-        raise InputError(f"correction is by '{how}', but must be by median or mean")
-    if raw.ndim != 2 or bad.shape != raw.shape:
-        raise InputError(f"bad pixels have shape {bad.shape}, but the mosaic [y, x] has {raw.shape}")
     out = raw.copy()
     whole = np.issubdtype(raw.dtype, np.integer)
     channels = channel_of(pattern, (raw.shape[0], raw.shape[1]))
@@ -310,7 +247,7 @@ def correct_defects(
         )
         later = []
         for group in np.array_split(pixels[near], len(pixels[near]) // _PIXELS_AT_ONCE + 1):
-            value, has_neighbours = _from_neighbours(raw, bad, channels, group, reach, how)
+            value, has_neighbours = _from_neighbours(raw, bad, channels, group, reach)
             y, x = group[has_neighbours].T
             out[y, x] = np.rint(value[has_neighbours]) if whole else value[has_neighbours]
             later.append(group[~has_neighbours])
@@ -338,9 +275,9 @@ def _in_reach(good: Mask, channels: NDArray[np.uint8], reach: int) -> Mask:
 
 
 def _from_neighbours(
-    raw: NDArray[Any], bad: Mask, channels: NDArray[np.uint8], pixels: NDArray[np.intp], reach: int, how: str
+    raw: NDArray[Any], bad: Mask, channels: NDArray[np.uint8], pixels: NDArray[np.intp], reach: int
 ) -> tuple[NDArray[np.float64], Mask]:
-    """Return the median or mean of the good neighbours of each pixel `at` [n, 2], and whether there are any."""
+    """Return the median of the good neighbours of each pixel `at` [n, 2], and whether there are any."""
     offset = np.arange(-reach, reach + 1)
     dy, dx = (d.ravel() for d in np.meshgrid(offset, offset, indexing="ij"))
     y, x = pixels[:, :1] + dy, pixels[:, 1:] + dx
@@ -349,21 +286,10 @@ def _from_neighbours(
     good = inside & ~bad[y, x] & (channels[y, x] == channels[pixels[:, 0], pixels[:, 1]][:, None])
     count = good.sum(axis=1)
     divisor = np.maximum(count, 1)
-    if how == "mean":
-        return np.where(good, raw[y, x], 0.0).sum(axis=1) / divisor, count > 0
     values = np.where(good, raw[y, x], np.inf)
     values.sort(axis=1)  # values that are not good are infinite and go last
     row = np.arange(len(pixels))
     return (values[row, (divisor - 1) // 2] + values[row, divisor // 2]) / 2, count > 0
-
-
-def _checked(raw: NDArray[Any]) -> F32:
-    """Return the mosaic as contiguous float32. Raises InputError for a wrong shape."""
-    if raw.ndim != 2 or min(raw.shape) < LEAST_PX:
-        raise InputError(
-            f"the mosaic has shape {raw.shape}, but must be [y, x] of at least {LEAST_PX} × {LEAST_PX} pixels"
-        )
-    return np.ascontiguousarray(raw, dtype=np.float32)
 
 
 def _in_blocks(step: Callable[[F32, Pattern], Sequence[F32]], raw: F32, pattern: Pattern, method: Method) -> F32:

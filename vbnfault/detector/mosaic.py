@@ -56,9 +56,7 @@ class Pattern:
         return self.shape == (2, 2) and name in BAYER
 
     def index(self, channel: str) -> int:
-        """Return the index of a channel by its name. Raises InputError if the pattern has no such channel."""
-        if channel not in self.channels:
-            raise InputError(f"channel is '{channel}', but pattern '{self.name}' has {self.channels}")
+        """Return the index of a channel by its name."""
         return self.channels.index(channel)
 
 
@@ -97,22 +95,11 @@ def channel_of(pattern: Pattern, shape: tuple[int, int]) -> NDArray[np.uint8]:
     return np.asarray(pattern.tile, dtype=np.uint8)[rows[:, None], columns]
 
 
-def channel_mask(pattern: Pattern, shape: tuple[int, int], channel: str) -> Mask:
-    """Return the pixels that belong to one channel, bool[y, x]."""
-    return channel_of(pattern, shape) == pattern.index(channel)
-
-
 def sample(planes: F32, pattern: Pattern) -> F32:
     """Return the mosaic float32[y, x] that takes each pixel from the plane of its own channel.
 
-    `planes` float32[y, x, channel] has full resolution, any unit, and the order of `pattern.channels`. Raises
-    InputError if the number of planes differs.
+    `planes` float32[y, x, channel] has full resolution, any unit, and the order of `pattern.channels`.
     """
-    if planes.ndim != 3 or planes.shape[2] != len(pattern.channels):
-        raise InputError(
-            f"planes have shape {planes.shape}, but must be [y, x, channel] with the channels {pattern.channels} "
-            f"of pattern '{pattern.name}'"
-        )
     out = np.empty(planes.shape[:2], np.float32)
     rows, columns = pattern.shape
     height = rows * max(1, _BLOCK_ROWS // rows)  # whole tiles, so that each block begins with the tile's first row
@@ -134,11 +121,3 @@ def plane_of(raw: NDArray[Any], pattern: Pattern, channel: str) -> F32:
             if pattern.tile[y][x] == index:
                 out[y::rows, x::columns] = raw[y::rows, x::columns]
     return out
-
-
-def separate(raw: NDArray[Any], pattern: Pattern) -> F32:
-    """Return a mosaic [y, x] as sparse planes float32[y, x, channel], with 0 at the pixels of other channels.
-
-    `sample` is the inverse.
-    """
-    return np.stack([plane_of(raw, pattern, channel) for channel in pattern.channels], axis=-1)

@@ -15,21 +15,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import InputError
-from ..core.quantities import RGBI, Electrons, Irradiance
-from ..core.spectra import per_joule
+from ..core.quantities import RGBI, Electrons
 from .chain import Device, MosaicNoise
 from .demosaic import footprint, mended_from
 from .effects import Acts, Effect
-from .efficiency import white_balance
+from .efficiency import QuantumEfficiency
+from .interface import Detector
 from .mosaic import sample
 from .sensor import Sensor
-from .three_colour import electron_rate_weights, electrons_of
 
 F32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True, kw_only=True)
-class MosaicDetector:
+class MosaicDetector(Detector):
     """Represent one device of a sensor type as the detector of a camera.
 
     The detector uses `width_px` × `height_px` pixels of the sensor. Charge moves and rows are read in `direction`
@@ -85,32 +84,14 @@ class MosaicDetector:
         return self.sensor.pattern.channels
 
     @property
-    def white_balance(self) -> F32:
-        """Return each channel's gain that shows a grey surface in sunlight as grey, float32[channel], ≥ 1."""
-        return white_balance(self.sensor.efficiency)
+    def efficiency(self) -> QuantumEfficiency:
+        """Return the quantum efficiency behind each filter."""
+        return self.sensor.efficiency
 
     @property
     def white_e(self) -> F32:
         """Return the signal of each channel in electrons that the 8 bit image shows as 255, float32[channel]."""
         return np.asarray(self.sensor.readout.white_e / self.white_balance, dtype=np.float32)
-
-    def electron_rate_weights(
-        self, wavelength_nm: NDArray[np.float64], transmittance: NDArray[np.float64] | None = None
-    ) -> F32:
-        """Return electrons per second and pixel for 1 W m⁻² nm⁻¹ in each band, float32[channel, band]."""
-        return electron_rate_weights(self.sensor.efficiency, self.pixel_pitch_um, wavelength_nm, transmittance)
-
-    def electron_rates(self, wavelength_nm: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return electrons per second and pixel for 1 W m⁻² at each wavelength, float64[channel, n]."""
-        return (
-            self.sensor.efficiency.at(wavelength_nm) * per_joule(wavelength_nm) * (self.pixel_pitch_um * 1e-6) ** 2
-        )
-
-    def electrons_expected(self, irradiance: Irradiance, exposure_s: float) -> Electrons:
-        """Return the expected photo-electrons per pixel behind each filter, noise-free and not clipped."""
-        weights = self.electron_rate_weights(irradiance.wavelength_nm, irradiance.transmittance)
-        weights = weights * np.float32(exposure_s)
-        return Electrons(array=electrons_of(irradiance, weights), white_e=self.white_e)
 
     def draw_noise(self, shape: tuple[int, int], rng: Callable[[str], np.random.Generator]) -> MosaicNoise:
         """Draw the variates of one exposure. `rng` returns the random generator for a name."""

@@ -17,10 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from ..core.errors import InputError
 from ..core.llvm import backend
 from ..core.tables import table_class
-from .converter import Converter, check_shape, on_device, plane, raw_of, transitions_dn, with_stuck_bits
+from .converter import Converter, on_device, raw_of, transitions_dn, with_stuck_bits
 from .nodes import node_of, readout_steps
 from .noise import normal_field
 
@@ -242,7 +241,7 @@ def read_out(
     """
     transitions = None if individual is None else individual.transitions_dn
     chain = _Chain(electrons.shape, spec, noise, individual)
-    left = backend().dr.minimum(on_device(plane(electrons)), _opaque(spec.full_well_e))
+    left = backend().dr.minimum(on_device(electrons), _opaque(spec.full_well_e))
     return raw_of(Converter(spec, transitions).codes(chain.amplified(left)), electrons.shape)
 
 
@@ -257,7 +256,7 @@ def analogue_dn(
     `electrons` are those that the full well has left (`clip_full_well`); other arguments are as in `read_out`.
     """
     chain = _Chain(electrons.shape, spec, noise, individual)
-    dr, level = backend().dr, chain.amplified(on_device(plane(electrons)))
+    dr, level = backend().dr, chain.amplified(on_device(electrons))
     dr.eval(level)
     dr.sync_thread()
     return np.array(level, copy=False).reshape(electrons.shape)
@@ -292,24 +291,17 @@ class _Chain:
         noise: ReadoutNoise | None,
         individual: ReadoutIndividual | None,
     ) -> None:
-        if len(shape) != 2:
-            raise InputError(f"the image has shape {shape}, but must be [y, x]")
         height, width = shape
         self._shape, self._spec = (height, width), spec
         rows, columns = (np.zeros(n, dtype=np.float32) for n in shape)
         self._pixel_e: F32 | None = None
         if individual is not None:
-            check_shape("row_e", individual.row_e, (height,))
-            check_shape("column_e", individual.column_e, (width,))
             if individual.row_e is not None:
                 rows = rows + individual.row_e
             if individual.column_e is not None:
                 columns = individual.column_e
             self._pixel_e = individual.pixel_e
-            check_shape("pixel_e", individual.pixel_e, (height, width))
         if noise is not None:
-            check_shape("read", noise.read, (height, width))
-            check_shape("row", noise.row, (height,))
             rows = rows + noise.row * np.float32(spec.row_noise_e_rms)
         self._row_e, self._column_e = (line if line.any() else None for line in (rows, columns))
         self._read = None if noise is None else noise.read

@@ -19,16 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import InputError
-from ..core.quantities import RGBI, Electrons, Irradiance, RawDN
-from ..core.spectra import per_joule
+from ..core.quantities import RGBI, Electrons, RawDN
 from . import compiled
 from .compiled import with_luminance
-from .efficiency import QuantumEfficiency, white_balance
+from .efficiency import QuantumEfficiency
+from .interface import Detector, blockwise
 from .noise import NormalField, counts_of_one_mean, draw_normals, poisson_on_dark, variates_by_code
 
 F32 = NDArray[np.float32]
-
-_ROWS_PER_BLOCK = 64  # measured as the fastest; two threads would wait for the interpreter's lock
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -65,7 +63,7 @@ class Noise:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ThreeColourDetector:
+class ThreeColourDetector(Detector):
     """Describe a sensor whose pixels sense R, G and B. Lengths are in µm, signals in electrons (e) or DN.
 
     `response` names the relative colour curves in `spectra.RESPONSES`; `quantum_efficiency_peak` in (0, 1] scales
@@ -116,30 +114,9 @@ class ThreeColourDetector:
         return QuantumEfficiency(response=self.response, peak=self.quantum_efficiency_peak)
 
     @property
-    def white_balance(self) -> F32:
-        """Return the gain of R, G, B that shows a grey surface in sunlight as grey, float32[3], at least 1."""
-        return white_balance(self.efficiency)
-
-    @property
     def white_e(self) -> F32:
         """Return the signal of R, G, B in electrons that the 8 bit image shows as 255, float32[3]."""
         return np.asarray(self.full_well_e / self.gain / self.white_balance, dtype=np.float32)
-
-    def electron_rate_weights(
-        self, wavelength_nm: NDArray[np.float64], transmittance: NDArray[np.float64] | None = None
-    ) -> F32:
-        """Return electrons per second and pixel for 1 W m⁻² nm⁻¹ in each band, float32[3, band]."""
-        return electron_rate_weights(self.efficiency, self.pixel_pitch_um, wavelength_nm, transmittance)
-
-    def electron_rates(self, wavelength_nm: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return electrons per second and pixel for 1 W m⁻² at each wavelength, float64[channel, n]."""
-        return self.efficiency.at(wavelength_nm) * per_joule(wavelength_nm) * (self.pixel_pitch_um * 1e-6) ** 2
-
-    def electrons_expected(self, irradiance: Irradiance, exposure_s: float) -> Electrons:
-        """Return the expected photo-electrons per pixel and colour, noise-free and not clipped."""
-        weights = self.electron_rate_weights(irradiance.wavelength_nm, irradiance.transmittance)
-        weights = weights * np.float32(exposure_s)
-        return Electrons(array=electrons_of(irradiance, weights), white_e=self.white_e)
 
     def electrons(self, expected: Electrons, exposure_s: float, noise: Noise | None) -> Electrons:
         """Return the collected electrons: add dark current, draw shot noise, clip at the full well."""
@@ -269,51 +246,3 @@ def curve_of(detector: ThreeColourDetector, exposure_s: float) -> compiled.Curve
         scale=scale,
         dark_counts_e=counts_of_one_mean(float(dark), variates_by_code()),
     )
-
-
-def electron_rate_weights(
-    efficiency: QuantumEfficiency,
-    pixel_pitch_um: float,
-    wavelength_nm: NDArray[np.float64],
-    transmittance: NDArray[np.float64] | None = None,
-) -> F32:
-    """Return electrons per second and pixel for 1 W m⁻² nm⁻¹ in each band, float32[channel, band]."""
-    area_m2 = (pixel_pitch_um * 1e-6) ** 2
-    return np.asarray(efficiency.electron_weights(wavelength_nm, transmittance) * area_m2, dtype=np.float32)
-
-
-def electrons_of(irradiance: Irradiance, weights: F32) -> F32:
-    """Return the electrons per pixel and channel, float32[y, x, channel], with weights float32[channel, band]."""
-
-    # a matrix product over the bands that stays in the cache: BLAS is slow for 3 × 8
-    def step(energy: F32) -> F32:
-        height, _, width = energy.shape
-        colours = np.zeros((len(weights), height, width), dtype=np.float32)
-        if not colours[0].size:  # of a frame without ground; OpenCV refuses empty arrays
-            return np.moveaxis(colours, 0, -1)
-        for colour, row in zip(colours, weights.tolist(), strict=True):
-            for band, weight in enumerate(row):
-                cv2.scaleAdd(energy[:, band], weight, colour, dst=colour)
-        return cv2.merge(list(colours)).reshape(height, width, len(weights))
-
-    return np.asarray(blockwise(step, np.moveaxis(irradiance.array, 0, 1)))
-
-
-def blockwise(step: Callable[..., NDArray[Any]], array: NDArray[Any], *more: NDArray[Any] | None) -> NDArray[Any]:
-    """Return `step(block, *blocks of more)` of all blocks of rows, joined.
-
-    `more` are arrays; None stays None.
-    """
-
-    def of_block(start: int) -> NDArray[Any]:
-        rows = slice(start, start + _ROWS_PER_BLOCK)
-        return step(array[rows], *(None if extra is None else extra[rows] for extra in more))
-
-    first = of_block(0)
-    if len(array) <= _ROWS_PER_BLOCK:
-        return first
-    out = np.empty((len(array), *first.shape[1:]), first.dtype)
-    out[:_ROWS_PER_BLOCK] = first
-    for start in range(_ROWS_PER_BLOCK, len(array), _ROWS_PER_BLOCK):
-        out[start : start + _ROWS_PER_BLOCK] = of_block(start)
-    return out

@@ -47,20 +47,6 @@ _OLDEST_YR = 100.0  # limit of a device's age; a higher age becomes faster growt
 _MOST_A_YEAR = 0.1  # fraction of the pixels that may die or stick in a year, at most
 
 
-# The drawn parameters that the damage follows from.
-_CAUSES = (
-    "years",
-    "growth_factor",
-    "dose_TeV_g",
-    "anneal_days",
-    "clustered_share",
-    "dead_per_year",
-    "stuck_per_year",
-    "least_dn",
-    "telegraph_seed",
-)
-
-
 @dataclass(frozen=True, kw_only=True)
 class HotPixels(Fault):
     """Add the hot, dead, stuck and telegraph pixels that the camera's device has at a later age and dose."""
@@ -222,7 +208,8 @@ class _Damage:
 
 def _damage_once(params: Params, context: FaultContext) -> _Damage:
     """Return the damage, computed once for each sample."""
-    cause = {name: params[name] for name in _CAUSES}  # without the lists that `draw` adds from the result
+    # without the lists and their length, which `draw` adds from the result
+    cause = {name: value for name, value in params.items() if not isinstance(value, list) and name != "count"}
     return context.once("broken_pixels.damage", cause, lambda: _damage(params, context))
 
 

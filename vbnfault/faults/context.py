@@ -14,11 +14,10 @@ from ..camera import Camera
 from ..core.quantities import FarSource, Radiance
 from ..core.shared_results import SharedResults
 from ..lens.image_frame import ImageFrame
+from .fields import REFERENCE_WIDTH_PX
 
 Params = dict[str, Any]
 T = TypeVar("T")
-
-REFERENCE_WIDTH_PX = 1024
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -108,6 +108,11 @@ class Severity:
         return [low, low + self.step] if drawn else low
 
 
+def _declared(kind: str, checked: Any, default: Any, doc: str, **more: Any) -> Any:
+    """Declare a field with the type by which pydantic checks its value and describes it in JSON Schema."""
+    return field(default=default, metadata={"kind": kind, "type": checked, "doc": doc, **more})
+
+
 def bounds(
     lo: float, hi: float, *, limits: tuple[float, float], doc: str, unit: str = "", integer: bool = False
 ) -> Any:
@@ -115,35 +120,34 @@ def bounds(
 
     A scene may set other bounds, or one fixed value, within `limits`.
     """
-    return field(
-        default=Interval(lo, hi),
-        metadata={"kind": "bounds", "limits": limits, "doc": doc, "unit": unit, "integer": integer},
-    )
+    pair_of: Any = tuple
+    value = _number(*limits, integer=integer)
+    either = value | Annotated[pair_of[value, value], AfterValidator(tables.ordered)]
+    return _declared("bounds", either, Interval(lo, hi), doc, limits=limits, unit=unit, integer=integer)
 
 
 def number(
     default: float | None, *, limits: tuple[float, float], doc: str, unit: str = "", integer: bool = False
 ) -> Any:
     """Declare a fixed number within `limits`. If its default is None, a scene may leave it out."""
-    return field(
-        default=default,
-        metadata={"kind": "number", "limits": limits, "doc": doc, "unit": unit, "integer": integer},
-    )
+    value = _number(*limits, integer=integer)
+    return _declared("number", value, default, doc, limits=limits, unit=unit, integer=integer)
 
 
 def flag(default: bool, *, doc: str) -> Any:
     """Declare a fixed true or false."""
-    return field(default=default, metadata={"kind": "flag", "doc": doc})
+    return _declared("flag", StrictBool, default, doc)
 
 
 def choice(default: str, options: tuple[str, ...], *, doc: str) -> Any:
     """Declare a string that must be one of `options`."""
-    return field(default=default, metadata={"kind": "choice", "options": options, "doc": doc})
+    one_of: Any = Literal
+    return _declared("choice", one_of[options], default, doc, options=options)
 
 
 def text(default: str, *, doc: str) -> Any:
     """Declare a fixed string. For the path of a file, use `path`."""
-    return field(default=default, metadata={"kind": "text", "doc": doc})
+    return _declared("text", StrictStr, default, doc)
 
 
 def path(*, content: str = "data", packaged: str = "", doc: str) -> Any:
@@ -160,12 +164,12 @@ def path(*, content: str = "data", packaged: str = "", doc: str) -> Any:
     packaged
         Folder of packaged files, such as `scenes/lenses`. A value without a suffix is then the name of one of them.
     """
-    return field(default="", metadata={"kind": "path", "content": content, "packaged": packaged, "doc": doc})
+    return _declared("path", StrictStr, "", doc, content=content, packaged=packaged)
 
 
 def paths(*, content: str = "data", doc: str) -> Any:
     """Declare a list of paths of files, each as `path` declares one; empty by default. One path needs no list."""
-    return field(default=(), metadata={"kind": "paths", "content": content, "packaged": "", "doc": doc})
+    return _declared("paths", StrictStr | list[StrictStr], (), doc, content=content, packaged="")
 
 
 def rows(columns: Mapping[str, tuple[float, float]], *, doc: str) -> Any:
@@ -173,7 +177,10 @@ def rows(columns: Mapping[str, tuple[float, float]], *, doc: str) -> Any:
 
     The list is empty by default; the model then draws these values.
     """
-    return field(default=(), metadata={"kind": "rows", "columns": dict(columns), "doc": doc})
+    typed: dict[str, Any] = {name: (_number(*limits), ...) for name, limits in columns.items()}
+    list_of: Any = list
+    row = list_of[create_model("Row", __base__=tables.Table, **typed)]
+    return _declared("rows", row, (), doc, columns=dict(columns))
 
 
 def parse_field(value: Any, f: dataclasses.Field[Any], where: str) -> Any:
@@ -207,30 +214,7 @@ def field_schema(f: dataclasses.Field[Any]) -> dict[str, Any]:
 @lru_cache(maxsize=1024)
 def _checks(f: dataclasses.Field[Any]) -> TypeAdapter[Any]:
     """Return pydantic's checks of the value of a field."""
-    return TypeAdapter(_type_of(f.metadata))
-
-
-def _type_of(meta: Mapping[str, Any]) -> Any:
-    """Return the type of a field as pydantic checks it."""
-    one_of: Any = Literal
-    pair_of: Any = tuple
-    list_of: Any = list
-    match meta["kind"]:
-        case "flag":
-            return StrictBool
-        case "choice":
-            return one_of[meta["options"]]
-        case "text" | "path":
-            return StrictStr
-        case "paths":
-            return StrictStr | list_of[StrictStr]
-        case "rows":
-            columns: dict[str, Any] = {name: (_number(*limits), ...) for name, limits in meta["columns"].items()}
-            return list_of[create_model("Row", __base__=tables.Table, **columns)]
-        case "number":
-            return _number(*meta["limits"], integer=meta["integer"])
-    value = _number(*meta["limits"], integer=meta["integer"])
-    return value | Annotated[pair_of[value, value], AfterValidator(tables.ordered)]
+    return TypeAdapter(f.metadata["type"])
 
 
 def _number(lo: float, hi: float, *, integer: bool = False) -> Any:

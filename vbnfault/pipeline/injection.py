@@ -6,14 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..core.memory import release_unused
 from ..faults import MOSAIC_STEPS, FaultContext
 from . import masks
 from .development import Development, Draws, acting_at, informs
 from .spec import Draw, Injection, Pose, Rendering, SampleSpec, SceneExposure, stored_layers
 
 _DRAW_TRIES = 8
-_TWINS_BYTES = 120 << 20  # more than an image without a fault takes while it is computed, for 1024×1024 pixels
 # If a step changes a pixel by this many DN, the change survives every later optical step within the paper's tables
 # (cos⁴ at 255 → 105 keeps 41 %). Such a fault counts as visible without a full comparison.
 _CLEARLY_VISIBLE_DN = 6.0
@@ -40,7 +38,6 @@ def inject_faults(
     A fault without a visible effect is drawn again a few times, then left out. So the result holds the faults that
     are in the image, and labels never claim more.
     """
-    release_unused(_TWINS_BYTES)  # what imaging took
     commanded = list(spec.commanded if commanded is None else commanded)
     if not pose.resolved or pose.sun_visible_fraction == 0:
         commanded = [name for name in commanded if not spec.faults[name].needs_sun]
@@ -60,13 +57,11 @@ def inject_faults(
     development.image({})  # pixels of the other images are taken from the clean one
     draws = draw_faults(spec, development, commanded, {}, attempt)
     _prepare_signals(development, draws)
-    release_unused(_TWINS_BYTES)
     while invisible := _invisible(development, draws, stored="mask_effect" in spec.scene.dataset.layers):
         draws = {name: draw for name, draw in draws.items() if name not in invisible}
         attempt += 1
         if attempt <= last:
             draws = draw_faults(spec, development, commanded, draws, attempt)
-    release_unused()
     return Injection(draws=draws, development=development, in_vain=in_vain)
 
 
@@ -155,7 +150,6 @@ def _invisible(development: Development, draws: Draws, *, stored: bool) -> list[
         invisible = {name: is_invisible(name) for name in draws if name not in last}
         if last:
             development.forget_steps(draws)
-            release_unused(_TWINS_BYTES)
             invisible |= {name: is_invisible(name) for name in last}
         return [name for name in draws if invisible[name]]
     doubtful = sorted(_doubtful(development, draws))

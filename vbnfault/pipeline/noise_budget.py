@@ -17,7 +17,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.memory import release_unused
 from ..core.quantities import FineLight, Radiance, Truth
 from ..render.description import RenderInput
 from ..world import assemble
@@ -51,8 +50,6 @@ _CELLS_AT_ONCE = 1 << 20
 _STRIP = 64
 _ROWS = 1 << 15  # pixels whose squared ranges are summed at a time
 _THREADS = 2
-# Memory that the first samples of 1024×1024 pixels in eight bands take, and samples in cells beside them.
-_RENDER_BYTES, _CELLS_BYTES = 220 << 20, 70 << 20
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -84,7 +81,6 @@ def sample_to_noise(
     from .. import render
 
     camera, electron_rate = spec.camera, green_per_second(spec)
-    release_unused(_RENDER_BYTES)  # what the sample before took
     sampled = render.direct_by_sample(spec.terrain.surface, scene, electron_rate)
     indirect = None
     if guide is not None and scene.bounces:
@@ -98,7 +94,6 @@ def sample_to_noise(
     light = sampled.radiance.array.copy() if indirect is None else _sum_of(sampled.radiance.array, indirect)
     whole = replace(sampled.radiance, array=light.view(), fine=fine)
     sampled = replace(sampled, radiance=whole)  # a copy in all bands takes 37 MB for a frame of 1024 pixels
-    release_unused(_CELLS_BYTES)  # samples in cells have wavefronts of other sizes
     exposure = foreseen_exposure_s(spec.scene, camera, truth, scene.view, whole)
     exposure *= 2 ** max(spec.scene.camera.exposure_stops[1], 0.0)  # the longest of the samples of the view
     signal_e = np.einsum("b,byx->yx", electron_rate * exposure, whole.array)

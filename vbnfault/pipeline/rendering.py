@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core import spectra
-from ..core.memory import release_unused
 from ..core.quantities import BODY, SKY, FarSource, FineLight, Radiance, Truth
 from ..core.sundisc import Projection
 from ..lens.straylight.scene import RenderGrid, surrounding_grids
@@ -90,7 +89,6 @@ def render_view(spec: SampleSpec, pose: Pose) -> Rendering:
     else:
         extra = None if body is None else (body.light, body.error)
         sampled = sample_to_noise(spec, shown, truth, guide, spec.scene.render.noise_fraction, extra)
-        release_unused()  # the samples of all pixels
     rendered = sampled.radiance
     if has_air and guide is not None and body is None:
         rendered = add_atmosphere(spec, scene, guide, rendered)

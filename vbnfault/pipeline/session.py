@@ -15,8 +15,8 @@ from ..body import Body, Fractured, Patch, PatchSpec, Site, Sites, cached_patch,
 from ..body.refine import GROWTH_POWER
 from ..camera import Camera
 from ..core import activity, tables
+from ..core.environment import MOST_THREADS, share_arenas
 from ..core.errors import InputError, in_file, shown, under_key
-from ..core.memory import release_unused, share_arenas
 from ..core.quantities import Sample
 from ..scene import config, plan
 from ..scene.config import Scene, configure_faults
@@ -36,12 +36,9 @@ if TYPE_CHECKING:
 
 # Limit of the slope of an octave of the finest relief: steeper relief would look like needles.
 _STEEPEST_DETAIL = 0.12
-# Memory that a new terrain takes (a patch of a million triangles and its tree of boxes), and its first render.
-_TERRAIN_BYTES, _RENDER_BYTES = 400 << 20, 300 << 20
 # Leaving out the smallest boulders is usual: the packaged scenes keep at least a quarter of those that are drawn. A
 # smaller fraction than this one means that the ground takes nearly all triangles.
 _FEWEST_KEPT = 0.05
-_MOST_THREADS = 1024  # more than any machine has
 
 
 def simulate(
@@ -128,8 +125,8 @@ class Session:
         self.faults = configure_faults(scene, source)
         need_sun = [name for name, fault in self.faults.items() if fault.needs_sun]
         self.plan = self.plan_of_sites = plan.make_plan(scene, list(self.faults), blocks, need_sun=need_sun)
-        if threads is not None and not 1 <= (tables.whole(threads) or 0) <= _MOST_THREADS:
-            raise InputError(f"threads = {shown(threads)}: must be a whole number from 1 to {_MOST_THREADS}")
+        if threads is not None and not 1 <= (tables.whole(threads) or 0) <= MOST_THREADS:
+            raise InputError(f"threads = {shown(threads)}: must be a whole number from 1 to {MOST_THREADS}")
         self.source = source
         self._threads = threads
         self._ground: dict[int, list[GroundDetail]] = {}  # of the rows of a site
@@ -244,12 +241,10 @@ class Session:
 
         if self._threads is not None:
             render.set_threads(self._threads)
-        release_unused(_TERRAIN_BYTES)  # what the last terrain and the last sample took
         activity.begin(f"terrain of site {site.index}")
         patch = self.patch(site, detail)
         site, surface = patch.site, self.surface(patch)
         del patch
-        release_unused(_RENDER_BYTES)
         return Terrain(body=self.body, site=site, surface=surface, vehicle=self.vehicle)
 
     def surface(self, patch: Patch) -> TerrainMesh:

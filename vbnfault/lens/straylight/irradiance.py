@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 
 from ...core.errors import InputError
 from ...core.llvm import backend
-from ...core.memory import release_unused
 from ...core.spectra import Bands
 from ..prescription import Prescription
 from .bundles import Rays, Spots, TraceOptions, Tracer, name_of
@@ -361,10 +360,7 @@ class FlareModel:
         InputError
             The angle is 90° or more.
         """
-        sums = self._drawn(sun_deg, azimuth_deg, only)
-        # the rays and cells; the sum of the levels takes the frame and, on each thread, some levels of a band
-        release_unused(8 * int(np.prod(self.canvas.shape)) * self.canvas.bands)
-        return sums.irradiance()
+        return self._drawn(sun_deg, azimuth_deg, only).irradiance()
 
     def _drawn(self, sun_deg: float, azimuth_deg: float, only: tuple[int, int] | None) -> Sums:
         """Return the sums into which all ghosts are drawn."""
