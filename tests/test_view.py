@@ -26,9 +26,10 @@ from vbnfault.core import images
 from vbnfault.core.errors import InputError
 from vbnfault.faults import registry
 from vbnfault.output.contact_sheet import overlay
+from vbnfault.output.json_files import plain
 from vbnfault.output.viewer import Viewer, server
 from vbnfault.output.viewer.listing import NOT_KNOWN, Listing, _keys, _measure
-from vbnfault.output.viewer.server import _exact, _plain
+from vbnfault.output.viewer.server import _exact
 from vbnfault.scene.names import STRATA
 
 
@@ -249,7 +250,7 @@ def test_a_fault_is_more_severe_by_the_number_that_its_levels_change(finished_st
 
 
 def test_numbers_that_neither_json_nor_a_browser_holds_are_sent_otherwise() -> None:
-    assert _plain(np.array([np.inf, -np.inf, np.nan, 1.5])) == [None, None, None, 1.5]
+    assert plain(np.array([np.inf, -np.inf, np.nan, 1.5])) == [None, None, None, 1.5]
     assert [_exact(str(n)) for n in (2**53 - 1, 2**53, -(2**53))] == [2**53 - 1, str(2**53), str(-(2**53))]
 
 

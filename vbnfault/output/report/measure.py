@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from ...core.errors import VbnfaultError
 from ...core.quantities import Sample
@@ -85,15 +86,8 @@ class Scalars:
     @cached_property
     def sun_C(self) -> F64:
         """Return the unit vectors towards the Sun in the camera frame C (x right, y down, z boresight), [n, 3]."""
-        w, x, y, z = self.columns["camera_from_T"].T
-        rotation = np.array(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-            ]
-        )
-        return np.einsum("ijn,nj->ni", rotation, self.columns["sun_direction_T"])
+        camera_from_T = Rotation.from_quat(self.columns["camera_from_T"], scalar_first=True)
+        return np.asarray(camera_from_T.apply(self.columns["sun_direction_T"]))
 
     def by_split(self, values: F64, of: NDArray[np.int64] | None = None) -> list[tuple[str, F64]]:
         """Return the finite values of each split with its name.
