@@ -82,7 +82,6 @@ def write_report(
         results=results,
         design=spec["design"],
         only_faults=results.has("fault_quantile") and len(results.factors) == 1,
-        facts=_facts(results),
         figures=figures,
         formula=formula,
         images=_images(results, folder / IMAGES),
@@ -90,32 +89,20 @@ def write_report(
         model_form=_model_form(results),
         faults=ranking_rows,
         indices=_index_tables(results),
-        asked=_asked(results),
+        distribution=_distribution,
+        plain=_plain,
+        flat=_flat,
+        code=_code,
         missed=_missed(results),
         without_value=_without_value(results),
         failures=_failures(results),
+        scene=Path(str(spec.get("scene", {}).get("base", ""))).name,
         timings=_json(dataset.attrs.get("timings")),
         versions=_json(dataset.attrs.get("versions")),
         most_rows=_MOST_ROWS,
         counts=_counts(results),
     )
     return path
-
-
-def _facts(results: StudyResults) -> dict[str, str]:
-    """Return the numbers that describe the study."""
-    design, scene = results.spec["design"], results.spec.get("scene", {})
-    counts = _counts(results)
-    return {
-        "Design": f"{results.method.replace('_', ' ')}, n\N{NO-BREAK SPACE}=\N{NO-BREAK SPACE}{design['n']}",
-        "Factors": str(len(results.factors)),
-        "Metrics": str(len(results.metrics)),
-        "Models": ", ".join(results.models) if len(results.models) > 1 else "one",
-        "Scene": Path(str(scene.get("base", ""))).name,
-        "Views and seeds": f"{counts['views']} × {counts['seeds']}",
-        "Evaluations": f"{results.table.num_rows:,}".replace(",", "\N{NARROW NO-BREAK SPACE}"),
-        "Failed": str(int((~results.succeeded).sum())),
-    }
 
 
 def _counts(results: StudyResults) -> dict[str, int]:
@@ -255,30 +242,6 @@ def _cell(results: StudyResults, name: str, metric: str, model: str, factor: str
 # ------------------------------------------------------------------------------------ what was asked, what to watch
 
 
-def _asked(results: StudyResults) -> dict[str, list[list[Any]]]:
-    """Return the study file as rows: factors, metrics, and the values of its other tables."""
-    factors = []
-    for entry in results.spec.get("factor", ()):
-        about = entry.get("description")
-        name = _code(entry["key"]) + (Markup('<br><span class="small">{}</span>').format(about) if about else "")
-        factors.append([name, _distribution(entry), _unit_words(str(entry.get("unit") or ""))])
-    metrics = [
-        [
-            _code(m),
-            results.about(m, "description"),
-            _unit_words(results.about(m, "unit")),
-            results.about(m, "source"),
-        ]
-        for m in results.metrics
-    ]
-    others = [
-        [name, [(key, _plain(value)) for key, value in _flat(results.spec[name])]]
-        for name in ("design", "scene", "models")
-        if results.spec.get(name)
-    ]
-    return {"factors": factors, "metrics": metrics, "others": others}
-
-
 def _distribution(entry: Mapping[str, Any]) -> str:
     """Return a factor's distribution in words."""
     kind = entry.get("distribution")
@@ -331,11 +294,6 @@ def _failures(results: StudyResults) -> list[list[str]]:
 def _code(text: str) -> Markup:
     """Return a name as an element of code."""
     return Markup("<code>") + escape(text) + Markup("</code>")
-
-
-def _unit_words(unit: str) -> str:
-    """Return a unit as text."""
-    return "no unit" if unit in ("", "1") else unit
 
 
 def _plain(value: Any) -> str:
