@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 from ....core.quantities import Sample
 from ....store import STRATA, Store, StoreSpec
-from ..contract import Closing, Entry, ExportPart, Finished, Format, mask_png, number_text, png
+from ..contract import Closing, Entry, ExportPart, Finished, Format, number_text, png_files
 from ..folder import Folder
 
 _NUMBERS = ("exposure_s", "sun_azimuth_deg", "sun_elevation_deg", "sun_distance_au", "sun_visible_fraction")
@@ -117,14 +117,11 @@ def _columns(spec: StoreSpec) -> dict[str, tuple[Any, dict[str, Any]]]:
 
 def _row(store: Store, sample: Sample) -> dict[str, Any]:
     """Return the columns of one sample."""
-    layers, scalars = sample.layers, sample.scalars
-    number = number_text(sample.index, store.samples)
+    scalars, number = sample.scalars, number_text(sample.index, store.samples)
     images = {
-        "image": png(layers["image"][..., :3]),
-        "intensity": png(layers["image"][..., 3]),
-        "clean": png(layers["clean"][..., :3]),
-        **{f"mask_{f}": mask_png(m) for f, m in zip(store.spec.faults, layers["mask"], strict=True)},
-        "mask_any": mask_png(layers["mask_any"]),
+        part if (name, part) == ("image", "intensity") else f"{name}_{part}" if part else name: content
+        for name, part, content in png_files(store.spec, sample)
+        if (name, part) != ("clean", "intensity")
     }
     return {
         **{name: {"bytes": data, "path": f"{number}_{name}.png"} for name, data in images.items()},
