@@ -50,11 +50,6 @@ class ResponseCurve:
     low: F64
     high: F64
 
-    @property
-    def categorical(self) -> bool:
-        """Return whether the factor's values are categories."""
-        return bool(self.x) and isinstance(self.x[0], str)
-
 
 @dataclass(frozen=True, kw_only=True)
 class Swing:
