@@ -24,7 +24,7 @@ from conftest import deny
 
 from vbnfault import cli
 from vbnfault.body import load_shape
-from vbnfault.body.shape import signed_volume
+from vbnfault.body.geometry import signed_volume
 from vbnfault.core import images, path_checks, resources, spice, user_files
 from vbnfault.core.errors import InputError, VbnfaultError, shown
 from vbnfault.core.toml_files import read_toml
