@@ -17,6 +17,7 @@ from ...core.quantities import Sample
 from ...dataset.statistics import is_seed, key_of
 from ...faults import registry
 from ...store import SPLITS, STRATA, Store, drawn_table
+from ..contact_sheet import spread
 
 F64 = NDArray[np.float64]
 
@@ -125,11 +126,6 @@ def read_scalars(store: Store) -> Scalars:
         columns=columns,
         unreadable=unreadable,
     )
-
-
-def spread(count: int, most: int) -> NDArray[np.int64]:
-    """Return up to `most` of the numbers 0 to `count` - 1, evenly spaced and ascending."""
-    return np.unique(np.linspace(0, max(count - 1, 0), min(count, most)).round().astype(np.int64))[:count]
 
 
 # --- drawn parameters ---------------------------------------------------------------------------------------

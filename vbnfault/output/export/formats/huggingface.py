@@ -18,7 +18,7 @@ _ROWS_IN_MEMORY = 8
 
 
 class HuggingFace(Format):
-    """Hugging Face: Parquet files with images, masks, labels and pose as typed columns.
+    """Parquet files for Hugging Face, with images, masks, labels and pose as typed columns.
 
     - `data/SPLIT-*.parquet`: `datasets.load_dataset("PATH_OF_THIS_FOLDER")` gives all splits; the head of this
       card names the files of each.
