@@ -87,8 +87,12 @@ class Scalars:
     @cached_property
     def sun_C(self) -> F64:
         """Return the unit vectors towards the Sun in the camera frame C (x right, y down, z boresight), [n, 3]."""
-        camera_from_T = Rotation.from_quat(self.columns["camera_from_T"], scalar_first=True)
-        return np.asarray(camera_from_T.apply(self.columns["sun_direction_T"]))
+        quaternion = self.columns["camera_from_T"]
+        is_any = np.linalg.norm(quaternion, axis=1) > 0  # a damaged one may be none
+        directions = np.full((len(quaternion), 3), np.nan)
+        camera_from_T = Rotation.from_quat(quaternion[is_any], scalar_first=True)
+        directions[is_any] = camera_from_T.apply(self.columns["sun_direction_T"][is_any])
+        return directions
 
     def by_split(self, values: F64, of: NDArray[np.int64] | None = None) -> list[tuple[str, F64]]:
         """Return the finite values of each split with its name.
