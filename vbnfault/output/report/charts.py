@@ -173,10 +173,11 @@ def _draw_values(axes: Axes, k: int, values: F64, edges: F64, has_zeros: bool) -
     step = (edges[-1] / edges[0]) ** 0.03
     zero = edges[0] / step**4
     axes.set_xlim(zero / step**2, edges[-1])
-    axes.set_xticks([tick for tick in axes.get_xticks() if tick >= edges[0]])
+    axes.set_xticks([tick for tick in axes.get_xticks() if edges[0] <= tick <= edges[-1]])
     at_zero = 1 - len(kept) / total
     axes.bar(zero * step ** (0.8 * (k - 1)), at_zero, width=0.6 * zero * (step - 1), color=colour, alpha=0.6)
-    axes.text(zero, -0.045, "0", transform=axes.get_xaxis_transform(), ha="center", va="top")
+    if k == 0:
+        axes.text(zero, -0.045, "0", transform=axes.get_xaxis_transform(), ha="center", va="top")
     return max(float(fractions.max()), at_zero)
 
 
