@@ -127,14 +127,12 @@ def panels(
 
 
 @contextlib.contextmanager
-def plain_panel(
-    size: tuple[float, float], top: float = 0.0, *, bottom: float = 16.0
-) -> Iterator[tuple[Figure, Axes]]:
+def plain_panel(size: tuple[float, float], top: float = 0.0) -> Iterator[tuple[Figure, Axes]]:
     """Give a figure and its one panel, whose labels are short, in the style of all figures; all sizes in points.
 
     `size`: width and height of the panel; `top`: room above it.
     """
-    width, height = size[0] + 16, size[1] + bottom + top + 2
+    width, height, bottom = size[0] + 16, size[1] + top + 18, 16
     with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=(width / 72, height / 72))
         yield figure, figure.add_axes((8 / width, bottom / height, size[0] / width, size[1] / height))

@@ -268,12 +268,11 @@ def _leading(results: StudyResults, metric: str, model: str) -> Markup:
 
 def _model_form(results: StudyResults) -> dict[str, str]:
     """Return how much of each metric's variance the choice of the model causes, as text."""
-    parts = {}
+    parts, dataset = {}, results.dataset
     for metric in results.metrics if results.has("model_share") else ():
-        share = float(results.dataset["model_share"].sel(metric=metric))
-        interval = ""
-        if "model_share_interval" in results.dataset:
-            low, high = results.dataset["model_share_interval"].sel(metric=metric, bound=["low", "high"]).values
+        share, interval = float(dataset["model_share"].sel(metric=metric)), ""
+        if "model_share_interval" in dataset:
+            low, high = dataset["model_share_interval"].sel(metric=metric, bound=["low", "high"]).values
             interval = f" [{100 * low:.0f}, {100 * high:.0f}]"
         if np.isfinite(share):
             parts[metric] = f"{100 * share:.0f}{interval}\N{NO-BREAK SPACE}%"

@@ -171,11 +171,7 @@ def _balance(store: Store, scalars: Scalars, numbers: Statistics | None) -> dict
     return {
         "is_planned": is_planned,
         "drawn": charts.balance(rows),
-        "numbers": [
-            [class_name, split, realised, "–" if planned is None else planned, of]
-            for class_name, _, splits in rows
-            for split, (realised, planned, of) in splits
-        ],
+        "rows": rows,
         "beside": [
             charts.histogram("faults in a sample", "", scalars.by_split(counts), limits=ends),
             charts.histogram("stratum", "", scalars.by_split(strata), limits=(-0.5, last), labels=STRATA),
