@@ -266,8 +266,19 @@ def test_yolo_outlines_and_boxes_give_the_regions_back(exported: Any, data: st.S
     assert lines > 50
 
 
-@pytest.mark.parametrize("pixels", [[(2, 3)], [(2, 3), (2, 4)], [(2, 3), (3, 4)], [(4, 2), (3, 3), (2, 4)]])
-def test_an_outline_of_the_smallest_regions_covers_them_exactly(pixels: list[tuple[int, int]]) -> None:
+@pytest.mark.parametrize(
+    ("pixels", "is_line"),
+    [
+        ([(2, 3)], True),
+        ([(2, 3), (2, 4)], True),
+        ([(2, 3), (3, 3), (4, 3)], True),
+        ([(2, 3), (3, 4)], False),
+        ([(4, 2), (3, 3), (2, 4)], False),
+    ],
+)
+def test_an_outline_of_the_smallest_regions_covers_them_exactly(
+    pixels: list[tuple[int, int]], is_line: bool
+) -> None:
     mask = np.zeros((8, 9), bool)
     mask[tuple(np.transpose(pixels))] = True
     (region,) = regions(mask)
@@ -275,16 +286,10 @@ def test_an_outline_of_the_smallest_regions_covers_them_exactly(pixels: list[tup
     cv2.fillPoly(drawn, [polygon(region).astype(np.int32)], 1)
     assert len(polygon(region)) >= 3
     assert np.array_equal(drawn == 1, mask)
-
-
-@pytest.mark.parametrize("pixels", [[(2, 3)], [(2, 3), (2, 4)], [(2, 3), (3, 3), (4, 3)]])
-def test_an_outline_of_a_straight_line_has_the_corners_of_its_box(pixels: list[tuple[int, int]]) -> None:
-    mask = np.zeros((8, 9), bool)
-    mask[tuple(np.transpose(pixels))] = True
-    (region,) = regions(mask)
-    x, y, w, h = region.box
-    corners = [(x, y), (x + w, y), (x + w, y + h), (x, y + h)]
-    np.testing.assert_allclose(polygon(region), corners, atol=2e-3)
+    if is_line:  # upright or level: the corners of its box
+        x, y, w, h = region.box
+        corners = [(x, y), (x + w, y), (x + w, y + h), (x, y + h)]
+        np.testing.assert_allclose(polygon(region), corners, atol=2e-3)
 
 
 def test_regions_come_in_the_order_of_their_first_pixel_down_the_columns() -> None:
@@ -331,30 +336,28 @@ def test_small_instances_are_left_out(name: str, described_store: Path, data: st
         export_store(described_store, tmp_path / "e", name, progress=False)
 
 
-def test_a_least_area_is_for_instances_only(described_store: Path, tmp_path: Path) -> None:
-    command = ["export", str(described_store), "--format", "png", "--out", str(tmp_path / "e"), "--min-area", "4"]
-    refused = CliRunner().invoke(cli.app, command)
-    assert "--min-area 4: must be a whole number from 1; png has no instances, so it must be 1" in str(
-        refused.exception
-    )
+def test_the_command_passes_masks_and_least_area_on(described_store: Path, tmp_path: Path) -> None:
+    arguments = ["export", str(described_store), "--out", str(tmp_path / "e"), "--min-area", "4"]
+    refused = CliRunner().invoke(cli.app, [*arguments, "--format", "png"])
+    sentence = "--min-area 4: must be a whole number from 1; png has no instances, so it must be 1"
+    assert sentence in str(refused.exception)
+    assert CliRunner().invoke(cli.app, [*arguments, "--format", "yolo", "--masks", "effect"]).exit_code == 0
+    state = json.loads((tmp_path / "e/export.json").read_text())
+    assert (state["masks"], state["min_area_px"]) == ("effect", 4)
 
 
-@pytest.mark.parametrize("content", [b"1", b"13"])  # another size, and the same with a flipped bit
-def test_a_part_whose_file_has_changed_is_not_finished(content: bytes, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("file", "old", "new"),
+    [("a.png", "12", "1"), ("a.png", "12", "13"), (".parts/000000.json", "[1]", "[2]")],  # size, a bit, the record
+)
+def test_a_part_whose_file_or_record_has_changed_is_not_finished(
+    file: str, old: str, new: str, tmp_path: Path
+) -> None:
     folder = Folder(tmp_path)
     folder.put([("a.png", b"12")])
     folder.write_part(0, {"rows": [1]})
     assert folder.has_part(0)
-    (tmp_path / "a.png").write_bytes(content)
-    assert not folder.has_part(0)
-
-
-def test_a_part_whose_record_has_changed_is_not_finished(tmp_path: Path) -> None:
-    folder = Folder(tmp_path)
-    folder.put([("a.png", b"12")])
-    folder.write_part(0, {"rows": [1]})
-    record = tmp_path / ".parts" / "000000.json"
-    record.write_text(record.read_text().replace("[1]", "[2]"))
+    (tmp_path / file).write_text((tmp_path / file).read_text().replace(old, new))
     assert not folder.has_part(0)
 
 
@@ -590,12 +593,6 @@ def test_masks_of_the_effect_replace_the_footprints(name: str, described_store: 
     assert "- Masks: `footprint`" in (tmp_path / "plain/README.md").read_text()
     with pytest.raises(InputError, match="holds another export: masks is 'effect' there and 'footprint' now"):
         export_store(first, tmp_path / "effect", name, progress=False)
-
-
-def test_the_command_passes_the_masks_on(described_store: Path, tmp_path: Path) -> None:
-    arguments = ["export", str(described_store), "--format", "yolo", "--out", str(tmp_path / "e")]
-    assert CliRunner().invoke(cli.app, [*arguments, "--masks", "effect"]).exit_code == 0
-    assert json.loads((tmp_path / "e/export.json").read_text())["masks"] == "effect"
 
 
 def test_another_store_or_format_does_not_mix_into_an_export(

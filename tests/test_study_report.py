@@ -19,9 +19,8 @@ from study_results import IMAGE_METRICS, LENS_FACTORS, Plan, ishigami, made_up
 
 import vbnfault
 from vbnfault.core.figures import inline_svg
-from vbnfault.study import extreme_images, plots, report
-from vbnfault.study.extreme_images import write_images
-from vbnfault.study.report import write_report
+from vbnfault.study import plots, report
+from vbnfault.study.report import write_images, write_report
 from vbnfault.study.summaries import StudyResults
 
 FEW = (LENS_FACTORS[0], LENS_FACTORS[9], LENS_FACTORS[7])  # normal, categorical, log-uniform
@@ -372,12 +371,12 @@ def test_images_are_those_of_the_extremes_with_one_exposure(tmp_path: Path) -> N
 
 def test_images_of_8_bits_stay_as_they_are_and_others_have_a_middle_that_is_seen() -> None:
     stored = [np.full((4, 4, 3), level, dtype=np.uint8) for level in (7, 255)]
-    assert all((shown == image).all() for shown, image in zip(extreme_images._shown(stored), stored, strict=True))
+    assert all((shown == image).all() for shown, image in zip(report._shown(stored), stored, strict=True))
     # ground a thousand times fainter than the Sun, and a veil that is nearly as bright as everything else
     for faint in (1e-3, 0.6):
         pair = [np.full((20, 20), faint * 1e6, dtype=np.float32) for _ in range(2)]
         pair[0][0, :5], pair[1][0, :5] = 1e6, 0.5e6
-        best, worst = extreme_images._shown(pair)
+        best, worst = report._shown(pair)
         assert best.max() == 255
         assert worst[0, 0] < 255
         assert 0.25 * 255 < np.median(best) == np.median(worst) < 0.65 * 255

@@ -18,6 +18,7 @@ import re
 import textwrap
 import zlib
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 import matplotlib
@@ -56,44 +57,13 @@ _HEAT = LinearSegmentedColormap.from_list("heat", ["#f3f6f9", "#8fc1e0", BLUE, "
 _ON_LIGHT, _ON_DARK = "#101418", "#fdfdfd"  # of text on a coloured cell, in both themes
 
 SMALL = 7.0  # points
-_TEXT, _TITLE = 8.0, 9.5
+_TITLE = 9.5
 _LETTER = 4.6  # mean width of a letter
 _LEAST_SHRUNK = 0.78  # a figure wider than `_NARROW` shrinks to this fraction on a small screen, and then scrolls
 _NARROW = 340.0
 _DPI = 160
 
-_STYLE: Any = {
-    "font.family": ["DejaVu Sans"],
-    "font.size": _TEXT,
-    "text.color": INK,
-    "axes.edgecolor": MUTED,
-    "axes.facecolor": "none",
-    "axes.labelcolor": INK,
-    "axes.labelsize": _TEXT,
-    "axes.linewidth": 0.7,
-    "axes.spines.right": False,
-    "axes.spines.top": False,
-    "axes.titlesize": _TEXT,
-    "axes.axisbelow": True,
-    "figure.facecolor": "white",
-    "grid.color": GRID,
-    "grid.linewidth": 0.6,
-    "legend.fontsize": _TEXT,
-    "legend.frameon": False,
-    "lines.solid_capstyle": "butt",
-    "svg.fonttype": "none",
-    "svg.hashsalt": "vbnfault",
-    "xtick.color": MUTED,
-    "xtick.labelcolor": INK,
-    "xtick.labelsize": _TEXT,
-    "xtick.major.size": 2.5,
-    "xtick.major.pad": 2,
-    "ytick.color": MUTED,
-    "ytick.labelcolor": INK,
-    "ytick.labelsize": _TEXT,
-    "ytick.major.size": 2.5,
-    "ytick.major.pad": 2,
-}
+_STYLE = matplotlib.rc_params_from_file(Path(__file__).with_suffix(".mplstyle"), use_default_template=False)
 
 
 # ------------------------------------------------------------------------------------ panels
@@ -157,14 +127,12 @@ def panels(
 
 
 @contextlib.contextmanager
-def plain_panel(
-    size: tuple[float, float], top: float = 0.0, *, bottom: float = 16.0
-) -> Iterator[tuple[Figure, Axes]]:
+def plain_panel(size: tuple[float, float], top: float = 0.0) -> Iterator[tuple[Figure, Axes]]:
     """Give a figure and its one panel, whose labels are short, in the style of all figures; all sizes in points.
 
     `size`: width and height of the panel; `top`: room above it.
     """
-    width, height = size[0] + 16, size[1] + bottom + top + 2
+    width, height, bottom = size[0] + 16, size[1] + top + 18, 16
     with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=(width / 72, height / 72))
         yield figure, figure.add_axes((8 / width, bottom / height, size[0] / width, size[1] / height))

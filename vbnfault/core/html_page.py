@@ -29,7 +29,7 @@ def _environment() -> jinja2.Environment:
     """Return what renders the templates of this package."""
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(_PACKAGE),
-        autoescape=True,
+        autoescape=lambda name: not str(name).endswith(".md"),  # Markdown is text
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
@@ -39,24 +39,15 @@ def _environment() -> jinja2.Environment:
     return environment
 
 
+def rendered(template: str, **values: Any) -> str:
+    """Return the text of a template, a file of this package such as `study/report.html`, with what it names."""
+    return _environment().get_template(template).render(values).strip() + "\n"
+
+
 def write_page(path: Path, template: str, **values: Any) -> None:
-    """Write a page, at once under its name.
-
-    Parameters
-    ----------
-    template
-        File of the template within the package, such as `study/report.html`.
-    **values
-        What the template names.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be written.
-    """
+    """Write a page, as `rendered`, at once under its name. Raises OSError if the file cannot be written."""
     style = (_PACKAGE / "core/html_page.css").read_text(encoding="utf-8")
-    page = _environment().get_template(template)
-    write_whole(path, page.render(values, links=[], style=style).strip() + "\n")
+    write_whole(path, rendered(template, links=[], style=style, **values))
 
 
 def grouped_digits(number: int) -> str:

@@ -13,7 +13,7 @@ import os
 import signal
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, TextIO, cast
 
 from .interrupts import Stopped
@@ -39,8 +39,9 @@ def steady() -> Iterator[None]:
         for stream in (out, error):
             if isinstance(stream, io.TextIOWrapper):  # a file name may hold bytes that are no text
                 stream.reconfigure(errors="backslashreplace")
-        stack.enter_context(contextlib.redirect_stdout(cast(TextIO, _Output(out))))
-        stack.enter_context(contextlib.redirect_stderr(cast(TextIO, _Messages(error))))
+        stack.enter_context(contextlib.redirect_stdout(cast(TextIO, _Stream(out, _output_failed))))
+        # a lost message does not end the work
+        stack.enter_context(contextlib.redirect_stderr(cast(TextIO, _Stream(error, lambda _: None))))
         yield
 
 
@@ -66,53 +67,38 @@ def _open_if_closed(number: int) -> None:
 
 
 class _Stream:
-    """Wrap a text stream: at a write error, send all later text to the null device and call `_failed`."""
+    """Wrap a text stream: at a write error, send all later text to the null device and call `failed`."""
 
-    def __init__(self, stream: TextIO) -> None:
-        self._stream = stream
+    def __init__(self, stream: TextIO, failed: Callable[[OSError], None]) -> None:
+        self._stream, self._failed = stream, failed
 
     def write(self, text: str) -> int:
         """Write text. Return the number of its characters."""
-        try:
-            if text == "":  # click writes this as a test and would hide the error of a full disk
-                return 0
-            return self._stream.write(text)
-        except OSError as error:
-            self._give_up()
-            self._failed(error)
-            return len(text)
+        if text != "":  # click writes this as a test and would hide the error of a full disk
+            self._try(self._stream.write, text)
+        return len(text)
 
     def flush(self) -> None:
         """Write the buffered text."""
+        self._try(self._stream.flush)
+
+    def _try(self, write: Callable[..., object], *text: str) -> None:
+        """Write; where that fails, let later text, also that of libraries, go nowhere, or Python fails at exit."""
         try:
-            self._stream.flush()
+            write(*text)
         except OSError as error:
-            self._give_up()
+            with contextlib.suppress(OSError, ValueError):
+                null = os.open(os.devnull, os.O_WRONLY)
+                os.dup2(null, self._stream.fileno())
+                os.close(null)
             self._failed(error)
-
-    def _give_up(self) -> None:
-        """Send all later text, also that of libraries, to the null device. Else Python reports an error at exit."""
-        with contextlib.suppress(OSError, ValueError):
-            null = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(null, self._stream.fileno())
-            os.close(null)
-
-    def _failed(self, error: OSError) -> None:
-        """React to a write error."""
-        raise NotImplementedError
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
 
 
-class _Output(_Stream):
-    def _failed(self, error: OSError) -> None:
-        """Raise `Stopped` where the reader left, else the error with the stream's name."""
-        if isinstance(error, BrokenPipeError):
-            raise Stopped(_SIGPIPE) from error
-        raise OSError(error.errno, error.strerror, "standard output") from error
-
-
-class _Messages(_Stream):
-    def _failed(self, error: OSError) -> None:
-        """Do nothing: a lost message does not end the work."""
+def _output_failed(error: OSError) -> None:
+    """Raise `Stopped` where the reader of standard output left, else the error with the stream's name."""
+    if isinstance(error, BrokenPipeError):
+        raise Stopped(_SIGPIPE) from error
+    raise OSError(error.errno, error.strerror, "standard output") from error

@@ -82,7 +82,7 @@ def preview(
     done = [i for number in range(store.shards) for i, whole in store.done(number).items() if whole]
     if not done:
         raise InputError(f"{store.path}: {store.why_none_is_finished()}, so there is nothing to show")
-    chosen = [done[k] for k in np.unique(np.linspace(0, len(done) - 1, max_samples).round().astype(int))]
+    chosen = [done[k] for k in spread(len(done), max_samples)]
     short = abbreviations(store.spec.faults)
     tiles = [_tile(store, i, short, masks) for i in chosen]
     columns = min(len(tiles), max(1, round(np.sqrt(len(tiles) * 1.25))))
@@ -91,6 +91,11 @@ def preview(
     sheet = np.vstack([_header(name, store.spec.faults, short, body.shape[1]), body])
     _write_png(Path(out_png), sheet)
     return len(tiles)
+
+
+def spread(count: int, most: int) -> NDArray[np.int64]:
+    """Return up to `most` of the numbers 0 to `count` - 1, evenly spaced and ascending."""
+    return np.unique(np.linspace(0, max(count - 1, 0), min(count, most)).round().astype(np.int64))[:count]
 
 
 def abbreviations(faults: Sequence[str]) -> dict[str, str]:

@@ -25,12 +25,8 @@ def file_schema(kind: str) -> dict[str, Any]:
     InputError
         The kind is none of `KINDS`.
     """
+    if kind not in KINDS:
+        raise InputError(f"schema {shown(kind)}: must be one of {', '.join(KINDS)}")
     if kind == "scene":
         return config.json_schema(faults.json_schema())
-    if kind == "lens":
-        return tables.json_schema(PrescriptionFile)
-    if kind == "sensor":
-        return tables.json_schema(Sensor)
-    if kind == "study":
-        return tables.json_schema(StudySpec)
-    raise InputError(f"schema {shown(kind)}: must be one of {', '.join(KINDS)}")
+    return tables.json_schema({"lens": PrescriptionFile, "sensor": Sensor, "study": StudySpec}[kind])

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..camera.characterise import Characterisation, Result, Settings, VirtualCamera, characterise, pictures
 from ..core.errors import InputError
-from ..core.whole_files import own, replacing
+from ..core.whole_files import own, write_whole
 from ..detector.chain import Device
 from ..detector.sensor import load_sensor
 from .json_files import write_json
@@ -157,27 +157,24 @@ def measure(request: SensorRequest, progress: Callable[[int], None] | None = Non
 
 def draw(channels: Mapping[str, Characterisation], title: str, path: Path) -> None:
     """Write a PNG figure of photon transfer, response, dark signal, spectra and histograms."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
+    from ..core.figures import panels, png_bytes, set_linear, set_log
 
-    figure = Figure(figsize=(15, 9), layout="constrained")
-    FigureCanvasAgg(figure)
-    figure.suptitle(f"{title}: EMVA 1288")
-    axes = figure.subplots(2, 3)
-    for name, channel in channels.items():
-        colour = _COLOURS.get(name[0], "0.3")
-        _draw_signals(axes[0], name, channel, colour)
-        _draw_spatial(axes[1], name, channel, colour)
-    _set_ticks(axes)
-    for panel, (head, x, y) in zip(axes.ravel(), _PANELS, strict=True):
-        panel.set(title=head, xlabel=x, ylabel=y)
-        panel.grid(alpha=0.3)
-        panel.legend(fontsize=7)
-    low, high = axes[1, 0].get_ylim()
-    axes[1, 0].set_ylim(low, high * (high / low) ** 0.2)  # room for the legend, as the spectra fill the panel
-    axes[1, 0].legend(fontsize=7, loc="upper center", ncols=len(channels))
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=100, format="png")
+    with panels(f"{title}: EMVA 1288", (2, 3), (270.0, 205.0)) as (figure, axes):
+        for name, channel in channels.items():
+            colour = _COLOURS.get(name[0], "0.3")
+            _draw_signals(axes[:3], name, channel, colour)
+            _draw_spatial(axes[3:], name, channel, colour)
+        low, high = axes[3].get_ylim()
+        axes[3].set_ylim(low, high * (high / low) ** 0.2)  # room for the legend, as the spectra fill the panel
+        for axis in (axes[0].xaxis, axes[3].yaxis):
+            set_log(axis, *axis.get_view_interval())
+        for axis in (axes[1].xaxis, axes[2].yaxis):
+            set_linear(axis, 6)
+        for k, (panel, (head, x, y)) in enumerate(zip(axes, _PANELS, strict=True)):
+            panel.set(title=head, xlabel=x, ylabel=y)
+            panel.grid()
+            panel.legend(loc="upper center" if k == 3 else "best", ncols=len(channels) if k == 3 else 1)
+    write_whole(path, png_bytes(figure))
 
 
 def _draw_signals(panels: Any, name: str, channel: Characterisation, colour: str) -> None:
@@ -219,19 +216,6 @@ def _draw_spatial(panels: Any, name: str, channel: Characterisation, colour: str
         count, edge = np.histogram(values, bins=_bins(values))
         middle = (edge[1:] + edge[:-1]) / 2
         panel.semilogy(middle, np.maximum(count, 0.5), color=colour, lw=0.8, label=f"{name}: {label}")
-
-
-def _set_ticks(axes: Any) -> None:
-    """Write the ticks as plain numbers, and no more of them than fit."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
-
-    axes[0, 0].xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axes[0, 0].xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.0f}"))
-    axes[0, 0].xaxis.set_minor_formatter(NullFormatter())
-    axes[0, 1].xaxis.set_major_locator(MaxNLocator(6))
-    axes[0, 2].ticklabel_format(useOffset=False)
-    for formatter in (axes[1, 0].yaxis.set_major_formatter, axes[1, 0].yaxis.set_minor_formatter):
-        formatter(FuncFormatter(lambda value, _: f"{value:.3g}"))
 
 
 def _bins(values: F64) -> F64:

@@ -34,11 +34,10 @@ def _taken(kind: str) -> Collection[str]:
     """Return the names that a plug-in's class of this kind may not have."""
     if kind == "fault":
         return {name for name, models in faults.registry().items() if any(map(faults.is_packaged, models.values()))}
-    if kind == "effect":
-        return {name for name, cls in effects.registry().items() if effects.is_packaged(cls)}
-    if kind == "reflectance":
-        return {name for name, cls in reflectance.registry().items() if reflectance.is_packaged(cls)}
-    return ()
+    if kind not in ("effect", "reflectance"):
+        return ()
+    kinds = effects if kind == "effect" else reflectance
+    return {name for name, cls in kinds.registry().items() if kinds.is_packaged(cls)}
 
 
 def write_template(kind: str, name: str, folder: Path, *, overwrite: bool = False) -> Path:

@@ -1,27 +1,29 @@
 """Write the report of a study: figures, and one page that needs no other file.
 
 `write_report` draws every figure into `DIR/plots` and writes `DIR/report.html`. It needs only what a study leaves
-in its folder, with the images that `extreme_images` has made before. The template `report.html` holds the words.
+in its folder, with the images that `write_images` has made before. The template `report.html` holds the words.
 """
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 from markupsafe import Markup, escape
+from numpy.typing import NDArray
 
 from ..core.figures import formula, inline_svg, png_bytes, svg_text
 from ..core.html_page import image_url, number_text, with_minus, write_page
+from ..core.images import write_png
 from ..core.whole_files import own, own_folder, write_whole
-from .extreme_images import IMAGES
 from .plots import drawings
 from .ranking_plots import ranking_rows
+from .spec import Evaluation
 from .summaries import DUMMY, StudyResults
 
 if TYPE_CHECKING:
@@ -30,11 +32,15 @@ if TYPE_CHECKING:
 
 PAGE = "report.html"
 PLOTS = "plots"
+IMAGES = "images"
 
 _IMAGE_PX = 400  # longer side of the images in the page; the files keep their size
 _COARSE_PX = 200  # an image that is smaller than this shows its pixels as squares
 _MOST_ROWS = 30  # of failed evaluations and of missed half-widths
 _MOST_LEADING = 4  # factors that the summary names for each metric
+_WHITE = 0.998  # quantile of a pair of images that is shown as white
+_MIDDLE = 0.3  # grey value of the median of a pair, of 1 for white
+_FAINTEST = 1e-6  # of white: the tone curve is linear at least up to here
 
 # name of the variable → heading, whether it is a fraction
 _COLUMNS = {
@@ -82,7 +88,6 @@ def write_report(
         results=results,
         design=spec["design"],
         only_faults=results.has("fault_quantile") and len(results.factors) == 1,
-        facts=_facts(results),
         figures=figures,
         formula=formula,
         images=_images(results, folder / IMAGES),
@@ -90,10 +95,14 @@ def write_report(
         model_form=_model_form(results),
         faults=ranking_rows,
         indices=_index_tables(results),
-        asked=_asked(results),
+        distribution=_distribution,
+        plain=_plain,
+        flat=_flat,
+        code=_code,
         missed=_missed(results),
         without_value=_without_value(results),
         failures=_failures(results),
+        scene=Path(str(spec.get("scene", {}).get("base", ""))).name,
         timings=_json(dataset.attrs.get("timings")),
         versions=_json(dataset.attrs.get("versions")),
         most_rows=_MOST_ROWS,
@@ -102,27 +111,80 @@ def write_report(
     return path
 
 
-def _facts(results: StudyResults) -> dict[str, str]:
-    """Return the numbers that describe the study."""
-    design, scene = results.spec["design"], results.spec.get("scene", {})
-    counts = _counts(results)
-    return {
-        "Design": f"{results.method.replace('_', ' ')}, n\N{NO-BREAK SPACE}=\N{NO-BREAK SPACE}{design['n']}",
-        "Factors": str(len(results.factors)),
-        "Metrics": str(len(results.metrics)),
-        "Models": ", ".join(results.models) if len(results.models) > 1 else "one",
-        "Scene": Path(str(scene.get("base", ""))).name,
-        "Views and seeds": f"{counts['views']} × {counts['seeds']}",
-        "Evaluations": f"{results.table.num_rows:,}".replace(",", "\N{NARROW NO-BREAK SPACE}"),
-        "Failed": str(int((~results.succeeded).sum())),
-    }
-
-
 def _counts(results: StudyResults) -> dict[str, int]:
     """Return how many views, seeds, roles and points the design has."""
     counts = {f"{name}s": len(np.unique(results.column(name))) for name in ("view", "seed", "role")}
     points = results.table.num_rows // (len(np.unique(results.blocks)) * len(results.models))
     return counts | {"points": points}
+
+
+# ------------------------------------------------------------------------------------ best and worst images
+
+
+def write_images(
+    folder: str | os.PathLike[str], dataset: xr.Dataset, table: pa.Table, spec: Mapping[str, Any], evaluator: Any
+) -> list[Path]:
+    """Write the images with the best and the worst value of each metric to `images`; return their paths.
+
+    Images of 8 bits are written as they are. Otherwise the two images of a metric have one exposure and one tone
+    curve, arcsinh (Lupton et al. 2004, doi 10.1086/382245), which shows ghosts and ground beside the Sun: the
+    99.8 % quantile of both is white, and their median is at 30 % of white, or brighter where it is so on a linear
+    scale. An evaluator without the method `picture`, and a metric whose values are all equal, give none.
+
+    Parameters
+    ----------
+    folder, dataset, table, spec
+        As for `write_report`. The images go to the folder `images`.
+    evaluator
+        Evaluator of the study; `picture(evaluation)` returns an image, [y, x] or [y, x, 3], in electrons, linear,
+        or as stored, uint8.
+    """
+    picture = getattr(evaluator, "picture", None)
+    if picture is None:
+        return []
+    results = StudyResults(dataset=dataset, table=table, spec=spec)
+    paths: list[Path] = []
+    kept: dict[int, NDArray[Any]] = {}
+
+    def image(row: int) -> NDArray[Any]:
+        if row not in kept:
+            values = table.slice(row, 1).to_pylist()[0]
+            evaluation = Evaluation(
+                index=int(values["evaluation"]),
+                seed=int(values["seed"]),
+                view=int(values["view"]),
+                model=str(values["model"]),
+                role=str(values["role"]),
+                values={factor: values[factor] for factor in results.factors},
+            )
+            kept[row] = np.asarray(picture(evaluation))
+        return kept[row]
+
+    for metric in results.metrics:
+        extremes = results.extremes(metric)
+        if extremes is None:
+            continue
+        names = ("best", "worst")
+        pair = _shown([image(extremes.best_row), image(extremes.worst_row)])
+        images = own_folder(Path(folder) / IMAGES)
+        for name, each in zip(names, pair, strict=True):
+            paths.append(write_png(own(images / f"{metric}_{name}.png"), each))
+    return paths
+
+
+def _shown(pair: Sequence[NDArray[Any]]) -> list[NDArray[np.uint8]]:
+    """Return two images as they are shown: as they are with 8 bits, otherwise with one exposure and tone curve."""
+    if all(image.dtype == np.uint8 for image in pair):
+        return list(pair)
+    linear = [np.nan_to_num(image).astype(np.float64) for image in pair]
+    white, middle = np.quantile(np.concatenate([image.ravel() for image in linear]), [_WHITE, 0.5])
+    white = white if white > 0 else 1.0
+    # Below `knee`, grey values are proportional to electrons. The lower it is, the brighter is the median.
+    knees = white * np.geomspace(1e3, _FAINTEST, 200)
+    greys = np.arcsinh(middle / knees) / np.arcsinh(white / knees)
+    knee = knees[min(int(np.searchsorted(greys, _MIDDLE)), len(knees) - 1)]
+    tones = (np.arcsinh(image / knee) / np.arcsinh(white / knee) for image in linear)
+    return [np.rint(255 * np.clip(tone, 0, 1)).astype(np.uint8) for tone in tones]
 
 
 # ------------------------------------------------------------------------------------ images and indices
@@ -206,12 +268,11 @@ def _leading(results: StudyResults, metric: str, model: str) -> Markup:
 
 def _model_form(results: StudyResults) -> dict[str, str]:
     """Return how much of each metric's variance the choice of the model causes, as text."""
-    parts = {}
+    parts, dataset = {}, results.dataset
     for metric in results.metrics if results.has("model_share") else ():
-        share = float(results.dataset["model_share"].sel(metric=metric))
-        interval = ""
-        if "model_share_interval" in results.dataset:
-            low, high = results.dataset["model_share_interval"].sel(metric=metric, bound=["low", "high"]).values
+        share, interval = float(dataset["model_share"].sel(metric=metric)), ""
+        if "model_share_interval" in dataset:
+            low, high = dataset["model_share_interval"].sel(metric=metric, bound=["low", "high"]).values
             interval = f" [{100 * low:.0f}, {100 * high:.0f}]"
         if np.isfinite(share):
             parts[metric] = f"{100 * share:.0f}{interval}\N{NO-BREAK SPACE}%"
@@ -253,30 +314,6 @@ def _cell(results: StudyResults, name: str, metric: str, model: str, factor: str
 
 
 # ------------------------------------------------------------------------------------ what was asked, what to watch
-
-
-def _asked(results: StudyResults) -> dict[str, list[list[Any]]]:
-    """Return the study file as rows: factors, metrics, and the values of its other tables."""
-    factors = []
-    for entry in results.spec.get("factor", ()):
-        about = entry.get("description")
-        name = _code(entry["key"]) + (Markup('<br><span class="small">{}</span>').format(about) if about else "")
-        factors.append([name, _distribution(entry), _unit_words(str(entry.get("unit") or ""))])
-    metrics = [
-        [
-            _code(m),
-            results.about(m, "description"),
-            _unit_words(results.about(m, "unit")),
-            results.about(m, "source"),
-        ]
-        for m in results.metrics
-    ]
-    others = [
-        [name, [(key, _plain(value)) for key, value in _flat(results.spec[name])]]
-        for name in ("design", "scene", "models")
-        if results.spec.get(name)
-    ]
-    return {"factors": factors, "metrics": metrics, "others": others}
 
 
 def _distribution(entry: Mapping[str, Any]) -> str:
@@ -331,11 +368,6 @@ def _failures(results: StudyResults) -> list[list[str]]:
 def _code(text: str) -> Markup:
     """Return a name as an element of code."""
     return Markup("<code>") + escape(text) + Markup("</code>")
-
-
-def _unit_words(unit: str) -> str:
-    """Return a unit as text."""
-    return "no unit" if unit in ("", "1") else unit
 
 
 def _plain(value: Any) -> str:

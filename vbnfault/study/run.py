@@ -471,8 +471,7 @@ def _write_report(
     path: Path, data: xr.Dataset, table: pyarrow.Table, spec: StudySpec, evaluator: Evaluator
 ) -> None:
     """Write the extreme images, the figures and the page of a study; without images where one fails."""
-    from .extreme_images import write_images
-    from .report import write_report  # loads matplotlib
+    from .report import write_images, write_report  # loads matplotlib
 
     plain = spec.resolved()
     try:

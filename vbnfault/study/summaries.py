@@ -11,7 +11,7 @@ values of a point are averaged over its blocks. The shifts cancel where every po
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -49,11 +49,6 @@ class ResponseCurve:
     median: F64
     low: F64
     high: F64
-
-    @property
-    def categorical(self) -> bool:
-        """Return whether the factor's values are categories."""
-        return bool(self.x) and isinstance(self.x[0], str)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,29 +127,25 @@ class DesignPoints:
         """
         if self.base is not None or len(self.values) < _LEAST_OF_SWING:
             return 0.0
-        generator = np.random.default_rng(1)
-        swings = []
-        for factor in self.columns:
-            groups = [members for _, members in self._groups(factor, parts=_PARTS)]
-            for _ in range(max(1, _RESAMPLES // len(self.columns))):
-                values = self._shuffled(generator)
-                means = [values[members].mean() for members in groups]
-                swings.append(max(means) - min(means))
-        return float(np.median(swings))
+        means = ([group.mean() for group in groups] for groups in self._by_chance(1, _PARTS))
+        return float(np.median([max(each) - min(each) for each in means]))
 
     def chance_band(self, confidence: float) -> tuple[float, float] | None:
         """Return the interval of medians along a factor that acts on nothing; None where there is no noise."""
         if self.base is not None or len(self.values) < _LEAST_OF_BAND:
             return None
-        generator = np.random.default_rng(2)
-        medians = []
-        for factor in self.columns:
-            groups = [members for _, members in self._groups(factor)]
-            for _ in range(max(1, _RESAMPLES // len(self.columns))):
-                values = self._shuffled(generator)
-                medians += [np.median(values[members]) for members in groups]
+        medians = [np.median(group) for groups in self._by_chance(2) for group in groups]
         low, high = np.quantile(medians, _tails(confidence))
         return float(low), float(high)
+
+    def _by_chance(self, seed: int, parts: int | None = None) -> Iterator[list[F64]]:
+        """Yield the values in groups of similar value of a factor, each time in another random order."""
+        generator = np.random.default_rng(seed)
+        for factor in self.columns:
+            groups = [members for _, members in self._groups(factor, parts=parts)]
+            for _ in range(max(1, _RESAMPLES // len(self.columns))):
+                values = self._shuffled(generator)
+                yield [values[members] for members in groups]
 
     def _shuffled(self, generator: np.random.Generator) -> F64:
         """Return the values in random order; trajectories stay whole, and each begins at a random step."""

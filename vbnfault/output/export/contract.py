@@ -158,6 +158,18 @@ def png(image: NDArray[Any]) -> bytes:
     return data.tobytes()
 
 
-def mask_png(mask: NDArray[np.bool_]) -> bytes:
-    """Return a mask as the bytes of an 8 bit PNG file: 255 where it is True, else 0."""
-    return png(mask.astype(np.uint8) * 255)
+def png_files(spec: StoreSpec, sample: Sample) -> Iterator[tuple[str, str, bytes]]:
+    """Yield name of the layer, part of it and content of a PNG file of each image and mask of a sample.
+
+    The part is `intensity` for the intensity channel of an image, the fault for a mask, otherwise empty. Masks have
+    8 bits, 255 where they are True, else 0.
+    """
+    for name, layer in sample.layers.items():
+        if name in ("mask", "mask_effect"):
+            for fault, mask in zip(spec.faults, layer, strict=True):
+                yield name, fault, png(mask.astype(np.uint8) * 255)
+        elif layer.ndim == 3 and layer.dtype == np.uint8:
+            yield name, "", png(layer[..., :3])
+            yield name, "intensity", png(layer[..., 3])
+        elif layer.dtype.kind in "bu":
+            yield name, "", png(layer.astype(np.uint8) * 255 if layer.dtype == np.bool_ else layer)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from ... import __version__
 from ...core.errors import InputError, VbnfaultError, shown
+from ...core.html_page import rendered
 from ...core.path_checks import path_of, real
 from ...core.quantities import Sample
 from ...core.tables import did_you_mean
@@ -297,43 +298,20 @@ def _finish(store: Store, kind: Format, parts: Sequence[ExportPart], folder: Fol
     return tuple(closing.warnings)
 
 
-_ABOUT_MASKS = {
-    "footprint": ("- Masks: `footprint`. `mask` is that of the store, by the rules of the table below.",),
-    "effect": (
-        f"- Masks: `effect`. What is called `mask` here is `mask_effect` of the store, not the footprint of the "
-        f"table below: {EFFECT_RULE}. `mask_any` unites these masks and what several "
-        "faults change together.",
-    ),
-}
-
-
 def _card(store: Store, kind: Format, closing: Closing, numbers: Statistics, masks: str) -> str:
     """Return the card of an export as Markdown; `masks`: footprint or effect."""
-    title = store.attributes.get("title") or "untitled dataset"
-    front = ["---", *closing.front, "---", ""] if closing.front else []
-    lines = [
-        *front,
-        f"# {title}, exported as {kind.name}",
-        "",
-        *([str(store.attributes["description"]), ""] if store.attributes.get("description") else []),
-        f"{store.samples} samples of {store.spec.width} x {store.spec.height} px: {kind.summary}",
-        "",
-        "## Files",
-        "",
-        *kind.usage,
-        *closing.lines,
-        *(_ABOUT_MASKS[masks] if "mask_effect" not in kind.layers(store.spec) else ()),
-        "- `samples.jsonl`: one line of JSON for each sample, with its file, its split, the names of "
-        "its faults, pose, "
-        "Sun, exposure, and every drawn parameter of every fault.",
-        "- `croissant.json`: this description for programs (Croissant 1.0). `export.json`: what was exported.",
-        "",
-        "The order of the classes is that of the table below. The intensity channel is: "
-        f"{store.attributes.get('intensity_channel', 'luminance of RGB')}.",
-        "",
-        *described(store, numbers),
-    ]
-    return "\n".join(lines) + "\n"
+    return rendered(
+        "output/export/card.md",
+        store=store,
+        attributes=store.attributes,
+        kind=kind,
+        closing=closing,
+        lines=[*kind.usage, *closing.lines],
+        masks=masks,
+        names_masks="mask_effect" not in kind.layers(store.spec),
+        effect_rule=EFFECT_RULE,
+        described=described(store, numbers),
+    )
 
 
 _COLUMNS = {

@@ -37,6 +37,7 @@ Groups = Sequence[tuple[str, F64]]  # name and values of each split
 # Colours of the splits, in their order; a further split is drawn in the colour of text.
 SPLIT_COLOURS = (BLUE, VERMILLION, GREEN)
 _BINS = 24
+_MOST = 1e30
 _FEW = 6  # a group of fewer values is drawn as dots
 _ROW = 14.0  # height of the bar of a split in points
 _SPREAD = 15.0  # positive values whose 99th percentile is so many medians get a logarithmic axis
@@ -95,6 +96,10 @@ def histogram(
     labels
         Names of the whole numbers from 0 on, where the values are the numbers of kinds.
     """
+    groups = [(name, _drawable(values)) for name, values in groups]
+    bounds = [
+        (name, (float(low), float(high))) for name, pair in bounds for low, high in [_drawable(np.array(pair))]
+    ]
     given = np.concatenate([values for _, values in groups] or [np.zeros(0)])
     if not given.size or (given.min() == given.max() and not bounds and not labels):
         text = f"{number_text(float(given[0]), unit=unit)} in all samples" if given.size else "no values"
@@ -126,6 +131,11 @@ def histogram(
     words = "; ".join(f"{name}: {len(values)} values" for name, values in groups)
     label = f"{title} from {number_text(low)} to {number_text(high)} {unit}; {words}"
     return _chart(figure, f"{section}-{title}", title, unit, label)
+
+
+def _drawable(values: F64) -> F64:
+    """Return values without those that overflow on an axis: a damaged store may hold any number."""
+    return np.where(np.abs(values) < 1 / _MOST, 0.0, np.clip(values, -_MOST, _MOST))
 
 
 def is_wide(groups: Groups) -> bool:
@@ -163,10 +173,11 @@ def _draw_values(axes: Axes, k: int, values: F64, edges: F64, has_zeros: bool) -
     step = (edges[-1] / edges[0]) ** 0.03
     zero = edges[0] / step**4
     axes.set_xlim(zero / step**2, edges[-1])
-    axes.set_xticks([tick for tick in axes.get_xticks() if tick >= edges[0]])
+    axes.set_xticks([tick for tick in axes.get_xticks() if edges[0] <= tick <= edges[-1]])
     at_zero = 1 - len(kept) / total
     axes.bar(zero * step ** (0.8 * (k - 1)), at_zero, width=0.6 * zero * (step - 1), color=colour, alpha=0.6)
-    axes.text(zero, -0.045, "0", transform=axes.get_xaxis_transform(), ha="center", va="top")
+    if k == 0:
+        axes.text(zero, -0.045, "0", transform=axes.get_xaxis_transform(), ha="center", va="top")
     return max(float(fractions.max()), at_zero)
 
 

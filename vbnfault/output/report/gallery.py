@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from ...core.html_page import data_url, image_url
 from ...core.quantities import Sample
 from ...store import Store
-from ..contact_sheet import COLOURS, resized_mask
-from .measure import Scalars, readable, spread
+from ..contact_sheet import COLOURS, resized_mask, spread
+from .measure import Scalars, readable
 
 _SIDES_PX = (640, 400, 256, 128)  # of the images; the first whose files fit is taken
 _MOST_BYTES = 15_000_000  # of all images

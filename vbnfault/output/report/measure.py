@@ -10,12 +10,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from ...core.errors import VbnfaultError
 from ...core.quantities import Sample
 from ...dataset.statistics import is_seed, key_of
 from ...faults import registry
 from ...store import SPLITS, STRATA, Store, drawn_table
+from ..contact_sheet import spread
 
 F64 = NDArray[np.float64]
 
@@ -85,15 +87,12 @@ class Scalars:
     @cached_property
     def sun_C(self) -> F64:
         """Return the unit vectors towards the Sun in the camera frame C (x right, y down, z boresight), [n, 3]."""
-        w, x, y, z = self.columns["camera_from_T"].T
-        rotation = np.array(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-            ]
-        )
-        return np.einsum("ijn,nj->ni", rotation, self.columns["sun_direction_T"])
+        quaternion = self.columns["camera_from_T"]
+        is_any = np.linalg.norm(quaternion, axis=1) > 0  # a damaged one may be none
+        directions = np.full((len(quaternion), 3), np.nan)
+        camera_from_T = Rotation.from_quat(quaternion[is_any], scalar_first=True)
+        directions[is_any] = camera_from_T.apply(self.columns["sun_direction_T"][is_any])
+        return directions
 
     def by_split(self, values: F64, of: NDArray[np.int64] | None = None) -> list[tuple[str, F64]]:
         """Return the finite values of each split with its name.
@@ -133,11 +132,6 @@ def read_scalars(store: Store) -> Scalars:
     )
 
 
-def spread(count: int, most: int) -> NDArray[np.int64]:
-    """Return up to `most` of the numbers 0 to `count` - 1, evenly spaced and ascending."""
-    return np.unique(np.linspace(0, max(count - 1, 0), min(count, most)).round().astype(np.int64))[:count]
-
-
 # --- drawn parameters ---------------------------------------------------------------------------------------
 
 
@@ -153,30 +147,26 @@ class Drawn:
 
 def read_drawn(store: Store, scalars: Scalars) -> tuple[list[Drawn], int]:
     """Return the drawn parameters of the faults but seeds, and from how many samples they were read."""
-    values: dict[tuple[str, str], list[F64]] = {}
-    splits: dict[tuple[str, str], list[NDArray[np.int64]]] = {}
+    found: dict[tuple[str, str], list[tuple[F64, int]]] = {}  # by fault and name: numbers of a sample, its split
     chosen = spread(len(scalars.samples), _MOST_DRAWN)
-    size = store.spec.shard_samples
-    for number, positions in _by_shard(scalars.samples, chosen, size).items():
+    shard, first = np.divmod(scalars.samples[chosen], store.spec.shard_samples)
+    for number in np.unique(shard).tolist():
         try:
             texts = store.column("parameters", number)
         except (OSError, ValueError):
             continue
-        for position in positions:
-            drawn = parsed(texts[scalars.samples[position] - number * size])
-            for fault, parameters in drawn.items():
+        for position, index in zip(chosen[shard == number], first[shard == number], strict=True):
+            for fault, parameters in parsed(texts[index]).items():
                 for name, numbers in _numbers(parameters):
-                    if is_seed(name):
-                        continue
-                    values.setdefault((fault, name), []).append(numbers)
-                    of_split = np.full(len(numbers), scalars.split[position])
-                    splits.setdefault((fault, name), []).append(of_split)
+                    if not is_seed(name):
+                        found.setdefault((fault, name), []).append((numbers, int(scalars.split[position])))
     order = {fault: k for k, fault in enumerate(store.spec.faults)}
-    keys = sorted(values, key=lambda key: (order.get(key[0], len(order)), key[1]))
-    return [
-        Drawn(fault=f, name=n, values=np.concatenate(values[f, n]), split=np.concatenate(splits[f, n]))
-        for f, n in keys
-    ], len(chosen)
+    drawn = []
+    for fault, name in sorted(found, key=lambda key: (order.get(key[0], len(order)), key[1])):
+        values, splits = zip(*found[fault, name], strict=True)
+        split = np.repeat(splits, [len(numbers) for numbers in values])
+        drawn.append(Drawn(fault=fault, name=name, values=np.concatenate(values), split=split))
+    return drawn, len(chosen)
 
 
 def parsed(text: Any) -> dict[str, Any]:
@@ -185,14 +175,6 @@ def parsed(text: Any) -> dict[str, Any]:
         return drawn_table(text)
     except ValueError:
         return {}
-
-
-def _by_shard(samples: NDArray[np.int64], chosen: NDArray[np.int64], size: int) -> dict[int, list[int]]:
-    """Return the chosen positions by shard."""
-    shards: dict[int, list[int]] = {}
-    for position in chosen.tolist():
-        shards.setdefault(int(samples[position]) // size, []).append(position)
-    return shards
 
 
 def _numbers(drawn: Any, name: str = "") -> Iterator[tuple[str, F64]]:
@@ -287,7 +269,8 @@ def read_pixels(store: Store, scalars: Scalars, most: int, unread: dict[int, str
         layers = sample.layers
         positions.append(position)
         for image in images:
-            rows[image].append(_of_image(layers[image]))
+            saturated = (layers[image][..., :3] >= _SATURATED_DN).any(axis=-1)
+            rows[image].append((saturated.mean(), layers[image][..., -1].mean()))
         for mask in masks:
             rows[mask].append(layers[mask].mean(axis=(1, 2)))
     of_images = {name: np.array(rows[name], dtype=np.float64).reshape(-1, 2) for name in images}
@@ -314,9 +297,3 @@ def readable(
             unread[position] = str(error)
             continue
         yield position, sample
-
-
-def _of_image(image: NDArray[Any]) -> tuple[float, float]:
-    """Return the saturated fraction and the mean intensity of an image, uint8[y, x, channel]."""
-    saturated = (image[..., :3] >= _SATURATED_DN).any(axis=-1).mean()
-    return float(saturated), float(image[..., -1].mean())

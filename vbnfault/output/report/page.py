@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ...core import tables
 from ...core.errors import InputError, VbnfaultError, shown
-from ...core.html_page import grouped_digits, write_page
+from ...core.html_page import write_page
 from ...core.path_checks import path_of
 from ...core.whole_files import unwritable
 from ...dataset.statistics import Statistics, statistics
@@ -127,7 +127,6 @@ def _values(store: Store, scalars: Scalars, shown_samples: int, read_samples: in
         "store": store,
         "name": store.path.name,
         "attributes": attributes,
-        "facts": _facts(store, scalars),
         "scalars": scalars,
         "pixels": pixels,
         "cards": sheet,
@@ -144,38 +143,15 @@ def _values(store: Store, scalars: Scalars, shown_samples: int, read_samples: in
             scalars, drawn, numbers.bounds if numbers else {}, attributes.get("fault_models", {})
         ),
         "parameters_read": read,
+        "percent": charts.percent,
         "exposure": _exposure(scalars, pixels),
         "areas": _areas(store, scalars, pixels),
-        "rules": [
-            [
-                fault.replace("_", " "),
-                attributes.get("fault_models", {}).get(fault, ""),
-                spec.mask_kinds[k] if spec.mask_kinds else "",
-                spec.mask_rules[k] if spec.mask_rules else "",
-            ]
-            for k, fault in enumerate(spec.faults)
-        ],
     }
 
 
 def _colour(k: int) -> str:
     """Return the colour of the fault number `k`."""
     return "#{:02x}{:02x}{:02x}".format(*COLOURS[k % len(COLOURS)])
-
-
-def _facts(store: Store, scalars: Scalars) -> dict[str, str]:
-    """Return the numbers below the title."""
-    spec, finished = store.spec, len(scalars.samples) + scalars.unreadable
-    some = f" of {grouped_digits(store.samples)} finished" if finished < store.samples else ""
-    without = charts.percent(float((~scalars.injected.any(axis=1)).mean())) if spec.faults else ""
-    return {
-        "Samples": grouped_digits(finished) + some,
-        "Frame": f"{spec.width} × {spec.height} px",
-        "Fault classes": str(len(spec.faults)),
-        **{n: grouped_digits(int((scalars.split == k).sum())) for k, n in enumerate(scalars.split_names)},
-        "Without fault": without,
-        "Licence": str(store.attributes.get("licence") or "not stated"),
-    }
 
 
 def _balance(store: Store, scalars: Scalars, numbers: Statistics | None) -> dict[str, Any]:
@@ -195,11 +171,7 @@ def _balance(store: Store, scalars: Scalars, numbers: Statistics | None) -> dict
     return {
         "is_planned": is_planned,
         "drawn": charts.balance(rows),
-        "numbers": [
-            [class_name, split, realised, "–" if planned is None else planned, of]
-            for class_name, _, splits in rows
-            for split, (realised, planned, of) in splits
-        ],
+        "rows": rows,
         "beside": [
             charts.histogram("faults in a sample", "", scalars.by_split(counts), limits=ends),
             charts.histogram("stratum", "", scalars.by_split(strata), limits=(-0.5, last), labels=STRATA),

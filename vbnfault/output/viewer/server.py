@@ -27,6 +27,7 @@ from ...core import images
 from ...core.errors import InputError, VbnfaultError
 from ...store import SCALARS, SEMANTIC, SPLITS, STRATA, ShardReader, Store
 from ..contact_sheet import COLOURS, abbreviations, overlay, resized, resized_mask
+from ..json_files import plain
 from .listing import Listing
 
 _PAGE = {
@@ -182,7 +183,7 @@ class Viewer:
             except (OSError, ValueError):
                 damaged.append(name)
                 continue
-            values[name] = str(value) if row.is_text else _plain(value)
+            values[name] = str(value) if row.is_text else plain(value)
             if row.units not in ("1", ""):
                 values[name] = {"value": values[name], "units": row.units}
         for name in ("parameters", "proposal"):
@@ -263,14 +264,6 @@ def _exact(digits: str) -> int | str:
 def _finite(digits: str) -> float | str:
     """Return a number, as text where it is beyond all floats."""
     return float(digits) if math.isfinite(float(digits)) else digits
-
-
-def _plain(value: Any) -> Any:
-    """Return numpy values as JSON-able data; None for what is not finite."""
-    if isinstance(value, np.ndarray):
-        return [_plain(entry) for entry in value]
-    plain = value.item() if isinstance(value, np.generic) else value
-    return None if isinstance(plain, float) and not math.isfinite(plain) else plain
 
 
 def _json(value: Any) -> bytes:

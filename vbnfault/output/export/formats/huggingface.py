@@ -9,19 +9,16 @@ from typing import Any, ClassVar
 
 from ....core.quantities import Sample
 from ....store import STRATA, Store, StoreSpec
-from ..contract import Closing, Entry, ExportPart, Finished, Format, mask_png, number_text, png
+from ..contract import Closing, Entry, ExportPart, Finished, Format, number_text, png_files
 from ..folder import Folder
 
-_IMAGE = {"_type": "Image"}
-_TEXT = {"dtype": "string", "_type": "Value"}
-_NUMBER = {"dtype": "float64", "_type": "Value"}
 _NUMBERS = ("exposure_s", "sun_azimuth_deg", "sun_elevation_deg", "sun_distance_au", "sun_visible_fraction")
 _VECTORS = ("camera_position_T_m", "camera_from_T", "sun_direction_T", "intrinsics")
 _ROWS_IN_MEMORY = 8
 
 
 class HuggingFace(Format):
-    """Hugging Face: Parquet files with images, masks, labels and pose as typed columns.
+    """Parquet files for Hugging Face, with images, masks, labels and pose as typed columns.
 
     - `data/SPLIT-*.parquet`: `datasets.load_dataset("PATH_OF_THIS_FOLDER")` gives all splits; the head of this
       card names the files of each.
@@ -47,11 +44,10 @@ class HuggingFace(Format):
         import pyarrow
         import pyarrow.parquet
 
-        features = _features(store.spec)
-        info = json.dumps({"info": {"features": features}})
-        schema = pyarrow.schema(
-            [(name, _arrow_type(feature)) for name, feature in features.items()], metadata={"huggingface": info}
-        )
+        columns = _columns(store.spec)
+        info = json.dumps({"info": {"features": {name: feature for name, (_, feature) in columns.items()}}})
+        types = [(name, kind) for name, (kind, _) in columns.items()]
+        schema = pyarrow.schema(types, metadata={"huggingface": info})
         name = f"data/{part.split}-{part.of_split:05d}-of-{part.parts_of_split:05d}.parquet"
         entries: list[Entry] = []
 
@@ -97,48 +93,35 @@ class HuggingFace(Format):
         )
 
 
-def _features(spec: StoreSpec) -> dict[str, Any]:
-    """Return the features of the columns as `datasets` writes them."""
-    labels = {"names": [*spec.faults], "_type": "ClassLabel"}
+def _columns(spec: StoreSpec) -> dict[str, tuple[Any, dict[str, Any]]]:
+    """Return of each column the type in Arrow, and the feature as `datasets` writes it."""
+    import pyarrow as pa
+
+    def value(kind: Any) -> tuple[Any, dict[str, Any]]:
+        return kind, {"dtype": "float64" if kind == pa.float64() else str(kind), "_type": "Value"}
+
+    def sequence(kind: Any, feature: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
+        return pa.list_(kind), {"feature": feature, "_type": "Sequence"}
+
+    image = pa.struct([("bytes", pa.binary()), ("path", pa.string())]), {"_type": "Image"}
     return {
-        "image": _IMAGE,
-        "intensity": _IMAGE,
-        "clean": _IMAGE,
-        **{f"mask_{fault}": _IMAGE for fault in spec.faults},
-        "mask_any": _IMAGE,
-        "faults": {"feature": labels, "_type": "Sequence"},
-        "sample": {"dtype": "int64", "_type": "Value"},
-        "site": {"dtype": "int64", "_type": "Value"},
-        "stratum": _TEXT,
-        **dict.fromkeys(_NUMBERS, _NUMBER),
-        **{name: {"feature": _NUMBER, "_type": "Sequence"} for name in _VECTORS},
-        "parameters": _TEXT,
+        **dict.fromkeys(("image", "intensity", "clean", *(f"mask_{f}" for f in spec.faults), "mask_any"), image),
+        "faults": sequence(pa.int64(), {"names": [*spec.faults], "_type": "ClassLabel"}),
+        **dict.fromkeys(("sample", "site"), value(pa.int64())),
+        "stratum": value(pa.string()),
+        **dict.fromkeys(_NUMBERS, value(pa.float64())),
+        **dict.fromkeys(_VECTORS, sequence(*value(pa.float64()))),
+        "parameters": value(pa.string()),
     }
-
-
-def _arrow_type(feature: dict[str, Any]) -> Any:
-    """Return the Arrow type of a feature."""
-    import pyarrow
-
-    kind = feature["_type"]
-    if kind == "Image":
-        return pyarrow.struct([("bytes", pyarrow.binary()), ("path", pyarrow.string())])
-    if kind == "Sequence":
-        return pyarrow.list_(_arrow_type(feature["feature"]))
-    types = {"string": pyarrow.string(), "float64": pyarrow.float64(), "int64": pyarrow.int64()}
-    return types[feature.get("dtype", "int64")]  # a ClassLabel is an int64
 
 
 def _row(store: Store, sample: Sample) -> dict[str, Any]:
     """Return the columns of one sample."""
-    layers, scalars = sample.layers, sample.scalars
-    number = number_text(sample.index, store.samples)
+    scalars, number = sample.scalars, number_text(sample.index, store.samples)
     images = {
-        "image": png(layers["image"][..., :3]),
-        "intensity": png(layers["image"][..., 3]),
-        "clean": png(layers["clean"][..., :3]),
-        **{f"mask_{f}": mask_png(m) for f, m in zip(store.spec.faults, layers["mask"], strict=True)},
-        "mask_any": mask_png(layers["mask_any"]),
+        part if (name, part) == ("image", "intensity") else f"{name}_{part}" if part else name: content
+        for name, part, content in png_files(store.spec, sample)
+        if (name, part) != ("clean", "intensity")
     }
     return {
         **{name: {"bytes": data, "path": f"{number}_{name}.png"} for name, data in images.items()},

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator
-
-import numpy as np
+from collections.abc import Collection, Iterable
 
 from ....core.quantities import Sample
 from ....store import Store, StoreSpec
-from ..contract import Entry, ExportPart, Format, mask_png, number_text, png
+from ..contract import Entry, ExportPart, Format, number_text, png_files
 
 _MASKS = ("mask", "mask_effect")
 _PLAIN = ("mask_any", "semantic", "raw")
@@ -42,17 +40,13 @@ class PngFolders(Format):
     def files(self, store: Store, part: ExportPart, sample: Sample) -> tuple[Entry, Iterable[tuple[str, bytes]]]:
         """Return the files of one sample."""
         number = number_text(sample.index, store.samples)
-        return Entry(sample.index, f"{part.split}/image/{number}.png"), self._files(store, part, sample, number)
+        files = (
+            (f"{part.split}/{_folder(name, of)}/{number}.png", content)
+            for name, of, content in png_files(store.spec, sample)
+        )
+        return Entry(sample.index, f"{part.split}/image/{number}.png"), files
 
-    def _files(self, store: Store, part: ExportPart, sample: Sample, number: str) -> Iterator[tuple[str, bytes]]:
-        """Yield name and content of each file of a sample."""
-        for name, layer in sample.layers.items():
-            if name in _MASKS:
-                for fault, mask in zip(store.spec.faults, layer, strict=True):
-                    yield f"{part.split}/{name}/{fault}/{number}.png", mask_png(mask)
-            elif layer.ndim == 3:
-                yield f"{part.split}/{name}/{number}.png", png(layer[..., :3])
-                yield f"{part.split}/{name}_intensity/{number}.png", png(layer[..., 3])
-            else:
-                is_mask = layer.dtype == np.bool_
-                yield f"{part.split}/{name}/{number}.png", mask_png(layer) if is_mask else png(layer)
+
+def _folder(name: str, part: str) -> str:
+    """Return the folder of a part of a layer."""
+    return f"{name}_{part}" if part == "intensity" else f"{name}/{part}" if part else name

@@ -14,7 +14,7 @@ import numpy as np
 from ....core.quantities import Sample
 from ....store import Store, StoreSpec
 from ...json_files import plain
-from ..contract import Entry, ExportPart, Format, mask_png, number_text, png
+from ..contract import Entry, ExportPart, Format, number_text, png_files
 from ..folder import Folder
 
 _ARRAYS = ("depth_m", "normal")
@@ -66,19 +66,15 @@ class WebDataset(Format):
 
 def _members(store: Store, sample: Sample) -> Iterator[tuple[str, bytes]]:
     """Yield the ending and the content of each file of a sample."""
-    layers = sample.layers
-    yield "image.png", png(layers["image"][..., :3])
-    yield "intensity.png", png(layers["image"][..., 3])
-    yield "clean.png", png(layers["clean"][..., :3])
-    for fault, mask in zip(store.spec.faults, layers["mask"], strict=True):
-        yield f"mask.{fault}.png", mask_png(mask)
-    for name in _PLAIN:
-        if name in layers:
-            yield f"{name}.png", mask_png(layers[name]) if layers[name].dtype == np.bool_ else png(layers[name])
+    for name, part, content in png_files(store.spec, sample):
+        if part != "intensity":
+            yield f"{name}.{part}.png" if part else f"{name}.png", content
+        elif name == "image":
+            yield "intensity.png", content
     for name in _ARRAYS:
-        if name in layers:
+        if name in sample.layers:
             file = io.BytesIO()
-            np.save(file, layers[name], allow_pickle=False)
+            np.save(file, sample.layers[name], allow_pickle=False)
             yield f"{name}.npy", file.getvalue()
     yield "json", json.dumps(_scalars(store, sample), allow_nan=False).encode()
 
