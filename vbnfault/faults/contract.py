@@ -24,8 +24,8 @@ from ..core.errors import under_key
 from ..core.quantities import RGBI, Charge, Electrons, Offset, Quantity, RawMosaic, RimRows, soft_kind
 from ..core.registry import DeclarationError
 from ..detector.effects import STEPS as MOSAIC_STEPS
-from ..lens import load_lens
-from ..lens.image_frame import DEFAULT_LENS
+from ..lens import Prescription, load_lens
+from ..lens.image_frame import DEFAULT_LENS, ImageFrame
 from .context import FaultContext, Params
 from .fields import Interval, Severity, parse_field, path
 from .models import register
@@ -196,6 +196,10 @@ class Fault:
         """Return the camera with this fault, if the fault changes a parameter of the instrument."""
         return camera
 
+    def prescription(self, frame: ImageFrame) -> Prescription | None:
+        """Return the prescription that the model traces behind a camera; None if it traces none."""
+        return None
+
     def inform(self, context: FaultContext, params: Params) -> FaultContext:
         """Return the context for the models with `informed`, if this fault changes what they act on."""
         return context
@@ -357,6 +361,10 @@ class LensFault(Fault):
         if self.lens:
             with under_key("lens"):
                 load_lens(self.lens)
+
+    def prescription(self, frame: ImageFrame) -> Prescription:
+        """Return the named lens or the camera's own."""
+        return frame.real_lens(self.lens).prescription
 
 
 def with_sensor(camera: Camera, **changes: Any) -> Camera:

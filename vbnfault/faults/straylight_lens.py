@@ -37,6 +37,8 @@ from numpy.typing import NDArray
 from ..core import spectra
 from ..core.quantities import Radiance
 from ..core.spectra import Bands
+from ..lens import Prescription
+from ..lens.image_frame import ImageFrame
 from ..lens.straylight.paraxial import Ghost
 from ..lens.straylight.particles import CLEANLINESS_LIMITS
 from ..lens.straylight.scatter import ROUGHNESS_NM_LIMITS, Cleanliness
@@ -162,6 +164,10 @@ class _LensStraylight(LensFault):
             raise ValueError("scene_diffraction: needs sources = 'scene'")
         if self.baffle_length_mm and not self.baffle_radius_mm:
             raise ValueError("baffle_length_mm: needs baffle_radius_mm")
+
+    def prescription(self, frame: ImageFrame) -> Prescription:
+        """Return the lens with its coating."""
+        return frame.prescription(self.lens, self.coating)
 
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
         """Return lens, coating, roughness, cleanliness, veil, baffle, mask level and the ghosts in the frame."""

@@ -17,9 +17,8 @@ of field of the render are those of the nominal lens.
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
 from typing import Any
@@ -29,44 +28,36 @@ from numpy.typing import NDArray
 
 from ..camera import Camera
 from ..core import spectra
-from ..core.errors import InputError, shown
-from ..core.quantities import Electrons
+from ..core.errors import InputError, in_file, shown
 from ..core.spectra import Bands
 from ..core.tables import did_you_mean
-from ..faults import Fault, act, registry
-from ..lens import Prescription
+from ..faults import Fault, FaultContext, act
 from ..lens.changes import changed
-from ..lens.image_frame import ImageFrame
 from ..lens.straylight.irradiance import flare_model
 from ..lens.straylight.scatter import GlareLayout
 from ..lens.straylight.settings import GhostSettings, SensorGrid
 from ..lens.straylight.total import COARSE_SPIKES, GhostSource, SpreadLight, SunInLens, ghosts, veil_per_px
-from ..pipeline.development import Development
-from ..pipeline.exposure import exposure_s
-from ..pipeline.injection import fault_context, inject_faults
+from ..pipeline.exposure import meter
+from ..pipeline.injection import inject_faults
 from ..pipeline.rendering import render_view
 from ..pipeline.resolve import resolve
-from ..pipeline.session import Session, configure_faults
-from ..pipeline.spec import Injection, Pose, Rendering, SampleSpec, SceneExposure
-from ..pipeline.stars import add_stars
-from ..scene.config import Scene
+from ..pipeline.session import Session
+from ..pipeline.spec import Injection, SampleSpec
+from ..scene.config import Scene, configure_faults
+from ..world.assemble import base_camera
 from . import chosen_fault, image_metrics
 from . import navigation_metrics as nav
-from .factors import Factors, Setting
+from .factors import Factors, Setting, StudyScene, base_scene, changed_scene
 from .image_metrics import LitImage
 from .kept import Kept
-from .scenes import StudyScene, check_models, faults_of, scene_of
 from .spec import Evaluation, Metric, StudySpec
 from .views import (
+    CleanView,
     Exposed,
     RenderedView,
     camera_shape,
     dark_e,
-    efficiency_key,
-    lit_pixels,
-    planes_of,
-    scene_rate,
-    sun_rate,
+    rendered_sequence,
     with_detector,
     with_sun,
 )
@@ -94,21 +85,27 @@ class SceneEvaluator:
     def __init__(self, spec: StudySpec) -> None:
         self.spec = spec
         self.kept = Kept()
-        self._base = scene_of(spec)
+        self._source = f"study {shown(spec.title)}"
         self._session: tuple[Hashable, Session] | None = None
-        self._kept_scene = lru_cache(maxsize=16)(self._made_scene)
-        with self._named():
-            faults = dict(self._base.faults)
+        with in_file(self._source):
+            self._base = base_scene(spec)
+            self.scene_of = lru_cache(maxsize=16)(partial(changed_scene, spec, self._base))
+            plain = [StudyScene(self._base)]
             if spec.models is not None:
-                check_models(spec, faults)
-            camera = Session(self._plain_scene()).base_camera
-            self._nominal_camera = camera
-            self.factors = Factors(spec, self._base, camera, self._nominal_lens(camera))
+                plain = [self.scene_of(self._base.dataset.seed, model) for model in spec.models.compare]
+            configure_faults(plain[0].scene)
             self._chosen_faults = chosen_fault.choices(spec)
             for choice in self._chosen_faults:
-                scene = self.factors.scene_of(spec.scene.seeds[0], "", ((chosen_fault.SCENE_KEY, choice),))
-                configure_faults(scene, f"{chosen_fault.KEY} = {choice!r}")
-        self._check_metrics()
+                made = self.scene_of(spec.scene.seeds[0], "", ((chosen_fault.SCENE_KEY, choice),))
+                configure_faults(made.scene, f"{chosen_fault.KEY} = {choice!r}")
+            self._nominal_camera = camera = base_camera(plain[0].scene)
+            adding = [name for made in plain for name, f in made.faults.items() if f.soft_layer.endswith("_added")]
+            self._adding = adding[0] if adding else ""  # the fault that adds light
+            frame = FaultContext(camera=camera).frame
+            traced = [made.faults[self._adding].prescription(frame) for made in plain if adding]
+            self._nominal_lens = next(filter(None, traced), None) or frame.prescription("", "as_prescribed")
+            self.factors = Factors(spec, self._base, camera, self._nominal_lens)
+            self._check_metrics()
 
     # --- the contract of an evaluator -----------------------------------------------------------------------------
 
@@ -221,41 +218,6 @@ class SceneEvaluator:
 
     # --- the study's scene ----------------------------------------------------------------------------------------
 
-    @contextlib.contextmanager
-    def _named(self) -> Iterator[None]:
-        """Name the study in errors."""
-        try:
-            yield
-        except InputError as error:
-            raise InputError(f"study {shown(self.spec.title)}: {error}") from None
-
-    @cached_property
-    def _adding(self) -> str:
-        """Return the fault class of the scene that adds light, by its soft layer; empty where it has none."""
-        adds = [name for name, fault in faults_of(self._base).items() if fault.soft_layer.endswith("_added")]
-        return adds[0] if adds else ""
-
-    def _plain_scene(self) -> Scene:
-        """Return the scene with the first seed and model."""
-        if self.spec.models is None:
-            return self._base
-        name, model = self.spec.models.fault, self.spec.model_names[0]
-        table = {**self._base.faults.get(name, {}), "model": model}
-        fault = registry()[name][model]
-        own = {key: value for key, value in table.items() if key == "model" or key in fault.__dataclass_fields__}
-        return self._base.model_copy(update={"faults": {**self._base.faults, name: own}})
-
-    def _nominal_lens(self, camera: Camera) -> Prescription:
-        """Return the prescription that the scene's straylight traces, without factors."""
-        table = self._base.faults.get(self._adding, {})
-        frame = ImageFrame(
-            lens=camera.lens,
-            width_px=camera.width_px,
-            height_px=camera.height_px,
-            pixel_pitch_um=camera.detector.pixel_pitch_um,
-        )
-        return frame.prescription(str(table.get("lens", "")), str(table.get("coating", "as_prescribed")))
-
     def _check_metrics(self) -> None:
         """Raise InputError if a metric is unknown, or has nothing to measure in the scene."""
         known = [*image_metrics.NAMES, *_NAVIGATION]
@@ -263,31 +225,23 @@ class SceneEvaluator:
             if name in _NAVIGATION:
                 continue
             if not image_metrics.is_image_metric(name):
-                raise InputError(
-                    f"study {shown(self.spec.title)}: metrics.names: {shown(name)} is unknown"
-                    f"{did_you_mean(name, known)}"
-                )
+                raise InputError(f"metrics.names: {shown(name)} is unknown{did_you_mean(name, known)}")
             if self._chosen_faults:
                 raise InputError(
-                    f"study {self.spec.title!r}: metrics.names: {name!r} measures the straylight of the scene; "
+                    f"metrics.names: {name!r} measures the straylight of the scene; "
                     f"with the factor {chosen_fault.KEY} use metrics of navigation: {', '.join(_NAVIGATION)}"
                 )
             if not self._adding:
                 raise InputError(
-                    f"study {shown(self.spec.title)}: metrics.names: {shown(name)} needs a fault that adds light, "
-                    f"which the scene {shown(self.spec.scene.base)} has not"
+                    f"metrics.names: {shown(name)} needs a fault that adds light, which the scene "
+                    f" {shown(self.spec.scene.base)} has not"
                 )
 
     # --- stages ---------------------------------------------------------------------------------------------------
 
     def _scene(self, evaluation: Evaluation, setting: Setting) -> StudyScene:
         """Return the scene of an evaluation."""
-        return self._kept_scene(evaluation.seed, evaluation.model, tuple(sorted(setting.scene.items())))
-
-    def _made_scene(self, seed: int, model: str, changes: tuple[tuple[str, Any], ...]) -> StudyScene:
-        """Return the scene with a seed, with a model of the compared fault, and with changed keys."""
-        with self._named():
-            return StudyScene(self.factors.scene_of(seed, model, changes))
+        return self.scene_of(evaluation.seed, evaluation.model, tuple(sorted(setting.scene.items())))
 
     def _view(self, evaluation: Evaluation, made: StudyScene) -> RenderedView:
         """Return a view, rendered where this was not done before for what the renderer reads of the scene."""
@@ -298,13 +252,8 @@ class SceneEvaluator:
         """Render a view."""
         if self._session is None or self._session[0] != key:
             self._session = None  # release the old terrain first
-            self._session = key, Session(scene, source=f"study {shown(self.spec.title)}")
+            self._session = key, Session(scene, source=self._source)
         session = self._session[1]
-        if not 0 <= index < len(session.plan):
-            raise InputError(
-                f"study {shown(self.spec.title)}: scene.samples = {index}: must be from 0 to "
-                f"{len(session.plan) - 1}"
-            )
         spec = session.spec(index)
         pose = resolve(spec, 0)
         spec = spec.at(pose)
@@ -313,43 +262,24 @@ class SceneEvaluator:
     def _exposed(self, evaluation: Evaluation, setting: Setting) -> Exposed:
         """Return the view of an evaluation with its camera, its Sun and its exposure."""
         made = self._scene(evaluation, setting)
-        scene, view = made.scene, self._view(evaluation, made)
-        spec = replace(view.spec, scene=scene, faults=faults_of(scene))
-        camera = self._camera(spec, setting)
-        pose, rendering = with_sun(view, camera, setting.sun)
-        far = setting.sun.get("distance_au")
-        view_key = evaluation.seed, evaluation.view, made.render_key
-        optics = (*view_key, camera.lens, efficiency_key(camera))
-        per_s = self.kept.once(
-            "direct image", (*optics, far), lambda: scene_rate(camera, rendering.light.rendered), "scene"
-        )
-        sun_key = (*optics, tuple(sorted(setting.sun.items())))
-        direct = self.kept.once("direct image", sun_key, lambda: sun_rate(camera, rendering.light.rendered))
-        white = camera.detector.white_e
-        rate = Electrons(array=per_s, white_e=white, past_rims=direct)
-        metered = self.kept.once(
-            "exposure",
-            (*sun_key, white.tobytes(), scene.camera),
-            lambda: exposure_s(scene, camera, rendering.truth, rate.merged),
-        )
-        camera = replace(camera, exposure_s=metered)
-        planes = self.kept.once(
-            "direct image",
-            (*sun_key, metered, white.tobytes()),
-            lambda: (planes_of(per_s, metered), None if direct is None else planes_of(direct, metered)),
-            "planes",
-        )
-        lit = self.kept.once(
-            "direct image", (*optics, far), lambda: lit_pixels(per_s, rendering.truth.semantic), "lit"
-        )
-        return Exposed(
-            spec=spec,
+        seen = self._seen(self._view(evaluation, made), evaluation, made, setting)
+        return Exposed(**vars(seen), exposure=meter(seen.spec, seen.rendering))
+
+    def _seen(self, view: RenderedView, evaluation: Evaluation, made: StudyScene, setting: Setting) -> RenderedView:
+        """Return a rendered view with the scene, the camera and the Sun of an evaluation.
+
+        What the stages share between the samples of a view is kept by all that this view differs in.
+        """
+        scene = made.scene
+        camera = self._camera(replace(view.spec, scene=scene), setting)
+        pose, rendering = with_sun(view, setting.sun)
+        optics = camera.lens, camera.lens_changes
+        key = (made.render_key, evaluation.view, view.number, tuple(setting.sun.items()), scene.camera, optics)
+        return RenderedView(
+            spec=replace(view.spec, scene=scene, faults=made.faults, taken_with=camera),
             pose=pose,
-            rendering=rendering,
-            exposure=SceneExposure(camera=camera, light=rendering.light, rate=rate),
-            scene_e=planes[0],
-            direct_e=planes[1],
-            lit=lit,
+            rendering=replace(rendering, shared=self.kept.of_view(key)),
+            number=view.number,
         )
 
     def _camera(self, spec: SampleSpec, setting: Setting) -> Camera:
@@ -435,7 +365,7 @@ class SceneEvaluator:
         The Sun stands at half the half-width of the field, to the right.
         """
         camera = self._nominal_camera
-        lens = self._nominal_lens(camera)
+        lens = self._nominal_lens
         scene = self._base.render
         bands = Bands.sunlight(scene.band_min_nm, scene.band_max_nm)
         sensor = SensorGrid(shape=camera_shape(camera), pitch_mm=camera.detector.pixel_pitch_um * 1e-3)
@@ -479,16 +409,15 @@ class SceneEvaluator:
 
         There are none where the fault that a factor chooses cannot act, or does not show.
         """
-        scene = self._scene(evaluation, setting).scene
-        faults = faults_of(scene)
+        made = self._scene(evaluation, setting)
         frames: list[nav.NavigationFrame] = []
         first: Injection | None = None
         for clean in self._clean_views(evaluation, setting, count).views:
             with self.kept.timed("faults"):
-                spec = replace(clean.spec, scene=scene, faults=faults)
+                spec = replace(clean.spec, scene=made.scene, faults=made.faults)
                 view = spec, clean.pose, clean.rendering, clean.exposure
                 if first is None:
-                    chosen = chosen_fault.acting(faults, spec, clean.pose) if self._chosen_faults else None
+                    chosen = chosen_fault.acting(made.faults, spec, clean.pose) if self._chosen_faults else None
                     first = injection = inject_faults(*view, commanded=chosen)
                     if self._chosen_faults and not first.draws:
                         return []
@@ -502,31 +431,17 @@ class SceneEvaluator:
         """Return the first `count` views of an evaluation's sequence without faults."""
         without = replace(setting, scene={k: v for k, v in setting.scene.items() if k != chosen_fault.SCENE_KEY})
         made = self._scene(evaluation, without)
-        scene, view = made.scene, self._view(evaluation, made)
+        view = self._view(evaluation, made)
         key = made.render_key, evaluation.view, count
-        sequence = self.kept.once("render", key, lambda: _rendered_sequence(view, count), "sequence")
+        sequence = self.kept.once("render", key, lambda: list(rendered_sequence(view, count)), "sequence")
         sun, detector = tuple(sorted(setting.sun.items())), tuple(sorted(setting.detector.items()))
 
         def make() -> _CleanSequence:
-            views = [self._clean_view(seen, scene, setting) for seen in sequence]
-            twins = nav.CleanTwins([view.frame.clean for view in views], [view.frame.view for view in views])
-            return _CleanSequence(views=views, twins=twins)
+            seen = (self._seen(view, evaluation, made, setting) for view in sequence)
+            views = [CleanView.of(view, nominal.spec.camera) for view, nominal in zip(seen, sequence, strict=True)]
+            return _CleanSequence(views=views, twins=nav.CleanTwins.of([view.frame for view in views]))
 
-        return self.kept.once("clean twins", (*key, scene.camera, tuple(setting.lens), detector, sun), make)
-
-    def _clean_view(self, seen: RenderedView, scene: Scene, setting: Setting) -> _CleanView:
-        """Return a view of a sequence with its exposure and its clean twin."""
-        spec = replace(seen.spec, scene=scene, faults=faults_of(scene))
-        camera = self._camera(spec, setting)
-        pose, rendering = with_sun(seen, camera, setting.sun)
-        rate = camera.expose(rendering.light.rendered, 1.0)
-        seconds = exposure_s(scene, camera, rendering.truth, rate.merged)
-        exposed = SceneExposure(camera=replace(camera, exposure_s=seconds), light=rendering.light, rate=rate)
-        exposed = add_stars(spec, pose, rendering, exposed)
-        context = fault_context(pose, rendering, exposed)
-        clean = Development(exposure=exposed, context=context, rng=spec.rng).image({}).array
-        frame = nav.navigation_frame(pose, rendering.truth, seen.spec.camera, clean, clean)
-        return _CleanView(spec=spec, pose=pose, rendering=rendering, exposure=exposed, frame=frame)
+        return self.kept.once("clean twins", (*key, made.scene.camera, tuple(setting.lens), detector, sun), make)
 
     # --- what a factor moves --------------------------------------------------------------------------------------
 
@@ -535,7 +450,7 @@ class SceneEvaluator:
         seed, view = self.spec.scene.seeds[0], self.spec.scene.views[0]
         evaluation = Evaluation(index=0, seed=seed, view=view, model=model, role="check", values=values)
         setting = self.factors.setting(values)
-        changed(self._nominal_lens(self._nominal_camera), setting.lens)
+        changed(self._nominal_lens, setting.lens)
         with_detector(self._nominal_camera, setting.detector)
         self._scene(evaluation, setting)
 
@@ -557,31 +472,11 @@ class SceneEvaluator:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _CleanView:
-    """Hold a view of a sequence as far as no fault changes it; both images of `frame` are its clean twin."""
-
-    spec: SampleSpec
-    pose: Pose
-    rendering: Rendering
-    exposure: SceneExposure
-    frame: nav.NavigationFrame
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
 class _CleanSequence:
     """Hold the views of a sequence, and what the metrics need of their clean twins."""
 
-    views: Sequence[_CleanView]
+    views: Sequence[CleanView]
     twins: nav.CleanTwins
-
-
-def _rendered_sequence(view: RenderedView, count: int) -> list[RenderedView]:
-    """Return the views of a sequence that begins with a view."""
-    views = [view]
-    for k, pose in enumerate(nav.sequence(view.spec, view.pose, view.rendering, count)[1:], start=1):
-        spec = nav.spec_of_view(view.spec, k)
-        views.append(RenderedView(spec=spec, pose=pose, rendering=render_view(spec, pose)))
-    return views
 
 
 # --- values and images -------------------------------------------------------------------------------------------

@@ -5,8 +5,8 @@ Each path is a table of steps, so that the rays of all ghosts run side by side t
 of a ray is relative to the vertex of the surface that the ray has just met. If the boxes of the bundles are
 symmetric about the plane of axis and Sun, the code traces only one side of this plane.
 
-Coatings vary faster with wavelength than directions of rays: a tracer of bands has the fractions of light of every
-other nanometre and means around the wavelengths that it traces. `ghosts.GhostSpectra` compares both with few rays.
+Coatings vary faster with wavelength than directions of rays: a tracer of bands has the fractions of light at
+many wavelengths and means around the wavelengths that it traces. `ghosts.GhostSpectra` compares both with few rays.
 A route is the sequence of reflecting surfaces, which are numbered by their row in the prescription. The path of a
 route is the sequence of all surfaces that a ray meets; each of them is one step.
 
@@ -306,7 +306,7 @@ class Tracer:
         self.lens = lens
         self.wavelength_nm = np.atleast_1d(np.asarray(wavelength_nm, dtype=np.float64))
         self.bands = bands if bands is not None and len(bands.nm) > 1 else None
-        self.light_nm = self.wavelength_nm if self.bands is None else self.bands.sampled_nm
+        self.light_nm = self.wavelength_nm if self.bands is None else self.bands.sampled_nm(lens.spectral_step_nm)
         self._cosines = _COSINES if self.bands is None else _COSINES_OF_BANDS
         self.routes = routes(lens, reflections) if routes_ is None else tuple(routes_)
         self.sensor_mm = paraxial_properties(lens).bfd_mm
