@@ -188,10 +188,7 @@ def worn(lens: Prescription, wavelength_nm: F64, coating_loss: float) -> F64:
 
 def colours(params: Params, context: FaultContext) -> F64:
     """Return the fraction of sunlight that passes in each of the detector's channels, float64[channel]."""
-    nodes, sun = context.wavelength_nm, context.sun_irradiance_W_m2_nm
-    if nodes is None or sun is None:
-        nodes = spectra.band_nodes_nm(400.0, 700.0, 8)
-        sun = spectra.solar_band_irradiance_W_m2_nm(nodes, 1.0)
+    nodes, sun = context.sunlight
     lens = context.frame.prescription(params["lens"], params["coating"])
     nm = spectra.fine_nodes_nm(nodes)
     passes = worn(lens, nm, params["coating_loss"]) * browned(

@@ -344,12 +344,11 @@ def _sun(context: FaultContext) -> _Sun | None:
     direction, irradiance = context.sun_direction_C, context.sun_irradiance_W_m2_nm
     if direction is None or irradiance is None or context.wavelength_nm is None or direction[2] <= 1e-3:
         return None
-    visible = 1.0 if context.sun_visible_fraction is None else float(context.sun_visible_fraction)
-    if visible == 0:
+    if context.sun_visible == 0:
         return None
     unit = direction / np.linalg.norm(direction)
     radius = 0.0 if context.sun_angular_radius_rad is None else float(context.sun_angular_radius_rad)
-    return _Sun(unit[:2] / unit[2], unit, context.wavelength_nm, irradiance * visible, radius)
+    return _Sun(unit[:2] / unit[2], unit, context.wavelength_nm, irradiance * context.sun_visible, radius)
 
 
 def _in_suns_beam(params: Params, context: FaultContext, grains: _Grains, sun: _Sun) -> F64:

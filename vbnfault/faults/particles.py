@@ -57,7 +57,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import spectra
 from ..detector.poisson import poisson_above_0
 from ..lens.streaks import Streaks, drawn, inside, pupil_support
 from .context import FaultContext, Params
@@ -242,15 +241,13 @@ class _Sunlight(NamedTuple):
 
     @classmethod
     def of(cls, context: FaultContext) -> _Sunlight:
-        """Return the sunlight at the camera; where it is unknown, that at 1 au in bands from 400 to 700 nm."""
-        nodes, irradiance = context.wavelength_nm, context.sun_irradiance_W_m2_nm
-        if nodes is None or irradiance is None:
-            nodes = spectra.band_nodes_nm(400.0, 700.0, 8)
-            irradiance = spectra.solar_band_irradiance_W_m2_nm(nodes, 1.0)
-        visible = 1.0 if context.sun_visible_fraction is None else float(context.sun_visible_fraction)
+        """Return the sunlight at the camera."""
+        nodes, irradiance = context.sunlight
         direction = context.sun_direction_C if context.sun_direction_C is not None else context.sun_before_camera
         return cls(
-            nodes, irradiance * visible, None if direction is None else direction / np.linalg.norm(direction)
+            nodes,
+            irradiance * context.sun_visible,
+            None if direction is None else direction / np.linalg.norm(direction),
         )
 
     def reflected(self, reddening_per_100nm: float) -> F64:

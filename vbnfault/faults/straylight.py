@@ -275,8 +275,7 @@ def _layer(
     glares: Sequence[str],
 ) -> NDArray[np.float32] | None:
     """Return all flares and the glare, electrons float32[y, x, channel]; None if there is nothing to add."""
-    visible = 1.0 if context.sun_visible_fraction is None else float(context.sun_visible_fraction)
-    if context.sun_xy_px is None or visible <= 0:
+    if context.sun_xy_px is None or context.sun_visible <= 0:
         return None
     sun = np.asarray(context.sun_xy_px, dtype=float)
     height, width = context.shape
@@ -292,7 +291,7 @@ def _layer(
     colours = np.stack([_COLOURS[channel] for channel in context.camera.detector.channels])
     layer = None
     for name, centre, f in stamps:
-        gain = white_e * np.float32(visible * f["brightness"])
+        gain = white_e * np.float32(context.sun_visible * f["brightness"])
         placed = _stamp(name, centre, f["radius"] * width, angle, colours * gain[:, None], context.shape)
         if placed is None:
             continue

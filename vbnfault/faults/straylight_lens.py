@@ -241,8 +241,7 @@ class _LensStraylight(LensFault):
             assert scene is not None
             return AddedLight(added=scene, direct_left=1 - lost, scene_lost=lost, scene_added=True)
         source = replace(source, spikes=spikes)
-        visible = 1.0 if context.sun_visible_fraction is None else float(context.sun_visible_fraction)
-        of_sun = source.straylight(channel_bands(context)[1] * visible, once)
+        of_sun = source.straylight(channel_bands(context)[1] * context.sun_visible, once)
         planes = of_sun.total(context.camera.exposure_s)
         added = cv2.merge(list(planes)).reshape(*context.shape, len(planes))
         return AddedLight(
@@ -438,7 +437,7 @@ def _sensor_grid(context: FaultContext) -> SensorGrid:
 
 def channel_bands(context: FaultContext) -> tuple[Bands, F64]:
     """Return the bands in which the channels sense sunlight, and its electrons per second, float64[channel]."""
-    nodes, irradiance = _sunlight(context)
+    nodes, irradiance = context.sunlight
     nm = spectra.fine_nodes_nm(nodes)
     spectrum = context.camera.detector.electron_rates(nm) * spectra.sunlike(irradiance, nodes)
     return Bands.of(nm, spectrum), np.asarray(np.trapezoid(spectrum, nm, axis=1))
@@ -451,17 +450,6 @@ def _bands_behind_lens(context: FaultContext) -> Bands:
     """
     bands, _ = channel_bands(context)
     return bands.behind(context.camera.lens.transmittance(bands.wavelength_nm))
-
-
-def _sunlight(context: FaultContext) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the band nodes and the Sun's irradiance in them.
-
-    If they are unknown, use eight bands from 400 to 700 nm and the Sun at 1 AU.
-    """
-    if context.wavelength_nm is not None and context.sun_irradiance_W_m2_nm is not None:
-        return context.wavelength_nm, context.sun_irradiance_W_m2_nm
-    nodes = spectra.band_nodes_nm(400.0, 700.0, 8)
-    return nodes, spectra.solar_band_irradiance_W_m2_nm(nodes, 1.0)
 
 
 def _sun_radius_rad(context: FaultContext) -> float:
