@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_scene_straylight import SINGLET, behind
+from test_scene_straylight import SINGLET, behind, flux_of
 
 from vbnfault.core import llvm
 from vbnfault.core.errors import VbnfaultError
@@ -105,7 +105,7 @@ def test_a_scene_past_the_hood(hooded: Prescription) -> None:
     scene = behind(hooded, 24, 70.0)
     response = scene.response
     slopes = np.array(response.cells.slopes)
-    flux = response.flux_mm2[0]
+    flux = flux_of(response)[0]
     assert (flux[slopes < 0.1] > 0).all()
     # a ring holds the sources as far as its neighbours
     assert not flux[slopes > (RADIUS + RIM) / LENGTH + 2 * slopes[1]].any()

@@ -262,12 +262,9 @@ def _sums(
     grains: _Grains, footprint: Footprint, frame: ImageFrame, on_window: bool, lit: F64 | None
 ) -> tuple[F32, F32 | None]:
     """Return the summed blocked fraction of the light, float32[y, x], and `seen` of `_Shadows`."""
-    height, width = frame.height_px, frame.width_px
     step = _step_px(grains, footprint, frame)
-    # one extra node beyond each edge, so that every pixel lies between nodes
-    rows, columns = -(-height // step) + 2, -(-width // step) + 2
-    x_px, y_px = ((np.arange(n) - 0.5) * step for n in (columns, rows))
-    sums = np.zeros((1 if lit is None else 3, rows, columns), dtype=np.float32)
+    x_px, y_px = frame.nodes_px(step)
+    sums = np.zeros((1 if lit is None else 3, len(y_px), len(x_px)), dtype=np.float32)
     # compute the footprints of a coarse grid once; on the pixel grid, compute only those near each grain
     whole = footprint.towards(*frame.slopes(x_px, y_px)) if step > 1 else None
     for k, (top, bottom, left, right) in enumerate(_windows(grains, footprint, frame, x_px, y_px)):
@@ -290,7 +287,7 @@ def _sums(
             covered *= footprints.area_mm2
             sums[1][part] += covered * np.float32(lit[k] / (np.pi * radius))
             sums[2][part] += covered * np.float32(lit[k] / np.pi)
-    finer = [_finer(v, step, (height, width)) for v in sums]
+    finer = [frame.between_nodes(v, step) for v in sums]
     return finer[0], None if lit is None else np.stack(finer[1:])
 
 
@@ -315,15 +312,6 @@ def _windows(
         stop = np.where(touched.any(axis=1), np.searchsorted(fine, coarse[last] + gap, side="right"), 0)
         spans += [start, stop]
     return [(int(a), int(b), int(c), int(d)) for a, b, c, d in zip(*spans, strict=True)]
-
-
-def _finer(coarse: F32, step: int, shape: tuple[int, int]) -> F32:
-    """Interpolate from nodes `step` px apart, the first of them half a step outside the frame, to pixels."""
-    if step == 1:
-        return np.ascontiguousarray(coarse[1:-1, 1:-1])
-    rows, columns = coarse.shape
-    whole = cv2.resize(coarse, (columns * step, rows * step), interpolation=cv2.INTER_LINEAR)
-    return np.ascontiguousarray(whole[step : step + shape[0], step : step + shape[1]])
 
 
 # --- glow ------------------------------------------------------------------------------------------------------

@@ -25,7 +25,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -211,17 +210,13 @@ def _share_left(params: Params, frame: ImageFrame) -> F32:
     soft_px = focal_px * beams.rim_mm[0].mean() / max(params["hood_distance_mm"], 1e-3)
     finest = 2 ** int(np.clip(np.log2(frame.width_px * frame.height_px) / 2 - 7, 0, 6))
     step = int(np.clip(2 ** np.floor(np.log2(max(soft_px / 6, 1))), finest, max(_COARSEST_PX, finest)))
-    rows, columns = -(-frame.height_px // step) + 2, -(-frame.width_px // step) + 2
-    x, y = (v.ravel() for v in frame.slopes(*((np.arange(n) - 0.5) * step for n in (columns, rows))))
-    left = np.empty(rows * columns, dtype=np.float32)
+    slopes = frame.slopes(*frame.nodes_px(step))
+    x, y = (v.ravel() for v in slopes)
+    left = np.empty(x.size, dtype=np.float32)
     for start in range(0, len(left), _TOGETHER):
         some = slice(start, start + _TOGETHER)
         left[some] = _left_of(params, beams, stop_mm, x[some].astype(np.float64), y[some].astype(np.float64))
-    coarse = left.reshape(rows, columns)
-    whole = (
-        cv2.resize(coarse, (columns * step, rows * step), interpolation=cv2.INTER_LINEAR) if step > 1 else coarse
-    )
-    return np.ascontiguousarray(whole[step : step + frame.height_px, step : step + frame.width_px])
+    return frame.between_nodes(left.reshape(slopes[0].shape), step)
 
 
 def _left_of(params: Params, beams: Beams, stop_mm: float, slope_x: F64, slope_y: F64) -> F64:

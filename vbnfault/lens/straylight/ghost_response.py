@@ -118,14 +118,6 @@ class GhostResponse:
     cells: PolarCells
     table: F32
 
-    @property
-    def flux_mm2(self) -> F64:
-        """Return the flux of the ghosts on all rings of the sensor, float64[band, source ring]."""
-        ring_mm = self.cells.ring_mm
-        area_mm2 = 2 * np.pi * (np.arange(self.cells.rings) + 0.5) * ring_mm**2
-        mean = self.table[:, 0].astype(np.float64) / self.cells.azimuths
-        return np.einsum("bmk,m->bk", mean, area_mm2)
-
     def harmonics(self, sources: F32, weights: F64) -> NDArray[np.complex64]:
         """Return the azimuthal harmonics of the ghosts on the sensor's rings, complex64[channel, harmonic, ring].
 
