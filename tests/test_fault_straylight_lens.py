@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from conftest import needs_llvm
 from test_faults_kit import flat_electrons, make_context
 
-from vbnfault.core import llvm, spectra
-from vbnfault.core.errors import InputError, VbnfaultError
+from vbnfault.core import spectra
+from vbnfault.core.errors import InputError
 from vbnfault.core.shared_results import SharedResults
 from vbnfault.faults import FaultContext, from_dict, registry
 from vbnfault.lens import load_lens, paraxial_properties, scaled_to_focal_length
@@ -20,10 +21,7 @@ from vbnfault.lens.straylight.irradiance import FlareModel
 from vbnfault.lens.straylight.starburst import Starburst
 from vbnfault.lens.straylight.total import anew
 
-try:
-    llvm.find()
-except VbnfaultError as error:
-    pytest.skip(f"no usable LLVM: {error}", allow_module_level=True)
+needs_llvm()
 
 MODELS = ("traced", "paraxial")
 SIZE = 256

@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import small_scene
+from conftest import needs_llvm, small_scene
 from numpy.typing import NDArray
 from test_faults_kit import flat_electrons, make_context
 
 import vbnfault
-from vbnfault.core import array_files, llvm, spectra
-from vbnfault.core.errors import InputError, VbnfaultError
+from vbnfault.core import array_files, spectra
+from vbnfault.core.errors import InputError
 from vbnfault.core.quantities import Electrons, Radiance
 from vbnfault.core.spectra import Bands
 from vbnfault.faults import FaultContext, from_dict
@@ -35,10 +35,7 @@ from vbnfault.lens.thin import Halo
 from vbnfault.pipeline.record import to_sample
 from vbnfault.scene import config
 
-try:
-    llvm.find()
-except VbnfaultError as error:
-    pytest.skip(f"no usable LLVM: {error}", allow_module_level=True)
+needs_llvm()
 
 SKY_BODY = {"declination_deg": 0.0, "of_sunlight": 0.01}
 F32 = NDArray[np.float32]

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from conftest import needs_llvm
 from numpy.typing import NDArray
 from test_faults_kit import make_context
 
 from vbnfault.camera import Camera
-from vbnfault.core import llvm, resources, spectra
-from vbnfault.core.errors import VbnfaultError
+from vbnfault.core import resources, spectra
 from vbnfault.core.quantities import Electrons, Radiance
 from vbnfault.core.spectra import Bands
 from vbnfault.detector import ThreeColourDetector
@@ -33,10 +33,7 @@ from vbnfault.lens.straylight.settings import DirectPath, GhostSettings, SensorG
 from vbnfault.lens.straylight.total import SunInLens, SunStraylight
 from vbnfault.output import flare_images
 
-try:
-    llvm.find()
-except VbnfaultError as error:
-    pytest.skip(f"no usable LLVM: {error}", allow_module_level=True)
+needs_llvm()
 
 F64 = NDArray[np.float64]
 
