@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 
 from ...core.errors import InputError
 from ...core.llvm import backend
-from ...core.memory import release_unused
 from ...core.spectra import Bands
 from ..prescription import Prescription
 from .bundles import Rays, Spots, TraceOptions, Tracer, name_of
@@ -351,16 +350,12 @@ class FlareModel:
         InputError
             The angle is 90° or more.
         """
-        sums = self._drawn(sun_deg, azimuth_deg, only)
-        # the rays and cells; the sum of the levels takes the frame and, on each thread, some levels of a band
-        release_unused(8 * int(np.prod(self.canvas.shape)) * self.canvas.bands)
-        return sums.irradiance()
-
-    def _drawn(self, sun_deg: float, azimuth_deg: float, only: tuple[int, int] | None) -> Sums:
-        """Return the sums into which all ghosts are drawn."""
         if not 0 <= sun_deg < 90:
             raise InputError(f"sun_deg = {sun_deg:g}: must be from 0 to below 90")
-        turn = float(np.radians(azimuth_deg))
+        return self._drawn(sun_deg, float(np.radians(azimuth_deg)), only).irradiance()
+
+    def _drawn(self, sun_deg: float, turn: float, only: tuple[int, int] | None) -> Sums:
+        """Return the sums into which all ghosts are drawn; rays and cells are freed before the levels are added."""
         made, rays, arrivals = self._boxes(sun_deg, turn)
         shown = self._in_frame(arrivals)
         if only is not None:

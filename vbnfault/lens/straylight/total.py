@@ -38,7 +38,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.memory import release_unused
 from ...core.spectra import Bands
 from ..paraxial import paraxial_properties
 from ..prescription import Prescription
@@ -115,13 +114,8 @@ class GhostSource:
 
 def ghosts(source: GhostSource) -> SpreadLight:
     """Return the ghosts."""
-    sensor, count = source.sensor, len(source.bands.nodes_nm)
-    frame_bytes = 4 * count * sensor.shape[0] * sensor.shape[1]
-    release_unused(9 * frame_bytes)  # the sums of all levels take 90 MB, the cells 200 MB
     planes = source.model.image(*source.sun)
-    # what the drawing took, before the other parts and the signals of the sample's faults take as much
-    release_unused(9 * frame_bytes)
-    return SpreadLight.of(planes, np.zeros(len(source.bands)), sensor)
+    return SpreadLight.of(planes, np.zeros(len(source.bands)), source.sensor)
 
 
 def starburst(burst: Starburst, frame: StarburstFrame, passed: tuple[float, ...], pupil_mm2: float) -> SpreadLight:
