@@ -247,9 +247,15 @@ def test_plain_numbers_make_bounds_in_python_too() -> None:
 def test_replace_forgets_what_was_made_once() -> None:
     context = make_context(96)
     params: dict[str, Any] = {}
-    assert context.once("thing", params, lambda: 1) == 1
-    assert context.once("thing", params, lambda: 2) == 1
-    assert dataclasses.replace(context).once("thing", params, lambda: 3) == 3
+    made: list[Any] = []
+
+    def number(params: dict[str, Any], where: Any, more: int) -> int:
+        made.append(where)
+        return len(made) + more
+
+    assert [context.once(number, params, 1), context.once(number, params, 1)] == [2, 2]
+    assert context.once(number, params, 7) == 9
+    assert dataclasses.replace(context).once(number, params, 1) == 4
 
 
 def test_scale_by_intensity() -> None:

@@ -223,7 +223,7 @@ class _Damage:
 def _damage_once(params: Params, context: FaultContext) -> _Damage:
     """Return the damage, computed once for each sample."""
     cause = {name: params[name] for name in _CAUSES}  # without the lists that `draw` adds from the result
-    return context.once("broken_pixels.damage", cause, lambda: _damage(params, context))
+    return context.once(_damage, cause)
 
 
 def _damage(params: Params, context: FaultContext) -> _Damage:

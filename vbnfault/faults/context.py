@@ -127,13 +127,13 @@ class FaultContext:
             changes=self.camera.lens_changes,
         )
 
-    def once(self, name: str, params: Params, make: Callable[[], T]) -> T:
-        """Return `make()`, computed once for each name and content of `params` in this context.
+    def once(self, function: Callable[..., T], params: Params, *more: Any) -> T:
+        """Return `function(params, self, *more)`, computed once for each function and content of its arguments.
 
         `apply` and `footprint` share the result, so an expensive computation runs only once.
         """
-        key = (name, pickle.dumps(params))
+        key = function.__module__, function.__qualname__, pickle.dumps((params, more))
         if key not in self._memo:
-            self._memo[key] = make()
+            self._memo[key] = function(params, self, *more)
         result: T = self._memo[key]
         return result

@@ -285,6 +285,11 @@ def kernel(params: Params, frame: ImageFrame, shape: tuple[int, int]) -> F32:
     return out.astype(np.float32)
 
 
+def _kernel_waves(params: Params, context: FaultContext, shape: tuple[int, int]) -> NDArray[np.complex64]:
+    """Return the Fourier transform of `kernel`."""
+    return np.asarray(fft.rfft2(kernel(params, context.frame, shape)))
+
+
 def _strewn(array: F32, white_e: F32, passes: F64, params: Params, context: FaultContext) -> F32:
     """Return the scattered light that reaches the sensor, float32[y, x, channel].
 
@@ -311,7 +316,7 @@ def _strewn(array: F32, white_e: F32, passes: F64, params: Params, context: Faul
     around[top : top + rows, left : left + columns] = cells
     planes = np.ascontiguousarray(np.moveaxis(around, -1, 0))
     # all twins share the transform of the kernel
-    waves = context.once(f"contamination.kernel {shape}", params, lambda: fft.rfft2(kernel(params, frame, shape)))
+    waves = context.once(_kernel_waves, params, shape)
     spread = fft.irfft2(fft.rfft2(planes) * waves, s=shape)
     inner = np.moveaxis(spread[:, top - 1 : top + rows + 1, left - 1 : left + columns + 1], 0, -1)
     inner = np.maximum(np.ascontiguousarray(inner), np.float32(0)) * passes.astype(np.float32)

@@ -138,8 +138,8 @@ class DefocusedDust(LensFault):
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
         """Return the expected electrons times the transmission of all grains, plus their glow."""
-        out = times(quantity.array, _shadows_once(params, context).transmission)
-        light = _glow_once(params, context)
+        out = times(quantity.array, context.once(_shadows, params).transmission)
+        light = context.once(_glow, params)
         return quantity.with_array(out if light is None else out + light)
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
@@ -147,8 +147,8 @@ class DefocusedDust(LensFault):
 
         The glow counts if it reaches the level in any channel.
         """
-        dark = _shadows_once(params, context).transmission <= np.float32(1 - params["mask_loss"])
-        light = _glow_once(params, context)
+        dark = context.once(_shadows, params).transmission <= np.float32(1 - params["mask_loss"])
+        light = context.once(_glow, params)
         if light is None:
             return np.asarray(dark)
         white = np.asarray(context.camera.detector.white_e, dtype=np.float32)
@@ -156,7 +156,7 @@ class DefocusedDust(LensFault):
 
     def soft(self, params: Params, context: FaultContext) -> F32:
         """Return the fraction of the light that the grains remove, float32[y, x]. Their glow does not count."""
-        return np.float32(1) - _shadows_once(params, context).transmission
+        return np.float32(1) - context.once(_shadows, params).transmission
 
 
 # --- geometry --------------------------------------------------------------------------------------------------
@@ -204,11 +204,6 @@ class _Shadows(NamedTuple):
 
     transmission: F32
     seen: F32 | None
-
-
-def _shadows_once(params: Params, context: FaultContext) -> _Shadows:
-    """Return the shadows, computed once for each sample."""
-    return context.once("dust.shadows", params, lambda: _shadows(params, context))
 
 
 def _shadows(params: Params, context: FaultContext) -> _Shadows:
@@ -392,11 +387,6 @@ def _lobe_table(x: F64) -> F64:
     return out
 
 
-def _glow_once(params: Params, context: FaultContext) -> F32 | None:
-    """Return the glow, computed once for each sample."""
-    return context.once("dust.glow", params, lambda: _glow(params, context))
-
-
 def _glow(params: Params, context: FaultContext) -> F32 | None:
     """Return the light that grains scatter or reflect onto the sensor, electrons float32[y, x, channel].
 
@@ -404,7 +394,7 @@ def _glow(params: Params, context: FaultContext) -> F32 | None:
     in a pixel's beam is sufficient. Near the Sun each grain has a lobe of its own. There the beam of a pixel is
     close to that of the Sun's image, so the grains in the Sun's beam can be used.
     """
-    seen, sun = _shadows_once(params, context).seen, _sun(context)
+    seen, sun = context.once(_shadows, params).seen, _sun(context)
     if seen is None or sun is None:
         return None
     camera = context.camera

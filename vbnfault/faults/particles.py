@@ -160,14 +160,14 @@ class _Particles(Fault):
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
         """Return the expected electrons that the grains leave, plus those of their own light."""
-        light = _light_once(params, context)
+        light = context.once(_light, params)
         if light is None:
             return quantity
         return quantity.with_array(times(quantity.array, light.passes) + light.added)
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
         """Return the pixels where any channel gains `mask_level_dn`, or all lose that fraction, bool[y, x]."""
-        light = _light_once(params, context)
+        light = context.once(_light, params)
         if light is None:
             return np.zeros(context.shape, dtype=bool)
         level = np.float32(params["mask_level_dn"] / 255)
@@ -309,13 +309,10 @@ def _pupil_per_pixel(context: FaultContext, slopes: F64) -> F64:
     return np.asarray(area / (camera.detector.pixel_pitch_um * 1e-3) ** 2)
 
 
-def _light_once(params: Params, context: FaultContext) -> _GrainLight | None:
-    """Return the light of the grains, computed once for each sample; None if there is no grain."""
-    return context.once("particles.light", params, lambda: _light(params, context)) if params["count"] else None
-
-
-def _light(params: Params, context: FaultContext) -> _GrainLight:
-    """Return the light of the grains, after the lens's point spread."""
+def _light(params: Params, context: FaultContext) -> _GrainLight | None:
+    """Return the light of the grains, after the lens's point spread; None without grains."""
+    if not params["count"]:
+        return None
     camera = context.camera
     grains = _GrainsInView(*(np.asarray(params[name], dtype=np.float64) for name in _GrainsInView._fields))
     slopes = np.column_stack([grains.slope_x, grains.slope_y])

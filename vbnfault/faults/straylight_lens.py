@@ -195,7 +195,7 @@ class _LensStraylight(LensFault):
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
         """Return the expected electrons plus straylight, minus the light that straylight is taken from."""
-        light = self._light_once(params, context)
+        light = context.once(self._light, params)
         if light is None:
             return quantity
         scene, added = times(quantity.array, 1 - light.scene_lost), light.added
@@ -210,7 +210,7 @@ class _LensStraylight(LensFault):
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
         """Return the pixels where any channel gains at least `mask_level_dn` of straylight, bool[y, x]."""
-        light = self._light_once(params, context)
+        light = context.once(self._light, params)
         if light is None:
             return np.zeros(context.shape, dtype=bool)
         white = context.camera.detector.white_e
@@ -218,7 +218,7 @@ class _LensStraylight(LensFault):
 
     def soft(self, params: Params, context: FaultContext) -> F32:
         """Return the intensity of the straylight, float32[y, x] in DN of 255."""
-        light = self._light_once(params, context)
+        light = context.once(self._light, params)
         return np.zeros(context.shape, np.float32) if light is None else intensity_dn(light.added, context.camera)
 
     @property
@@ -226,9 +226,9 @@ class _LensStraylight(LensFault):
         """Return `mask_level_dn`."""
         return float(self.mask_level_dn)
 
-    def _light_once(self, params: Params, context: FaultContext) -> AddedLight | None:
-        """Return the straylight, computed once for each sample."""
-        return context.once("straylight.lens", params, lambda: self.added_light(params, context, _of_view(context)))
+    def _light(self, params: Params, context: FaultContext) -> AddedLight | None:
+        """Return the straylight of a sample."""
+        return self.added_light(params, context, _of_view(context))
 
     def added_light(
         self, params: Params, context: FaultContext, once: Once, *, spikes: tuple[int, int] = FINE_SPIKES

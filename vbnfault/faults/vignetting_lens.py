@@ -103,7 +103,7 @@ class LensVignetting(LensFault):
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
         """Return the expected electrons times the factor of each pixel."""
-        return quantity.with_array(times(quantity.array, _factor_once(params, context)))
+        return quantity.with_array(times(quantity.array, context.once(_factor, params)))
 
     def passed_to_sun(self, params: Params, context: FaultContext) -> float:
         """Return the fraction of the Sun's beam that clears ring and hood.
@@ -115,16 +115,16 @@ class LensVignetting(LensFault):
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
         """Return the pixels where the loss reaches `mask_loss`, bool[y, x]."""
-        return np.asarray(_factor_once(params, context) <= np.float32(1 - params["mask_loss"]))
+        return np.asarray(context.once(_factor, params) <= np.float32(1 - params["mask_loss"]))
 
     def soft(self, params: Params, context: FaultContext) -> F32:
         """Return the factor on the light, float32[y, x]."""
-        return _factor_once(params, context)
+        return context.once(_factor, params)
 
 
-def _factor_once(params: Params, context: FaultContext) -> F32:
-    """Return the factor on the light, computed once for each sample."""
-    return context.once("vignetting.factor", params, lambda: factor(params, context.frame))
+def _factor(params: Params, context: FaultContext) -> F32:
+    """Return the factor on the light of a sample."""
+    return factor(params, context.frame)
 
 
 def factor(params: Params, frame: ImageFrame) -> F32:
