@@ -23,7 +23,6 @@ from vbnfault.faults import (
     MOSAIC_STEPS,
     STEPS,
     Fault,
-    act,
     dataset_order,
     from_dict,
     json_schema,
@@ -381,7 +380,9 @@ def test_a_plane_of_no_light_past_the_rims_is_no_light(name: str) -> None:
     params, light = fault.draw(context, np.random.default_rng(1)), noisy_electrons(context)
     none = dataclasses.replace(light, past_rims=np.zeros_like(light.array)).scaled(1.0)
     assert none.past_rims is None
-    np.testing.assert_array_equal(act(fault, none, params, context).array, act(fault, light, params, context).array)
+    np.testing.assert_array_equal(
+        fault.on_light(none, params, context).array, fault.on_light(light, params, context).array
+    )
 
 
 def test_light_past_the_rims_is_scaled_again() -> None:

@@ -35,7 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core import spectra
-from ..core.quantities import Radiance
+from ..core.quantities import Electrons, Radiance
 from ..core.spectra import Bands
 from ..lens import Prescription
 from ..lens.image_frame import ImageFrame
@@ -105,7 +105,6 @@ class _LensStraylight(LensFault):
     severity = Severity(key="veil_fraction", low=1e-4, high=0.5)
     effect_mask = True
     soft_layer = "straylight_added"
-    adds_past_rims = True
 
     coating: str = choice(
         "as_prescribed",
@@ -192,6 +191,12 @@ class _LensStraylight(LensFault):
         if self.scene_diffraction:
             params["scene_diffraction"] = True
         return params
+
+    def on_light(self, light: Electrons, params: Params, context: FaultContext) -> Electrons:
+        """Return the light with straylight added to that past the rims."""
+        past = np.zeros_like(light.array) if light.past_rims is None else light.past_rims
+        out: Electrons = self.apply(replace(light, past_rims=past), params, context)
+        return out
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
         """Return the expected electrons plus straylight, minus the light that straylight is taken from."""

@@ -54,7 +54,6 @@ class LensVignetting(LensFault):
     severity = Severity(key="decentre", low=0.02, high=2.0)
     localised = False
     soft_layer = "vignetting_factor"
-    at_rims = True
 
     decentre: Interval = bounds(
         0.0,
@@ -105,13 +104,15 @@ class LensVignetting(LensFault):
         """Return the expected electrons times the factor of each pixel."""
         return quantity.with_array(times(quantity.array, context.once(_factor, params)))
 
-    def passed_to_sun(self, params: Params, context: FaultContext) -> float:
-        """Return the fraction of the Sun's beam that clears ring and hood.
+    def past_rims(self, light: Any, rest: Any, params: Params, context: FaultContext) -> Any:
+        """Return the light past the rims times the fraction of the Sun's beam that clears ring and hood.
 
-        Direct image and straylight of the Sun enter with that beam.
+        Direct image and straylight of the Sun enter with that beam. The loss at the lens's own rims is already in
+        this light.
         """
         sun = context.sun_before_camera
-        return 1.0 if sun is None else share_left(params, context.frame, np.asarray(sun[:2] / sun[2]))
+        left = 1.0 if sun is None else share_left(params, context.frame, np.asarray(sun[:2] / sun[2]))
+        return light.past_rims * np.float32(left)
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
         """Return the pixels where the loss reaches `mask_loss`, bool[y, x]."""
