@@ -215,6 +215,17 @@ def deny(monkeypatch: pytest.MonkeyPatch, *paths: Path) -> None:
         monkeypatch.setattr(os, name, refusing(getattr(os, name), below=True))
 
 
+def needs_llvm() -> None:
+    """Skip a test, or a file whose first lines call this, where no LLVM can be used."""
+    from vbnfault.core import llvm
+    from vbnfault.core.errors import VbnfaultError
+
+    try:
+        llvm.find()
+    except VbnfaultError as error:
+        pytest.skip(f"no usable LLVM: {error}", allow_module_level=True)
+
+
 def small_scene(**tables: dict[str, Any]) -> dict[str, Any]:
     """A scene of small images over coarse terrain, as plain data; `tables` are merged into it."""
     scene: dict[str, Any] = {

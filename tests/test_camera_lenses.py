@@ -6,9 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from conftest import needs_llvm
 
-from vbnfault.core import llvm
-from vbnfault.core.errors import VbnfaultError
 from vbnfault.core.spectra import Bands
 from vbnfault.lens import RealLens, load_lens, paraxial_properties, scaled_to_field
 from vbnfault.lens.straylight.settings import SensorGrid, SunSource
@@ -49,10 +48,7 @@ def test_plates_shift_the_focus_and_leave_the_lens(name: str) -> None:
 
 @pytest.mark.parametrize("name", LENSES)
 def test_the_sensor_raises_ghosts_near_the_axis(name: str) -> None:
-    try:
-        llvm.find()
-    except VbnfaultError as error:
-        pytest.skip(f"no usable LLVM: {error}")
+    needs_llvm()
     lens = scaled_to_field(load_lens(f"{name}_camera"), 65.0, SENSOR_MM).coated("bbar")
     at = np.arange(32) + 0.5 - 16
     near = np.hypot(at, at[:, None]) < 4

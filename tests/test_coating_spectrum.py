@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 import tmm
+from conftest import needs_llvm
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from test_faults_kit import make_context
 
 from vbnfault.camera import Camera
-from vbnfault.core import llvm, spectra
-from vbnfault.core.errors import VbnfaultError
+from vbnfault.core import spectra
 from vbnfault.core.quantities import Radiance
 from vbnfault.core.spectra import Bands
 from vbnfault.detector import ThreeColourDetector
@@ -24,17 +24,13 @@ from vbnfault.faults.straylight_lens import channel_bands
 from vbnfault.lens import Prescription, load_lens, parse_lens, scaled_to_field
 from vbnfault.lens.coating import Layer
 from vbnfault.lens.imaging import RealLens
+from vbnfault.lens.straylight.irradiance import FlareModel
 from vbnfault.lens.straylight.paraxial import pairs, paraxial_ghosts
 from vbnfault.lens.straylight.scene import in_channels
 from vbnfault.lens.straylight.settings import SensorGrid
 from vbnfault.lens.straylight.total import anew
 
-try:
-    llvm.find()
-except VbnfaultError as error:
-    pytest.skip(f"no usable LLVM: {error}", allow_module_level=True)
-
-from vbnfault.lens.straylight.irradiance import FlareModel
+needs_llvm()
 
 F64 = NDArray[np.float64]
 NM = np.linspace(400.0, 700.0, 301)

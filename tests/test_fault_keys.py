@@ -17,7 +17,7 @@ from vbnfault.core import spectra
 from vbnfault.core.errors import InputError
 from vbnfault.core.quantities import Electrons, Radiance
 from vbnfault.detector import MosaicDetector
-from vbnfault.faults import Fault, FaultContext, act, from_dict, registry
+from vbnfault.faults import Fault, FaultContext, from_dict, registry
 from vbnfault.pipeline import masks
 
 SIZE = 64
@@ -124,7 +124,7 @@ def outcome(table: dict[str, Any], name: str, key: str) -> list[NDArray[Any]]:
     before: Any = noisy(fault.step, where)
     after: Any
     if isinstance(before, Electrons):
-        after = act(fault, before, params, where).merged
+        after = fault.on_light(before, params, where).merged
         found = [after.array]
     else:
         found = [fault.apply_at(step, noisy(step, where), params, where).array for step in fault.steps]  # type: ignore[type-var]
@@ -192,7 +192,7 @@ def test_keys_of_straylight_work_together(model: str, files: list[str], tmp_path
         where = context(fault, "")
         params = fault.draw(where, np.random.default_rng(0))
         black = Electrons(array=np.zeros((SIZE, SIZE, 3), np.float32), white_e=where.camera.detector.white_e)
-        light = act(fault, black, params, where)
+        light = fault.on_light(black, params, where)
         assert np.isfinite(light.merged.array).all()
         assert (light.merged.array >= 0).all()
         return float(light.merged.array.sum(dtype=np.float64))

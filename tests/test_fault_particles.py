@@ -19,7 +19,7 @@ from vbnfault.core import spectra
 from vbnfault.core.errors import InputError
 from vbnfault.core.quantities import Electrons
 from vbnfault.detector import MosaicDetector, ThreeColourDetector, load_sensor
-from vbnfault.faults import FaultContext, act
+from vbnfault.faults import FaultContext
 from vbnfault.faults.particles import _Population, diffracted
 from vbnfault.lens import RealLens, ThinLens, load_lens, scaled_to_field
 from vbnfault.pipeline import Session
@@ -209,7 +209,7 @@ def test_light_of_a_grain(slope: tuple[float, float]) -> None:
     """E T A_pupil cos θ, over the cos⁴ that vignetting has still to take from the image of a thin lens."""
     c = context()
     params = one_grain(c, slope=slope)
-    electrons = act(make("particles"), dark(c), params, c).array.sum(axis=(0, 1), dtype=np.float64)
+    electrons = make("particles").on_light(dark(c), params, c).array.sum(axis=(0, 1), dtype=np.float64)
     cosine = 1 / np.sqrt(1 + slope[0] ** 2 + slope[1] ** 2)
     pupil_m2 = np.pi * (FOCAL_MM * 1e-3 / 4) ** 2
     weights = c.camera.detector.electron_rate_weights(NODES) / (PITCH_UM * 1e-6) ** 2  # per W/nm
@@ -288,7 +288,7 @@ def test_a_near_grain_is_a_disc_of_the_pupil(focus_m: float) -> None:
     expected = FOCAL_MM * 1e-3 / 0.2 * np.abs(1 / grains["depth_m"] - 1 / focus_m) * FOCAL_PX
     np.testing.assert_allclose(grains["blur_px"], expected, rtol=1e-3, atol=1e-4)
     params = one_grain(c, depth_m=2.0)
-    image = act(fault, dark(c), params, c).array[..., 1]
+    image = fault.on_light(dark(c), params, c).array[..., 1]
     y, x = np.indices(image.shape) + 0.5
     radius = np.hypot(params["blur_px"][0] / 2, 2e-3 / 2.0 * FOCAL_PX)
     assert radius > 5
@@ -303,7 +303,7 @@ def test_a_lens_with_surfaces_spreads_and_vignettes_the_light() -> None:
     fault = make("particles")
     for slope in ((0.05, 0.0), (0.3, 0.25)):
         params = one_grain(c, slope=slope, depth_m=1000.0)
-        light = act(fault, dark(c), params, c).array
+        light = fault.on_light(dark(c), params, c).array
         angle = np.hypot(*slope)
         pupil_m2 = float(camera.lens.pupil_area_mm2([angle])[0]) * 1e-6
         weights = camera.electron_rate_weights(NODES) / (PITCH_UM * 1e-6) ** 2
@@ -316,7 +316,7 @@ def test_a_lens_with_surfaces_spreads_and_vignettes_the_light() -> None:
         assert abs(y + 0.5 - params["y_px"][0]) <= 1.5
     drawn = fault.draw(c, rng(1))
     assert drawn["count"] > 0
-    assert act(fault, flat_electrons(c), drawn, c).array.min() >= 0
+    assert fault.on_light(flat_electrons(c), drawn, c).array.min() >= 0
 
 
 def test_a_grain_hides_what_is_behind_it_and_the_ground_hides_a_grain() -> None:
@@ -324,7 +324,7 @@ def test_a_grain_hides_what_is_behind_it_and_the_ground_hides_a_grain() -> None:
     fault = make("particles")
     params = one_grain(c, depth_m=4.0, radius_mm=30.0, irradiance_W_m2=0.0, blur_px=4.0)
     light = flat_electrons(c)
-    left = act(fault, light, params, c).array / light.array
+    left = fault.on_light(light, params, c).array / light.array
     # a dark ball of 30 mm at 4 m covers π (0.03 / 4 · f)² pixels
     assert (1 - left[..., 0]).sum() == pytest.approx(np.pi * (0.03 / 4 * FOCAL_PX) ** 2, rel=1e-3)
     assert left[SIZE // 2, SIZE // 2, 0] == pytest.approx(1 - 3.75**2 / (3.75**2 + 2**2), abs=0.05)
@@ -333,9 +333,9 @@ def test_a_grain_hides_what_is_behind_it_and_the_ground_hides_a_grain() -> None:
     assert mask.sum() == pytest.approx(np.pi * (3.75**2 + 2**2), rel=0.3)
     ground = np.full(c.shape, 3.0, np.float32)
     near = replace(c, depth_m=ground)
-    assert np.array_equal(act(fault, light, params, near).array, light.array)
+    assert np.array_equal(fault.on_light(light, params, near).array, light.array)
     ground[:, SIZE // 2 :] = 5.0
-    half = act(fault, light, params, replace(c, depth_m=ground)).array / light.array
+    half = fault.on_light(light, params, replace(c, depth_m=ground)).array / light.array
     assert (1 - half[..., 0]).sum() == pytest.approx(0.5 * np.pi * (0.03 / 4 * FOCAL_PX) ** 2, rel=0.1)
     drawn = fault.draw(replace(c, depth_m=np.full(c.shape, 50.0, np.float32)), rng(1))
     assert drawn["count"] > 0
@@ -369,7 +369,7 @@ def test_masks_sit_on_the_grains() -> None:
     fault = make("particles", density_per_m3=1.0, mask_level_dn=2.0)
     params = json.loads(json.dumps(fault.draw(c, rng(6))))
     light = dark(c)
-    added = act(fault, light, params, c).array
+    added = fault.on_light(light, params, c).array
     mask = fault.footprint(params, c)
     assert mask is not None
     assert np.array_equal(mask, (added >= np.float32(2 / 255) * light.white_e).any(axis=2))
@@ -381,7 +381,7 @@ def test_masks_sit_on_the_grains() -> None:
     far = np.hypot(x[:, None] - px - along * dx, y[:, None] - py - along * dy)
     radius = np.hypot(blur / 2, np.array(params["radius_mm"]) * 1e-3 / np.array(params["depth_m"]) * FOCAL_PX)
     assert (far < np.maximum(radius, 0.3) + 0.8).any(axis=1).all()
-    again = act(fault, light, params, replace(c)).array
+    again = fault.on_light(light, params, replace(c)).array
     assert again.tobytes() == added.tobytes()
 
 
@@ -390,7 +390,7 @@ def test_a_users_own_image_needs_no_sun() -> None:
     fault = make("particles", density_per_m3=20.0)
     params = fault.draw(c, rng(1))
     assert params["count"] > 0
-    assert act(fault, dark(c), params, c).array.max() > 0
+    assert fault.on_light(dark(c), params, c).array.max() > 0
     debris = make("particles", model="debris")
     assert debris.draw(c, rng(1))["count"] > 0
     assert max(debris.draw(c, rng(1))["depth_m"]) <= 40.0

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+from conftest import needs_llvm
 from test_faults_kit import flat_electrons, make_context
 
-from vbnfault.core import llvm, spectra
-from vbnfault.core.errors import InputError, VbnfaultError
+from vbnfault.core import spectra
+from vbnfault.core.errors import InputError
 from vbnfault.core.shared_results import SharedResults
 from vbnfault.faults import FaultContext, from_dict, registry
 from vbnfault.lens import load_lens, paraxial_properties, scaled_to_focal_length
@@ -20,10 +22,7 @@ from vbnfault.lens.straylight.irradiance import FlareModel
 from vbnfault.lens.straylight.starburst import Starburst
 from vbnfault.lens.straylight.total import anew
 
-try:
-    llvm.find()
-except VbnfaultError as error:
-    pytest.skip(f"no usable LLVM: {error}", allow_module_level=True)
+needs_llvm()
 
 MODELS = ("traced", "paraxial")
 SIZE = 256
@@ -196,44 +195,28 @@ def test_worn_coatings_raise_ghosts(model: str) -> None:
     assert coated.sum() < half.sum()
 
 
-def test_samples_of_a_view_with_worn_coatings_share_the_starburst(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Their ghosts differ, and each sample has the same bits as alone; another lens has its own starburst."""
-    made: list[Starburst] = []
-    image = Starburst.image
-    monkeypatch.setattr(Starburst, "image", lambda burst, frame: made.append(burst) or image(burst, frame))
-    losses, of_view = [0.4, 0.1, 0.0, 0.4], SharedResults(kept=True)
-    together = [light("paraxial", context(coating_loss=loss, of_view=of_view), coating="bbar") for loss in losses]
-    assert len(made) == 1
-    alone = [light("paraxial", context(coating_loss=loss), coating="bbar") for loss in losses]
-    assert len(made) == 1 + 4
-    for (added, params), (added_alone, params_alone) in zip(together, alone, strict=True):
-        np.testing.assert_array_equal(added, added_alone)
-        assert params == params_alone
-    light("paraxial", context(coating_loss=0.1, of_view=of_view), lens="tessar_50_f2p8")
-    assert len(made) == 5 + 1  # another lens
+def test_samples_of_a_view_share_whole_ghosts_and_the_starburst(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Each sample has its own roughness, dust, veil and worn coatings, and the same bits as alone."""
+    drawn: Counter[type] = Counter()
+    for kind in (FlareModel, Starburst):
 
+        def counted(of: Any, *where: Any, image: Any = kind.image, kind: type = kind) -> Any:
+            drawn[kind] += 1
+            return image(of, *where)
 
-def test_samples_of_a_view_share_the_ghosts_of_whole_coatings(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each sample has its own roughness, dust and veil, and the same bits as alone."""
-    drawn: list[float] = []
-    image = FlareModel.image
-
-    def counted(model: FlareModel, *sun: float) -> Any:
-        drawn.append(sun[0])
-        return image(model, *sun)
-
-    monkeypatch.setattr(FlareModel, "image", counted)
-    keys = [{"roughness_nm": 0.5, "veil_fraction": 0.01}, {}, {"cleanliness_level": 90}, {"coating": "none"}]
-    keys = [{"coating": "bbar"} | own for own in keys]
-    losses = [0.0, 0.4, 0.0, 0.0]
+        monkeypatch.setattr(kind, "image", counted)
+    keys = [{"roughness_nm": 0.5, "veil_fraction": 0.01}, {}, {"cleanliness_level": 90}, {"coating": "none"}, {}]
+    samples = [({"coating": "bbar"} | own, loss) for own, loss in zip(keys, (0.0, 0.4, 0.0, 0.0, 0.1), strict=True)]
     of_view = SharedResults(kept=True)
-    together = [
-        light("paraxial", context(coating_loss=loss, of_view=of_view), **own)
-        for loss, own in zip(losses, keys, strict=True)
-    ]
-    assert len(drawn) == 3  # whole coatings, worn coatings, other coatings
-    alone = [light("paraxial", context(coating_loss=loss), **own) for loss, own in zip(losses, keys, strict=True)]
-    assert len(drawn) == 3 + 4
+    together = [light("paraxial", context(coating_loss=loss, of_view=of_view), **own) for own, loss in samples]
+    # whole coatings, worn coatings twice, other coatings; the camera's own lens has one starburst
+    assert drawn == {FlareModel: 4, Starburst: 1}
+    alone = [light("paraxial", context(coating_loss=loss), **own) for own, loss in samples]
+    assert drawn == {FlareModel: 4 + 5, Starburst: 1 + 5}
     for (added, params), (added_alone, params_alone) in zip(together, alone, strict=True):
         np.testing.assert_array_equal(added, added_alone)
         assert params == params_alone
+    light("paraxial", context(of_view=of_view), lens="tessar_50_f2p8")
+    assert drawn == {FlareModel: 9 + 1, Starburst: 6 + 1}

@@ -23,7 +23,6 @@ from vbnfault.faults import (
     MOSAIC_STEPS,
     STEPS,
     Fault,
-    act,
     dataset_order,
     from_dict,
     json_schema,
@@ -247,9 +246,15 @@ def test_plain_numbers_make_bounds_in_python_too() -> None:
 def test_replace_forgets_what_was_made_once() -> None:
     context = make_context(96)
     params: dict[str, Any] = {}
-    assert context.once("thing", params, lambda: 1) == 1
-    assert context.once("thing", params, lambda: 2) == 1
-    assert dataclasses.replace(context).once("thing", params, lambda: 3) == 3
+    made: list[Any] = []
+
+    def number(params: dict[str, Any], where: Any, more: int) -> int:
+        made.append(where)
+        return len(made) + more
+
+    assert [context.once(number, params, 1), context.once(number, params, 1)] == [2, 2]
+    assert context.once(number, params, 7) == 9
+    assert dataclasses.replace(context).once(number, params, 1) == 4
 
 
 def test_scale_by_intensity() -> None:
@@ -375,7 +380,9 @@ def test_a_plane_of_no_light_past_the_rims_is_no_light(name: str) -> None:
     params, light = fault.draw(context, np.random.default_rng(1)), noisy_electrons(context)
     none = dataclasses.replace(light, past_rims=np.zeros_like(light.array)).scaled(1.0)
     assert none.past_rims is None
-    np.testing.assert_array_equal(act(fault, none, params, context).array, act(fault, light, params, context).array)
+    np.testing.assert_array_equal(
+        fault.on_light(none, params, context).array, fault.on_light(light, params, context).array
+    )
 
 
 def test_light_past_the_rims_is_scaled_again() -> None:

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_scene_straylight import SINGLET, behind
+from conftest import needs_llvm
+from test_scene_straylight import SINGLET, behind, flux_of
 
-from vbnfault.core import llvm
 from vbnfault.core.errors import VbnfaultError
 from vbnfault.core.spectra import Bands
 from vbnfault.lens import load_lens
@@ -22,10 +22,7 @@ from vbnfault.lens.straylight.scatter import Cleanliness, hood_transmission
 from vbnfault.lens.straylight.settings import SensorGrid, StraylightSettings, SunSource
 from vbnfault.lens.straylight.total import SunInLens
 
-try:
-    llvm.find()
-except VbnfaultError as error:
-    pytest.skip(f"no usable LLVM: {error}", allow_module_level=True)
+needs_llvm()
 
 LENGTH, RADIUS, RIM = 40.0, 14.0, 8.0
 HOOD = f"hood = {{ length_mm = {LENGTH}, radius_mm = {RADIUS} }}\n"
@@ -105,7 +102,7 @@ def test_a_scene_past_the_hood(hooded: Prescription) -> None:
     scene = behind(hooded, 24, 70.0)
     response = scene.response
     slopes = np.array(response.cells.slopes)
-    flux = response.flux_mm2[0]
+    flux = flux_of(response)[0]
     assert (flux[slopes < 0.1] > 0).all()
     # a ring holds the sources as far as its neighbours
     assert not flux[slopes > (RADIUS + RIM) / LENGTH + 2 * slopes[1]].any()

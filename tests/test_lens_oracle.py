@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from conftest import needs_llvm
 from test_lens import BACK, GLASS, STOP
 from test_zemax import TRIPLET
 
-from vbnfault.core import llvm
-from vbnfault.core.errors import VbnfaultError
 from vbnfault.core.spectra import Bands
 from vbnfault.lens import Prescription, load_lens, paraxial_properties, parse_lens
 from vbnfault.lens.coating import mean_reflectance
@@ -347,10 +346,7 @@ ALL_ANGLES = ("nikkor_28_f2p8", "tessar_50_f2p8")
 def test_traced_ghosts_against_the_sequential_trace(name: str, sun_deg: float) -> None:
     if sun_deg != 8.0 and name not in ALL_ANGLES and not os.environ.get(WHOLE):
         pytest.skip(f"takes two seconds a case: of these lenses 8 degrees alone, unless {WHOLE} is set")
-    try:
-        llvm.find()
-    except VbnfaultError as error:
-        pytest.skip(f"no usable LLVM: {error}")
+    needs_llvm()
     from vbnfault.lens.straylight.ghosts import traced_ghosts
 
     lens, wavelength = load_lens(name), WAVELENGTH_NM.get(name, D_NM)
@@ -416,10 +412,7 @@ def test_rays_of_ghosts_through_plates_and_off_the_sensor(name: str) -> None:
 
 
 def test_traced_ghosts_off_the_sensor() -> None:
-    try:
-        llvm.find()
-    except VbnfaultError as error:
-        pytest.skip(f"no usable LLVM: {error}")
+    needs_llvm()
     from vbnfault.lens.straylight.ghosts import traced_ghosts
 
     lens = load_lens("nikkor_28_f2p8_camera").coated("none")

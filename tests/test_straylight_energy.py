@@ -8,16 +8,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from conftest import needs_llvm
 from numpy.typing import NDArray
 from test_faults_kit import make_context
 
 from vbnfault.camera import Camera
-from vbnfault.core import llvm, resources, spectra
-from vbnfault.core.errors import VbnfaultError
+from vbnfault.core import resources, spectra
 from vbnfault.core.quantities import Electrons, Radiance
 from vbnfault.core.spectra import Bands
 from vbnfault.detector import ThreeColourDetector
-from vbnfault.faults import FaultContext, act, from_dict, registry
+from vbnfault.faults import FaultContext, from_dict, registry
 from vbnfault.lens import (
     Prescription,
     RealLens,
@@ -33,10 +33,7 @@ from vbnfault.lens.straylight.settings import DirectPath, GhostSettings, SensorG
 from vbnfault.lens.straylight.total import SunInLens, SunStraylight
 from vbnfault.output import flare_images
 
-try:
-    llvm.find()
-except VbnfaultError as error:
-    pytest.skip(f"no usable LLVM: {error}", allow_module_level=True)
+needs_llvm()
 
 F64 = NDArray[np.float64]
 
@@ -239,7 +236,7 @@ def test_a_frame_with_all_straylight_holds_what_enters(camera: str, sun_deg: flo
     )
     params = fault.draw(where, np.random.default_rng(0))
     before, sun_e = direct_sun(where, sun_deg)
-    after = act(fault, before, params, where)
+    after = fault.on_light(before, params, where)
     assert after.past_rims is not None
     # the scene: its image and its veil on the unbounded plane
     scene_e = before.array.sum(axis=(0, 1), dtype=np.float64)
@@ -294,8 +291,8 @@ def test_light_that_has_met_the_rims_is_not_vignetted_again(model: str, vignetti
     before, _ = direct_sun(where, 12.0)
     rng = np.random.default_rng(1)
     rims_params, stray_params = rims.draw(where, rng), stray.draw(where, rng)
-    lit = act(stray, before, stray_params, where)
-    dimmed = act(rims, lit, rims_params, where)
+    lit = stray.on_light(before, stray_params, where)
+    dimmed = rims.on_light(lit, rims_params, where)
     assert before.past_rims is not None
     assert lit.past_rims is not None
     assert dimmed.past_rims is not None
@@ -311,7 +308,7 @@ def test_light_that_has_met_the_rims_is_not_vignetted_again(model: str, vignetti
     for fault in ("dust_on_optics", "optics_degradation"):
         other = from_dict(fault, {}, source="test")
         params = other.draw(where, rng)
-        apart, whole = act(other, lit, params, where), other.apply(lit.merged, params, where)
+        apart, whole = other.on_light(lit, params, where), other.apply(lit.merged, params, where)
         np.testing.assert_allclose(apart.merged.array, whole.array, rtol=1e-5)
 
 
@@ -323,7 +320,7 @@ def test_a_moved_hood_or_ring_takes_of_the_sun_what_it_takes_of_its_beam(moved: 
     x, y = (int(v) for v in where.sun_xy_px)
     stray = from_dict("straylight", {"model": "paraxial"}, source="test")
     before, _ = direct_sun(where, 12.0)
-    lit = act(stray, before, stray.draw(where, np.random.default_rng(1)), where)
+    lit = stray.on_light(before, stray.draw(where, np.random.default_rng(1)), where)
     assert lit.past_rims is not None
     maps, past = [], []
     for keys in ({}, moved):
@@ -332,7 +329,7 @@ def test_a_moved_hood_or_ring_takes_of_the_sun_what_it_takes_of_its_beam(moved: 
         # to the right, where the Sun is: its beam comes in from the left
         params["hood_offset_mm"] = [float(np.hypot(*params["hood_offset_mm"])), 0.0]
         maps.append(rims.soft(params, where))
-        after = act(rims, lit, params, where).past_rims
+        after = rims.on_light(lit, params, where).past_rims
         assert after is not None
         past.append(after)
     np.testing.assert_array_equal(past[0], lit.past_rims)
@@ -346,9 +343,9 @@ def test_a_hood_in_front_of_the_sun_leaves_none_of_its_light() -> None:
     where = thin_context(12.0)
     stray = from_dict("straylight", {"model": "paraxial"}, source="test")
     before, _ = direct_sun(where, 12.0)
-    lit = act(stray, before, stray.draw(where, np.random.default_rng(1)), where)
+    lit = stray.on_light(before, stray.draw(where, np.random.default_rng(1)), where)
     rims = from_dict("vignetting", {"model": "lens", "hood_offset": 10.0}, source="test")
-    after = act(rims, lit, rims.draw(where, np.random.default_rng(2)), where).past_rims
+    after = rims.on_light(lit, rims.draw(where, np.random.default_rng(2)), where).past_rims
     assert after is not None
     np.testing.assert_array_equal(after, 0)
 

@@ -16,7 +16,6 @@ from vbnfault.core import llvm, resources
 from vbnfault.core.errors import InputError, VbnfaultError
 from vbnfault.core.llvm import backend
 from vbnfault.core.spectra import solar_irradiance_W_m2_nm
-from vbnfault.faults import act
 from vbnfault.lens import load_lens
 from vbnfault.lens.changes import Change, changed
 from vbnfault.lens.coating import mean_reflectance
@@ -174,7 +173,7 @@ def test_an_evaluation_equals_the_pipelines_own_light(
     exposed = made._exposed(point({}), made.factors.setting({}))
     fault = exposed.spec.faults["straylight"]
     params = fault.draw(exposed.context, exposed.spec.rng("fault", "straylight/0"))
-    whole = act(fault, exposed.exposure.rate.scaled(exposed.camera.exposure_s), params, exposed.context).merged
+    whole = fault.on_light(exposed.exposure.rate.scaled(exposed.camera.exposure_s), params, exposed.context).merged
     own = np.moveaxis(image.kept + image.added, 0, -1)
     # both are sums of four parts in single precision, added in another order
     np.testing.assert_allclose(own, whole.array, rtol=2e-4, atol=1e-3)

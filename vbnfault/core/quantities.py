@@ -238,7 +238,7 @@ class Electrons(Quantity):
     `past_rims` float32[y, x, channel] is additional light, not contained in `array`, whose losses at the lens's
     pupil and rims are included already: the Sun's direct image and its traced straylight. The lens's own vignetting
     does not reduce it again. A fault at the rims, such as a slipped ring or a moved hood, multiplies all of it by
-    one fraction, that of the Sun's beam which clears the fault (`Fault.passed_to_sun`). None: there is no
+    one fraction, that of the Sun's beam which clears the fault (`Fault.past_rims`). None: there is no
     such light.
     """
 

@@ -1,7 +1,7 @@
 """Define the fault classes and their models; `contract` states what every model follows."""
 
 from .context import FaultContext, Params
-from .contract import MOSAIC_STEPS, QUANTITIES, STEPS, Fault, act
+from .contract import MOSAIC_STEPS, QUANTITIES, STEPS, Fault
 from .fields import Interval, Severity, bounds, choice, flag, number, path, rows, text
 from .levels import LEVELS, Levels, ModelLevels, SeverityTable, read_table
 from .models import (
@@ -30,7 +30,6 @@ __all__ = [
     "Plugin",
     "Severity",
     "SeverityTable",
-    "act",
     "belongs_here",
     "bounds",
     "choice",

@@ -150,7 +150,7 @@ class TextureBrokenPixels(Fault):
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
         """Return the image with lines, neighbours and defects. All other pixels stay bit for bit the same."""
-        layout = _layout_once(params, context)
+        layout = context.once(_layout, params)
         out = quantity.array.copy()
         grey = context.camera.is_monochrome
         if len(layout.line):
@@ -173,7 +173,7 @@ class TextureBrokenPixels(Fault):
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
         """Return the pixels of the defects, of their neighbours and of lines with an offset, bool[y, x]."""
-        layout = _layout_once(params, context)
+        layout = context.once(_layout, params)
         out = np.zeros(context.shape, dtype=bool)
         flat = out.reshape(-1)
         for index in (layout.line, layout.neighbour, layout.defect):
@@ -217,20 +217,15 @@ def _scatter(image: NDArray[np.uint8], index: Index, pixels: NDArray[np.uint8]) 
     image.view(np.uint32).reshape(-1)[index] = pixels.view(np.uint32).reshape(-1)
 
 
-def _layout_once(params: Params, context: FaultContext) -> _Layout:
-    """Return the layout of the defects, computed once for each sample."""
-    return context.once("broken_pixels.layout", params, lambda: _layout(params, context.shape))
-
-
-def _layout(params: Params, shape: tuple[int, int]) -> _Layout:
-    """Return the layout of the defects in a frame of the given (height, width)."""
-    height, width = shape
+def _layout(params: Params, context: FaultContext) -> _Layout:
+    """Return the layout of the defects."""
+    height, width = context.shape
     x, y = (np.asarray(params[k], dtype=np.int64) for k in ("x", "y"))
     defect = y * width + x
     which = np.full(height * width, -1, dtype=np.int16)
     which[defect] = np.arange(len(defect))
 
-    line, line_offset = _lines(params, shape)
+    line, line_offset = _lines(params, context.shape)
 
     dy, dx = (np.array(v)[:, None] for v in zip(*STEPS.values(), strict=True))
     near_y, near_x = y + dy, x + dx

@@ -210,7 +210,7 @@ def _damage_once(params: Params, context: FaultContext) -> _Damage:
     """Return the damage, computed once for each sample."""
     # without the lists and their length, which `draw` adds from the result
     cause = {name: value for name, value in params.items() if not isinstance(value, list) and name != "count"}
-    return context.once("broken_pixels.damage", cause, lambda: _damage(params, context))
+    return context.once(_damage, cause)
 
 
 def _damage(params: Params, context: FaultContext) -> _Damage:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..camera import Camera
+from ..core import spectra
 from ..core.quantities import FarSource, Radiance
 from ..core.shared_results import SharedResults
 from ..lens.image_frame import ImageFrame
@@ -97,6 +98,19 @@ class FaultContext:
         return direction if direction is not None and direction[2] > 0 else None
 
     @property
+    def sunlight(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return band nodes and the Sun's irradiance in them; if unknown, eight from 400 to 700 nm at 1 au."""
+        if self.wavelength_nm is not None and self.sun_irradiance_W_m2_nm is not None:
+            return self.wavelength_nm, self.sun_irradiance_W_m2_nm
+        nodes = spectra.band_nodes_nm(400.0, 700.0, 8)
+        return nodes, spectra.solar_band_irradiance_W_m2_nm(nodes, 1.0)
+
+    @property
+    def sun_visible(self) -> float:
+        """Return the visible fraction of the Sun's disc; 1 if it is unknown."""
+        return 1.0 if self.sun_visible_fraction is None else float(self.sun_visible_fraction)
+
+    @property
     def scale(self) -> float:
         """Return the factor that converts pixels of a 1024 px wide image to pixels of this camera."""
         return self.camera.width_px / REFERENCE_WIDTH_PX
@@ -112,13 +126,13 @@ class FaultContext:
             changes=self.camera.lens_changes,
         )
 
-    def once(self, name: str, params: Params, make: Callable[[], T]) -> T:
-        """Return `make()`, computed once for each name and content of `params` in this context.
+    def once(self, function: Callable[..., T], params: Params, *more: Any) -> T:
+        """Return `function(params, self, *more)`, computed once for each function and content of its arguments.
 
         `apply` and `footprint` share the result, so an expensive computation runs only once.
         """
-        key = (name, pickle.dumps(params))
+        key = function.__module__, function.__qualname__, pickle.dumps((params, more))
         if key not in self._memo:
-            self._memo[key] = make()
+            self._memo[key] = function(params, self, *more)
         result: T = self._memo[key]
         return result

@@ -104,15 +104,6 @@ class Fault:
         What `vbnfault describe` says of the model, as a clause behind the name of its class. "": nothing.
     packaged_images
         Folder of packaged images that the model may read. Their contents belong to the scene's identity. "": none.
-
-    Two more attributes, for the step `electrons`, say which light has already passed the lens's rims. A model with
-    neither acts in the same manner on all light (see `act`).
-
-    adds_past_rims
-        True if the light that the model adds has passed the rims. `apply` adds it to `Electrons.past_rims` if the
-        quantity has that plane, else to `array`.
-    at_rims
-        True if the model acts at the rims. Light past the rims is then only multiplied by `passed_to_sun`.
     """
 
     fault: ClassVar[str]
@@ -135,8 +126,6 @@ class Fault:
     per_exposure: ClassVar[bool] = False
     effect_mask: ClassVar[bool] = False
     soft_layer: ClassVar[str] = ""
-    adds_past_rims: ClassVar[bool] = False
-    at_rims: ClassVar[bool] = False
     lens_of_thin_camera: ClassVar[str] = ""
     remark: ClassVar[str] = ""
     packaged_images: ClassVar[str] = ""
@@ -220,13 +209,20 @@ class Fault:
 
         return act
 
-    def passed_to_sun(self, params: Params, context: FaultContext) -> float:
-        """Return the fraction of the light past the rims that a fault with `at_rims` lets pass.
+    def on_light(self, light: Electrons, params: Params, context: FaultContext) -> Electrons:
+        """Return the light after an optical fault; light that has passed the lens's rims stays in its own plane."""
+        if light.past_rims is None:
+            return self.apply(light, params, context)
+        rest = self.apply(replace(light, past_rims=None), params, context)
+        return replace(rest, past_rims=self.past_rims(light, rest, params, context))
 
-        This is the fraction of the Sun's beam that clears the openings which the fault has moved. The loss at the
-        lens's own rims is already in that light, so it does not count here.
+    def past_rims(self, light: Electrons, rest: Electrons, params: Params, context: FaultContext) -> Any:
+        """Return the light past the rims after the fault, float32[y, x, channel]; `rest` is the other after it.
+
+        A fault that acts on all light may clip it, so the two planes cannot be treated one by one. This plane
+        becomes the result for all light minus the result for the light before the rims, at least 0.
         """
-        return 1.0
+        return np.maximum(self.apply(light.merged, params, context).array - rest.array, 0)
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_] | None:
         """Return the pixels at which the fault acts, bool[y, x]; None if the class has no footprint."""
@@ -265,24 +261,6 @@ class Fault:
             if value is not None:  # TOML has no null, so a missing number stays out
                 plain[f.name] = value
         return plain
-
-
-def act(fault: Fault, light: Electrons, params: Params, context: FaultContext) -> Electrons:
-    """Return the light after an optical fault; light that has passed the lens's rims stays in its own plane.
-
-    A fault that acts on all light may clip it, so the two planes cannot be treated one by one. The plane past the
-    rims becomes the result for all light minus the result for the light before the rims, at least 0.
-    """
-    if fault.adds_past_rims:
-        past = np.zeros_like(light.array) if light.past_rims is None else light.past_rims
-        return fault.apply(replace(light, past_rims=past), params, context)
-    if light.past_rims is None:
-        return fault.apply(light, params, context)
-    rest = fault.apply(replace(light, past_rims=None), params, context)
-    if fault.at_rims:
-        return replace(rest, past_rims=light.past_rims * np.float32(fault.passed_to_sun(params, context)))
-    whole = fault.apply(light.merged, params, context)
-    return replace(rest, past_rims=np.maximum(whole.array - rest.array, 0))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -121,12 +121,12 @@ class Tracks(Fault):
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
         """Return the collected electrons plus those of the tracks."""
-        return quantity.with_array(quantity.array + _charge_once(params, context))
+        return quantity.with_array(quantity.array + context.once(_charge, params))
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
         """Return the pixels of the image that the tracks' charge can change by demosaicing, bool[y, x]."""
         detector = context.camera.mosaic
-        reached: NDArray[np.bool_] = detector.footprint(_charge_once(params, context) > 0)
+        reached: NDArray[np.bool_] = detector.footprint(context.once(_charge, params) > 0)
         return reached
 
 
@@ -163,11 +163,6 @@ def _tracks(
         columns["electrons"], columns["length_um"] = columns["electrons"] * left, columns["length_um"] * left
     # rounded, because thousands of tracks must stay short as text; seeds are integers and stay exact
     return CosmicRays(**{name: np.round(column, 3) for name, column in columns.items()})
-
-
-def _charge_once(params: Params, context: FaultContext) -> F32:
-    """Return the charge of the tracks, computed once for each sample."""
-    return context.once("cosmic_rays.charge", params, lambda: _charge(params, context))
 
 
 def _charge(params: Params, context: FaultContext) -> F32:

@@ -188,10 +188,7 @@ def worn(lens: Prescription, wavelength_nm: F64, coating_loss: float) -> F64:
 
 def colours(params: Params, context: FaultContext) -> F64:
     """Return the fraction of sunlight that passes in each of the detector's channels, float64[channel]."""
-    nodes, sun = context.wavelength_nm, context.sun_irradiance_W_m2_nm
-    if nodes is None or sun is None:
-        nodes = spectra.band_nodes_nm(400.0, 700.0, 8)
-        sun = spectra.solar_band_irradiance_W_m2_nm(nodes, 1.0)
+    nodes, sun = context.sunlight
     lens = context.frame.prescription(params["lens"], params["coating"])
     nm = spectra.fine_nodes_nm(nodes)
     passes = worn(lens, nm, params["coating_loss"]) * browned(
@@ -288,6 +285,11 @@ def kernel(params: Params, frame: ImageFrame, shape: tuple[int, int]) -> F32:
     return out.astype(np.float32)
 
 
+def _kernel_waves(params: Params, context: FaultContext, shape: tuple[int, int]) -> NDArray[np.complex64]:
+    """Return the Fourier transform of `kernel`."""
+    return np.asarray(fft.rfft2(kernel(params, context.frame, shape)))
+
+
 def _strewn(array: F32, white_e: F32, passes: F64, params: Params, context: FaultContext) -> F32:
     """Return the scattered light that reaches the sensor, float32[y, x, channel].
 
@@ -314,7 +316,7 @@ def _strewn(array: F32, white_e: F32, passes: F64, params: Params, context: Faul
     around[top : top + rows, left : left + columns] = cells
     planes = np.ascontiguousarray(np.moveaxis(around, -1, 0))
     # all twins share the transform of the kernel
-    waves = context.once(f"contamination.kernel {shape}", params, lambda: fft.rfft2(kernel(params, frame, shape)))
+    waves = context.once(_kernel_waves, params, shape)
     spread = fft.irfft2(fft.rfft2(planes) * waves, s=shape)
     inner = np.moveaxis(spread[:, top - 1 : top + rows + 1, left - 1 : left + columns + 1], 0, -1)
     inner = np.maximum(np.ascontiguousarray(inner), np.float32(0)) * passes.astype(np.float32)

@@ -119,20 +119,20 @@ class GaussianDust(Fault):
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
         """Return the expected electrons times the transmission of all grains."""
         # outside the grains the factor is exactly 1; to choose the pixels of the grains takes four times as long
-        return quantity.with_array(times(quantity.array, _transmission_once(params, context)))
+        return quantity.with_array(times(quantity.array, context.once(_transmission, params)))
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
         """Return the pixels that a grain darkens by more than `mask_level_dn`, bool[y, x]."""
-        return _transmission_once(params, context) < 1
+        return context.once(_transmission, params) < 1
 
     def soft(self, params: Params, context: FaultContext) -> NDArray[np.float32]:
         """Return the fraction of the light that the grains remove, float32[y, x]."""
-        return np.float32(1) - _transmission_once(params, context)
+        return np.float32(1) - context.once(_transmission, params)
 
 
-def _transmission_once(params: Params, context: FaultContext) -> NDArray[np.float32]:
-    """Return the transmission of all grains, computed once for each sample."""
-    return context.once("dust.transmission", params, lambda: transmission(params, context.shape))
+def _transmission(params: Params, context: FaultContext) -> NDArray[np.float32]:
+    """Return the transmission of all grains."""
+    return transmission(params, context.shape)
 
 
 def transmission(params: Params, shape: tuple[int, int]) -> NDArray[np.float32]:

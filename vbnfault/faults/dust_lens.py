@@ -138,8 +138,8 @@ class DefocusedDust(LensFault):
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
         """Return the expected electrons times the transmission of all grains, plus their glow."""
-        out = times(quantity.array, _shadows_once(params, context).transmission)
-        light = _glow_once(params, context)
+        out = times(quantity.array, context.once(_shadows, params).transmission)
+        light = context.once(_glow, params)
         return quantity.with_array(out if light is None else out + light)
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
@@ -147,8 +147,8 @@ class DefocusedDust(LensFault):
 
         The glow counts if it reaches the level in any channel.
         """
-        dark = _shadows_once(params, context).transmission <= np.float32(1 - params["mask_loss"])
-        light = _glow_once(params, context)
+        dark = context.once(_shadows, params).transmission <= np.float32(1 - params["mask_loss"])
+        light = context.once(_glow, params)
         if light is None:
             return np.asarray(dark)
         white = np.asarray(context.camera.detector.white_e, dtype=np.float32)
@@ -156,7 +156,7 @@ class DefocusedDust(LensFault):
 
     def soft(self, params: Params, context: FaultContext) -> F32:
         """Return the fraction of the light that the grains remove, float32[y, x]. Their glow does not count."""
-        return np.float32(1) - _shadows_once(params, context).transmission
+        return np.float32(1) - context.once(_shadows, params).transmission
 
 
 # --- geometry --------------------------------------------------------------------------------------------------
@@ -206,11 +206,6 @@ class _Shadows(NamedTuple):
     seen: F32 | None
 
 
-def _shadows_once(params: Params, context: FaultContext) -> _Shadows:
-    """Return the shadows, computed once for each sample."""
-    return context.once("dust.shadows", params, lambda: _shadows(params, context))
-
-
 def _shadows(params: Params, context: FaultContext) -> _Shadows:
     """Return the shadows of all grains. Transmissions of the window and of the lens's surface multiply."""
     frame = context.frame
@@ -254,12 +249,9 @@ def _sums(
     grains: _Grains, footprint: Footprint, frame: ImageFrame, on_window: bool, lit: F64 | None
 ) -> tuple[F32, F32 | None]:
     """Return the summed blocked fraction of the light, float32[y, x], and `seen` of `_Shadows`."""
-    height, width = frame.height_px, frame.width_px
     step = _step_px(grains, footprint, frame)
-    # one extra node beyond each edge, so that every pixel lies between nodes
-    rows, columns = -(-height // step) + 2, -(-width // step) + 2
-    x_px, y_px = ((np.arange(n) - 0.5) * step for n in (columns, rows))
-    sums = np.zeros((1 if lit is None else 3, rows, columns), dtype=np.float32)
+    x_px, y_px = frame.nodes_px(step)
+    sums = np.zeros((1 if lit is None else 3, len(y_px), len(x_px)), dtype=np.float32)
     # compute the footprints of a coarse grid once; on the pixel grid, compute only those near each grain
     whole = footprint.towards(*frame.slopes(x_px, y_px)) if step > 1 else None
     for k, (top, bottom, left, right) in enumerate(_windows(grains, footprint, frame, x_px, y_px)):
@@ -282,7 +274,7 @@ def _sums(
             covered *= footprints.area_mm2
             sums[1][part] += covered * np.float32(lit[k] / (np.pi * radius))
             sums[2][part] += covered * np.float32(lit[k] / np.pi)
-    finer = [_finer(v, step, (height, width)) for v in sums]
+    finer = [frame.between_nodes(v, step) for v in sums]
     return finer[0], None if lit is None else np.stack(finer[1:])
 
 
@@ -309,15 +301,6 @@ def _windows(
     return [(int(a), int(b), int(c), int(d)) for a, b, c, d in zip(*spans, strict=True)]
 
 
-def _finer(coarse: F32, step: int, shape: tuple[int, int]) -> F32:
-    """Interpolate from nodes `step` px apart, the first of them half a step outside the frame, to pixels."""
-    if step == 1:
-        return np.ascontiguousarray(coarse[1:-1, 1:-1])
-    rows, columns = coarse.shape
-    whole = cv2.resize(coarse, (columns * step, rows * step), interpolation=cv2.INTER_LINEAR)
-    return np.ascontiguousarray(whole[step : step + shape[0], step : step + shape[1]])
-
-
 # --- glow ------------------------------------------------------------------------------------------------------
 
 
@@ -336,12 +319,11 @@ def _sun(context: FaultContext) -> _Sun | None:
     direction, irradiance = context.sun_direction_C, context.sun_irradiance_W_m2_nm
     if direction is None or irradiance is None or context.wavelength_nm is None or direction[2] <= 1e-3:
         return None
-    visible = 1.0 if context.sun_visible_fraction is None else float(context.sun_visible_fraction)
-    if visible == 0:
+    if context.sun_visible == 0:
         return None
     unit = direction / np.linalg.norm(direction)
     radius = 0.0 if context.sun_angular_radius_rad is None else float(context.sun_angular_radius_rad)
-    return _Sun(unit[:2] / unit[2], unit, context.wavelength_nm, irradiance * visible, radius)
+    return _Sun(unit[:2] / unit[2], unit, context.wavelength_nm, irradiance * context.sun_visible, radius)
 
 
 def _in_suns_beam(params: Params, context: FaultContext, grains: _Grains, sun: _Sun) -> F64:
@@ -405,11 +387,6 @@ def _lobe_table(x: F64) -> F64:
     return out
 
 
-def _glow_once(params: Params, context: FaultContext) -> F32 | None:
-    """Return the glow, computed once for each sample."""
-    return context.once("dust.glow", params, lambda: _glow(params, context))
-
-
 def _glow(params: Params, context: FaultContext) -> F32 | None:
     """Return the light that grains scatter or reflect onto the sensor, electrons float32[y, x, channel].
 
@@ -417,7 +394,7 @@ def _glow(params: Params, context: FaultContext) -> F32 | None:
     in a pixel's beam is sufficient. Near the Sun each grain has a lobe of its own. There the beam of a pixel is
     close to that of the Sun's image, so the grains in the Sun's beam can be used.
     """
-    seen, sun = _shadows_once(params, context).seen, _sun(context)
+    seen, sun = context.once(_shadows, params).seen, _sun(context)
     if seen is None or sun is None:
         return None
     camera = context.camera

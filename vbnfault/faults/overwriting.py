@@ -79,7 +79,7 @@ class TextureOverwriting(Fault):
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
         """Return the image with the texture blended in."""
         texture, alpha = self._fitted(params, context)
-        where = np.flatnonzero(self._mask(params, context))
+        where = np.flatnonzero(context.once(self._mask, params))
         out = quantity.array.copy()
         flat = out.reshape(-1, 4)
         before = flat[where].astype(np.float32)
@@ -97,7 +97,7 @@ class TextureOverwriting(Fault):
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
         """Return the pixels that the texture can change, bool[y, x]."""
-        mask: NDArray[np.bool_] = self._mask(params, context).copy()
+        mask: NDArray[np.bool_] = context.once(self._mask, params).copy()
         return mask
 
     def _fitted(self, params: Params, context: FaultContext) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -106,8 +106,8 @@ class TextureOverwriting(Fault):
         return _stretch(self.texture_file, params["sha256"], context.shape)
 
     def _mask(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
-        """Return the mask, computed once for each sample."""
-        return context.once("overwriting.mask", params, lambda: _mask(params, *self._fitted(params, context)))
+        """Return the pixels that the texture can change, bool[y, x]."""
+        return _mask(params, *self._fitted(params, context))
 
 
 def _mask(params: Params, texture: NDArray[np.float32], alpha: NDArray[np.float32]) -> NDArray[np.bool_]:

@@ -57,7 +57,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import spectra
 from ..detector.noise import poisson_above_0
 from ..lens.streaks import Streaks, drawn, inside, pupil_support
 from .context import FaultContext, Params
@@ -161,14 +160,14 @@ class _Particles(Fault):
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
         """Return the expected electrons that the grains leave, plus those of their own light."""
-        light = _light_once(params, context)
+        light = context.once(_light, params)
         if light is None:
             return quantity
         return quantity.with_array(times(quantity.array, light.passes) + light.added)
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
         """Return the pixels where any channel gains `mask_level_dn`, or all lose that fraction, bool[y, x]."""
-        light = _light_once(params, context)
+        light = context.once(_light, params)
         if light is None:
             return np.zeros(context.shape, dtype=bool)
         level = np.float32(params["mask_level_dn"] / 255)
@@ -242,15 +241,13 @@ class _Sunlight(NamedTuple):
 
     @classmethod
     def of(cls, context: FaultContext) -> _Sunlight:
-        """Return the sunlight at the camera; where it is unknown, that at 1 au in bands from 400 to 700 nm."""
-        nodes, irradiance = context.wavelength_nm, context.sun_irradiance_W_m2_nm
-        if nodes is None or irradiance is None:
-            nodes = spectra.band_nodes_nm(400.0, 700.0, 8)
-            irradiance = spectra.solar_band_irradiance_W_m2_nm(nodes, 1.0)
-        visible = 1.0 if context.sun_visible_fraction is None else float(context.sun_visible_fraction)
+        """Return the sunlight at the camera."""
+        nodes, irradiance = context.sunlight
         direction = context.sun_direction_C if context.sun_direction_C is not None else context.sun_before_camera
         return cls(
-            nodes, irradiance * visible, None if direction is None else direction / np.linalg.norm(direction)
+            nodes,
+            irradiance * context.sun_visible,
+            None if direction is None else direction / np.linalg.norm(direction),
         )
 
     def reflected(self, reddening_per_100nm: float) -> F64:
@@ -312,13 +309,10 @@ def _pupil_per_pixel(context: FaultContext, slopes: F64) -> F64:
     return np.asarray(area / (camera.detector.pixel_pitch_um * 1e-3) ** 2)
 
 
-def _light_once(params: Params, context: FaultContext) -> _GrainLight | None:
-    """Return the light of the grains, computed once for each sample; None if there is no grain."""
-    return context.once("particles.light", params, lambda: _light(params, context)) if params["count"] else None
-
-
-def _light(params: Params, context: FaultContext) -> _GrainLight:
-    """Return the light of the grains, after the lens's point spread."""
+def _light(params: Params, context: FaultContext) -> _GrainLight | None:
+    """Return the light of the grains, after the lens's point spread; None without grains."""
+    if not params["count"]:
+        return None
     camera = context.camera
     grains = _GrainsInView(*(np.asarray(params[name], dtype=np.float64) for name in _GrainsInView._fields))
     slopes = np.column_stack([grains.slope_x, grains.slope_y])

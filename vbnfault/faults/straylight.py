@@ -208,29 +208,27 @@ class TextureStraylight(Fault):
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
         """Return the expected electrons plus flares and glare."""
-        layer = self._layer_once(params, context, quantity.white_e)
+        layer = context.once(self._layer, params, quantity.white_e)
         return quantity if layer is None else quantity.with_array(quantity.array + layer)
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
         """Return the pixels where any channel gains at least `mask_level_dn`, bool[y, x]."""
         white = context.camera.detector.white_e
-        layer = self._layer_once(params, context, white)
+        layer = context.once(self._layer, params, white)
         if layer is None:
             return np.zeros(context.shape, dtype=bool)
         return reaches(layer, white * np.float32(params["mask_level_dn"] / 255))
 
     def soft(self, params: Params, context: FaultContext) -> NDArray[np.float32]:
         """Return the intensity of flares and glare, float32[y, x] in DN of 255."""
-        layer = self._layer_once(params, context, context.camera.detector.white_e)
+        layer = context.once(self._layer, params, context.camera.detector.white_e)
         return np.zeros(context.shape, np.float32) if layer is None else intensity_dn(layer, context.camera)
 
-    def _layer_once(
+    def _layer(
         self, params: Params, context: FaultContext, white_e: NDArray[np.float32]
     ) -> NDArray[np.float32] | None:
-        """Return all flares and the glare, computed once for each sample and white level."""
-        white = np.asarray(white_e, dtype=np.float32)
-        name = f"straylight.layer {white.tobytes().hex()}"
-        return context.once(name, params, lambda: _layer(params, context, white, *self._textures()[:2]))
+        """Return all flares and the glare for a white level, electrons float32[y, x, channel]."""
+        return _layer(params, context, np.asarray(white_e, dtype=np.float32), *self._textures()[:2])
 
 
 def flare_centres_px(params: Params, sun_xy_px: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -265,8 +263,7 @@ def _layer(
     glares: Sequence[str],
 ) -> NDArray[np.float32] | None:
     """Return all flares and the glare, electrons float32[y, x, channel]; None if there is nothing to add."""
-    visible = 1.0 if context.sun_visible_fraction is None else float(context.sun_visible_fraction)
-    if context.sun_xy_px is None or visible <= 0:
+    if context.sun_xy_px is None or context.sun_visible <= 0:
         return None
     sun = np.asarray(context.sun_xy_px, dtype=float)
     height, width = context.shape
@@ -282,7 +279,7 @@ def _layer(
     colours = np.stack([_COLOURS[channel] for channel in context.camera.detector.channels])
     layer = None
     for name, centre, f in stamps:
-        gain = white_e * np.float32(visible * f["brightness"])
+        gain = white_e * np.float32(context.sun_visible * f["brightness"])
         placed = _stamp(name, centre, f["radius"] * width, angle, colours * gain[:, None], context.shape)
         if placed is None:
             continue

@@ -35,7 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core import spectra
-from ..core.quantities import Radiance
+from ..core.quantities import Electrons, Radiance
 from ..core.spectra import Bands
 from ..lens import Prescription
 from ..lens.image_frame import ImageFrame
@@ -105,7 +105,6 @@ class _LensStraylight(LensFault):
     severity = Severity(key="veil_fraction", low=1e-4, high=0.5)
     effect_mask = True
     soft_layer = "straylight_added"
-    adds_past_rims = True
 
     coating: str = choice(
         "as_prescribed",
@@ -193,9 +192,15 @@ class _LensStraylight(LensFault):
             params["scene_diffraction"] = True
         return params
 
+    def on_light(self, light: Electrons, params: Params, context: FaultContext) -> Electrons:
+        """Return the light with straylight added to that past the rims."""
+        past = np.zeros_like(light.array) if light.past_rims is None else light.past_rims
+        out: Electrons = self.apply(replace(light, past_rims=past), params, context)
+        return out
+
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
         """Return the expected electrons plus straylight, minus the light that straylight is taken from."""
-        light = self._light_once(params, context)
+        light = context.once(self._light, params)
         if light is None:
             return quantity
         scene, added = times(quantity.array, 1 - light.scene_lost), light.added
@@ -210,7 +215,7 @@ class _LensStraylight(LensFault):
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
         """Return the pixels where any channel gains at least `mask_level_dn` of straylight, bool[y, x]."""
-        light = self._light_once(params, context)
+        light = context.once(self._light, params)
         if light is None:
             return np.zeros(context.shape, dtype=bool)
         white = context.camera.detector.white_e
@@ -218,7 +223,7 @@ class _LensStraylight(LensFault):
 
     def soft(self, params: Params, context: FaultContext) -> F32:
         """Return the intensity of the straylight, float32[y, x] in DN of 255."""
-        light = self._light_once(params, context)
+        light = context.once(self._light, params)
         return np.zeros(context.shape, np.float32) if light is None else intensity_dn(light.added, context.camera)
 
     @property
@@ -226,9 +231,9 @@ class _LensStraylight(LensFault):
         """Return `mask_level_dn`."""
         return float(self.mask_level_dn)
 
-    def _light_once(self, params: Params, context: FaultContext) -> AddedLight | None:
-        """Return the straylight, computed once for each sample."""
-        return context.once("straylight.lens", params, lambda: self.added_light(params, context, _of_view(context)))
+    def _light(self, params: Params, context: FaultContext) -> AddedLight | None:
+        """Return the straylight of a sample."""
+        return self.added_light(params, context, _of_view(context))
 
     def added_light(
         self, params: Params, context: FaultContext, once: Once, *, spikes: tuple[int, int] = FINE_SPIKES
@@ -242,8 +247,7 @@ class _LensStraylight(LensFault):
             assert scene is not None
             return AddedLight(added=scene, direct_left=1 - lost, scene_lost=lost, scene_added=True)
         source = replace(source, spikes=spikes)
-        visible = 1.0 if context.sun_visible_fraction is None else float(context.sun_visible_fraction)
-        of_sun = source.straylight(channel_bands(context)[1] * visible, once)
+        of_sun = source.straylight(channel_bands(context)[1] * context.sun_visible, once)
         planes = of_sun.total(context.camera.exposure_s)
         added = cv2.merge(list(planes)).reshape(*context.shape, len(planes))
         return AddedLight(
@@ -439,7 +443,7 @@ def _sensor_grid(context: FaultContext) -> SensorGrid:
 
 def channel_bands(context: FaultContext) -> tuple[Bands, F64]:
     """Return the bands in which the channels sense sunlight, and its electrons per second, float64[channel]."""
-    nodes, irradiance = _sunlight(context)
+    nodes, irradiance = context.sunlight
     nm = spectra.fine_nodes_nm(nodes)
     spectrum = context.camera.detector.electron_rates(nm) * spectra.sunlike(irradiance, nodes)
     return Bands.of(nm, spectrum), np.asarray(np.trapezoid(spectrum, nm, axis=1))
@@ -452,17 +456,6 @@ def _bands_behind_lens(context: FaultContext) -> Bands:
     """
     bands, _ = channel_bands(context)
     return bands.behind(context.camera.lens.transmittance(bands.wavelength_nm))
-
-
-def _sunlight(context: FaultContext) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the band nodes and the Sun's irradiance in them.
-
-    If they are unknown, use eight bands from 400 to 700 nm and the Sun at 1 AU.
-    """
-    if context.wavelength_nm is not None and context.sun_irradiance_W_m2_nm is not None:
-        return context.wavelength_nm, context.sun_irradiance_W_m2_nm
-    nodes = spectra.band_nodes_nm(400.0, 700.0, 8)
-    return nodes, spectra.solar_band_irradiance_W_m2_nm(nodes, 1.0)
 
 
 def _sun_radius_rad(context: FaultContext) -> float:

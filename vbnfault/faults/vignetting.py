@@ -39,7 +39,6 @@ class Cos4Vignetting(Fault):
     severity = Severity(key="frame_illuminance_dn", low=255.0, high=2.0)
     localised = False
     soft_layer = "vignetting_factor"
-    at_rims = True
     thin_lens_only = "images fall off as its rays do, and cos⁴ would count that twice; use model 'lens'"
 
     on_axis_illuminance_dn: Interval = bounds(
@@ -69,6 +68,10 @@ class Cos4Vignetting(Fault):
         cos4 = _cos4_planes(context.shape, context.camera.focal_length_px, quantity.array.shape[2])
         e0 = params["on_axis_illuminance_dn"] / 255
         return quantity.with_array(cv2.multiply(quantity.array, cos4, scale=e0).reshape(cos4.shape))
+
+    def past_rims(self, light: Any, rest: Any, params: Params, context: FaultContext) -> Any:
+        """Return the light past the rims as it is."""
+        return light.past_rims
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
         """Return the pixels where the loss reaches `mask_loss`, bool[y, x]."""

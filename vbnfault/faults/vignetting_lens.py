@@ -25,7 +25,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -55,7 +54,6 @@ class LensVignetting(LensFault):
     severity = Severity(key="decentre", low=0.02, high=2.0)
     localised = False
     soft_layer = "vignetting_factor"
-    at_rims = True
 
     decentre: Interval = bounds(
         0.0,
@@ -104,28 +102,30 @@ class LensVignetting(LensFault):
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
         """Return the expected electrons times the factor of each pixel."""
-        return quantity.with_array(times(quantity.array, _factor_once(params, context)))
+        return quantity.with_array(times(quantity.array, context.once(_factor, params)))
 
-    def passed_to_sun(self, params: Params, context: FaultContext) -> float:
-        """Return the fraction of the Sun's beam that clears ring and hood.
+    def past_rims(self, light: Any, rest: Any, params: Params, context: FaultContext) -> Any:
+        """Return the light past the rims times the fraction of the Sun's beam that clears ring and hood.
 
-        Direct image and straylight of the Sun enter with that beam.
+        Direct image and straylight of the Sun enter with that beam. The loss at the lens's own rims is already in
+        this light.
         """
         sun = context.sun_before_camera
-        return 1.0 if sun is None else share_left(params, context.frame, np.asarray(sun[:2] / sun[2]))
+        left = 1.0 if sun is None else share_left(params, context.frame, np.asarray(sun[:2] / sun[2]))
+        return light.past_rims * np.float32(left)
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
         """Return the pixels where the loss reaches `mask_loss`, bool[y, x]."""
-        return np.asarray(_factor_once(params, context) <= np.float32(1 - params["mask_loss"]))
+        return np.asarray(context.once(_factor, params) <= np.float32(1 - params["mask_loss"]))
 
     def soft(self, params: Params, context: FaultContext) -> F32:
         """Return the factor on the light, float32[y, x]."""
-        return _factor_once(params, context)
+        return context.once(_factor, params)
 
 
-def _factor_once(params: Params, context: FaultContext) -> F32:
-    """Return the factor on the light, computed once for each sample."""
-    return context.once("vignetting.factor", params, lambda: factor(params, context.frame))
+def _factor(params: Params, context: FaultContext) -> F32:
+    """Return the factor on the light of a sample."""
+    return factor(params, context.frame)
 
 
 def factor(params: Params, frame: ImageFrame) -> F32:
@@ -203,17 +203,13 @@ def _share_left(params: Params, frame: ImageFrame) -> F32:
     soft_px = focal_px * beams.rim_mm[0].mean() / max(params["hood_distance_mm"], 1e-3)
     finest = 2 ** int(np.clip(np.log2(frame.width_px * frame.height_px) / 2 - 7, 0, 6))
     step = int(np.clip(2 ** np.floor(np.log2(max(soft_px / 6, 1))), finest, max(_COARSEST_PX, finest)))
-    rows, columns = -(-frame.height_px // step) + 2, -(-frame.width_px // step) + 2
-    x, y = (v.ravel() for v in frame.slopes(*((np.arange(n) - 0.5) * step for n in (columns, rows))))
-    left = np.empty(rows * columns, dtype=np.float32)
+    slopes = frame.slopes(*frame.nodes_px(step))
+    x, y = (v.ravel() for v in slopes)
+    left = np.empty(x.size, dtype=np.float32)
     for start in range(0, len(left), _TOGETHER):
         some = slice(start, start + _TOGETHER)
         left[some] = _left_of(params, beams, stop_mm, x[some].astype(np.float64), y[some].astype(np.float64))
-    coarse = left.reshape(rows, columns)
-    whole = (
-        cv2.resize(coarse, (columns * step, rows * step), interpolation=cv2.INTER_LINEAR) if step > 1 else coarse
-    )
-    return np.ascontiguousarray(whole[step : step + frame.height_px, step : step + frame.width_px])
+    return frame.between_nodes(left.reshape(slopes[0].shape), step)
 
 
 def _left_of(params: Params, beams: Beams, stop_mm: float, slope_x: F64, slope_y: F64) -> F64:

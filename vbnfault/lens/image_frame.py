@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,6 +20,7 @@ from .prescription import Prescription
 from .prescription_file import load_lens
 
 F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
 
 DEFAULT_LENS = "nikkor_35_f2p8"
 
@@ -50,6 +52,19 @@ class ImageFrame:
             ((y_px - self.height_px / 2) * per_px).astype(np.float32)[:, None],
         )
         return self.lens.field_slopes(x, y)
+
+    def nodes_px(self, step: int) -> tuple[F64, F64]:
+        """Return x and y of nodes `step` px apart, from half a step outside; every pixel lies between nodes."""
+        counts = (-(-size // step) + 2 for size in (self.width_px, self.height_px))
+        x, y = (np.asarray((np.arange(count) - 0.5) * step) for count in counts)
+        return x, y
+
+    def between_nodes(self, values: F32, step: int) -> F32:
+        """Interpolate float32[y, x] at `nodes_px` linearly to the pixels."""
+        rows, columns = values.shape
+        if step > 1:
+            values = np.asarray(cv2.resize(values, (columns * step, rows * step), interpolation=cv2.INTER_LINEAR))
+        return np.ascontiguousarray(values[step : step + self.height_px, step : step + self.width_px])
 
     def real_lens(self, name: str) -> RealLens:
         """Return the camera's own lens if it is real and `name` is empty, else the named one, fitted to the camera.

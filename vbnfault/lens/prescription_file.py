@@ -9,6 +9,7 @@ import itertools
 import math
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -30,15 +31,15 @@ from .glass import (
     check_index,
     from_abbe,
     from_coefficients,
-    registered,
 )
 from .paraxial import paraxial_properties
 from .prescription import Hood, Prescription, Surface, facing_air
-from .zemax import LENS_SUFFIX, GlassCatalogue, read_catalogue, read_lens
+from .zemax import LENS_SUFFIX, GlassCatalogue, glass_named, read_catalogue, read_lens
 
 _RIM_POINTS = 65
 _SMALLEST_RADIUS_MM = 1e-9  # the squares of larger curvatures could be too large for a number
 _OF_THE_STOP = ("blades", "blade_rounding", "rotation_deg")
+_AS_THEY_ARE = ("stop", "conic", "aspheric_mm", *_OF_THE_STOP)  # keys of a row that a surface has too
 
 
 class GlassTable(Table):
@@ -275,13 +276,8 @@ def _surface(row: SurfaceRow, front: Glass, where: str, catalogues: Sequence[Gla
         medium=medium,
         semi_diameter_mm=0.5 * row.diameter_mm,
         coating=_coating(row.coating, front, medium, where),
-        stop=row.stop,
-        conic=row.conic,
-        aspheric_mm=row.aspheric_mm,
         internal_transmittance_10mm=_transmittance(row.internal_transmittance_10mm, medium),
-        blades=row.blades,
-        blade_rounding=row.blade_rounding,
-        rotation_deg=row.rotation_deg,
+        **row.model_dump(include=set(_AS_THEY_ARE)),
     )
     if np.isnan(surface.sag_mm(surface.semi_diameter_mm)):
         most_mm = 2 * abs(radius) / math.sqrt(1 + row.conic)
@@ -312,10 +308,7 @@ def _medium(row: SurfaceRow, where: str, catalogues: Sequence[GlassCatalogue]) -
 
 def _named(name: str, catalogues: Sequence[GlassCatalogue]) -> Glass:
     """Return a glass of the catalogues, the first that has it, or a registered one. Raises InputError."""
-    for catalogue in catalogues:
-        if (glass := catalogue.glass(name)) is not None:
-            return glass
-    if (glass := registered(name)) is not None:
+    if (glass := glass_named(name, catalogues)) is not None:
         return glass
     read = "".join(f" {catalogue.path}," for catalogue in catalogues)
     raise InputError(
@@ -336,7 +329,7 @@ def _transmittance(given: float | TransmittanceTable | None, medium: Glass) -> T
 def _coating(given: str | tuple[CoatingLayer, ...], front: Glass, back: Glass, where: str) -> tuple[Layer, ...]:
     """Return the layers of a row's coating, in the order in which light from the front meets them."""
     if isinstance(given, tuple):
-        return tuple(Layer(n=layer.n, k=layer.k, thickness_nm=layer.thickness_nm) for layer in given)
+        return tuple(Layer(**layer.model_dump()) for layer in given)
     try:
         layers = facing_air(given, front, back)
     except InputError as error:
@@ -392,7 +385,7 @@ def to_table(lens: Prescription) -> dict[str, Any]:
         rows.append({"sensor": True, "reflectance": lens.sensor_reflectance})
     head: dict[str, Any] = {"name": lens.name, "source": lens.source}
     if lens.hood is not None:
-        head["hood"] = {"length_mm": lens.hood.length_mm, "radius_mm": lens.hood.radius_mm}
+        head["hood"] = asdict(lens.hood)
     return {**head, "surface": rows}
 
 
@@ -404,15 +397,9 @@ def _row(surface: Surface) -> dict[str, Any]:
         "diameter_mm": 2 * surface.semi_diameter_mm,
         **_keys_of(surface.medium),
     }
-    if surface.stop:
-        row["stop"] = True
     if surface.coating:
-        row["coating"] = [{"n": f.n, "k": f.k, "thickness_nm": f.thickness_nm} for f in surface.coating]
-    if surface.aspheric_mm:
-        row["aspheric_mm"] = list(surface.aspheric_mm)
-    for key, default in (("conic", 0.0), ("blades", 0), ("blade_rounding", 0.0), ("rotation_deg", 0.0)):
-        if getattr(surface, key) != default:
-            row[key] = getattr(surface, key)
+        row["coating"] = [asdict(film) for film in surface.coating]
+    row |= {key: value for key in _AS_THEY_ARE if (value := getattr(surface, key))}
     nodes, values = surface.internal_transmittance_10mm
     registered = GLASSES.get(surface.medium.name) == surface.medium
     of_glass = surface.medium.internal_transmittance_10mm if registered else CLEAR

@@ -75,6 +75,7 @@ _REFUSED = {
     "USOB": "an obscuration of the user's shape",
     "OBDC": "an aperture off the axis",
 }
+_NUMBERS = {"CURV": "curvature", "CONI": "conic", "DIAM": "semi_diameter"}
 _OF_BEAMS = ("ENPD", "FNUM", "FTYP", "XFLN", "YFLN")
 _FAR_MM = 1e7  # distance of the object from which on it counts as infinite; some files write 1e10 for infinity
 _NOT_RECORDED = (1.5, 40.0)  # nd and vd that older files have for every glass of a catalogue
@@ -248,14 +249,10 @@ class _Surface:
                 raise InputError(f"{self.where}: TYPE {self.kind}: must be STANDARD or EVENASPH")
         elif key == "STOP":
             self.stop = True
-        elif key == "CURV":
-            self.curvature = _number(words, 1, self.where)
-        elif key == "CONI":
-            self.conic = _number(words, 1, self.where)
+        elif key in _NUMBERS:
+            setattr(self, _NUMBERS[key], _number(words, 1, self.where))
         elif key == "DISZ":
             self.thickness = math.inf if words[1:2] == ["INFINITY"] else _number(words, 1, self.where)
-        elif key == "DIAM":
-            self.semi_diameter = _number(words, 1, self.where)
         elif key in ("CLAP", "FLAP"):
             if _number(words, 1, self.where) != 0:
                 raise InputError(f"{self.where}: {key} {words[1]}: the inner radius of the aperture must be 0")
@@ -434,7 +431,7 @@ def _with_rims(
 
 def _index(keys: Mapping[str, Any], catalogues: Sequence[GlassCatalogue]) -> float:
     """Return the index at the d line of the medium that keys of a row describe."""
-    glass = _named(keys["glass"], catalogues) if "glass" in keys else None
+    glass = glass_named(keys["glass"], catalogues) if "glass" in keys else None
     return float(keys.get("nd", 1.0) if glass is None else glass.nd)
 
 
@@ -484,7 +481,7 @@ def _rows(
     return rows, tuple(numbers)
 
 
-def _named(name: str, catalogues: Sequence[GlassCatalogue]) -> Glass | None:
+def glass_named(name: str, catalogues: Sequence[GlassCatalogue]) -> Glass | None:
     """Return a glass of the catalogues, the first that has it, or a registered one, or None."""
     return next((glass for catalogue in catalogues if (glass := catalogue.glass(name))), None) or registered(name)
 
@@ -499,7 +496,7 @@ def _medium(surface: _Surface, catalogues: Sequence[GlassCatalogue]) -> dict[str
     by_index = {"nd": nd} | ({"vd": vd} if vd else {})
     if words[2:3] == ["1"]:  # a model glass
         return by_index
-    if _named(name, catalogues):
+    if glass_named(name, catalogues):
         return {"glass": name}
     if nd > 1 and (nd, vd) != _NOT_RECORDED:
         return by_index

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..camera import Camera
 from ..core.quantities import RGBI, Electrons
-from ..faults import MOSAIC_STEPS, Fault, FaultContext, act, physical_order
+from ..faults import MOSAIC_STEPS, Fault, FaultContext, physical_order
 from . import masks
 from .spec import Draw, SceneExposure
 
@@ -126,7 +126,7 @@ class Development:
                 draw, context = draws[last], self.context_of(draws[last].fault, draws)
                 leads = before == acting_at(draws, "electrons")[: len(before)]
                 light = self.signal(draws, before, keep=keep and leads)
-                signal = act(draw.fault, light, draw.params, context)
+                signal = draw.fault.on_light(light, draw.params, context)
             else:
                 signal = self._undisturbed(draws)
             if keep:

@@ -31,19 +31,12 @@ from ..core import spectra
 from ..core.errors import InputError, in_file, shown
 from ..core.spectra import Bands
 from ..core.tables import did_you_mean
-from ..faults import Fault, FaultContext, act
+from ..faults import Fault, FaultContext
 from ..lens.changes import changed
 from ..lens.straylight.irradiance import flare_model
 from ..lens.straylight.scatter import GlareLayout
 from ..lens.straylight.settings import GhostSettings, SensorGrid
-from ..lens.straylight.total import (
-    COARSE_SPIKES,
-    GhostSource,
-    SpreadLight,
-    SunInLens,
-    ghosts,
-    veil_per_px,
-)
+from ..lens.straylight.total import COARSE_SPIKES, GhostSource, SpreadLight, SunInLens, ghosts, veil_per_px
 from ..pipeline.exposure import meter
 from ..pipeline.injection import inject_faults
 from ..pipeline.rendering import render_view
@@ -515,7 +508,7 @@ def _mean_of_channels(light: SpreadLight, rates: F64) -> F32:
 def _added_by(fault: Fault, exposed: Exposed, params: Any) -> dict[str, Any]:
     """Return the fields of `LitImage` that hold the straylight of a model that gives one image."""
     clean = exposed.exposure.rate.scaled(exposed.camera.exposure_s)
-    image = act(fault, clean, params, exposed.context).merged.array
+    image = fault.on_light(clean, params, exposed.context).merged.array
     added = np.ascontiguousarray(np.moveaxis(image, -1, 0)) - exposed.clean
     light = {"kept": exposed.clean, "direct": exposed.direct_e, "added": np.maximum(added, 0)}
     return {**light, "parts_e": {}, "ghosts_e": ()}

@@ -19,7 +19,6 @@ from ..faults import (
     Fault,
     FaultContext,
     Params,
-    act,
     from_dict,
     models,
     physical_order,
@@ -221,7 +220,7 @@ def _check_footprint(fault: Fault, params: Params, context: FaultContext, mask: 
 def _check_planes_of_light(fault: Fault, params: Params, context: FaultContext, light: Electrons) -> None:
     """Check that light past the lens's rims stays in a plane of its own, finite and not negative."""
     both = replace(light, past_rims=light.array[::-1].copy())
-    result = act(fault, both, params, context)
+    result = fault.on_light(both, params, context)
     assert result.past_rims is not None
     for plane in (result.array, result.past_rims):
         assert plane.shape == light.array.shape, "apply changed the shape of the light past the rims"

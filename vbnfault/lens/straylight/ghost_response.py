@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -34,7 +33,6 @@ from ...core import activity
 from ...core.array_files import ArrayFiles, code_hash
 from ...core.llvm import backend
 from ...core.spectra import Bands
-from ..glass import D_NM
 from ..prescription import Prescription
 from .bundles import Rays, Spots, Tracer
 from .ghosts import GhostSpectra, boxes, lit_cells
@@ -119,14 +117,6 @@ class GhostResponse:
 
     cells: PolarCells
     table: F32
-
-    @property
-    def flux_mm2(self) -> F64:
-        """Return the flux of the ghosts on all rings of the sensor, float64[band, source ring]."""
-        ring_mm = self.cells.ring_mm
-        area_mm2 = 2 * np.pi * (np.arange(self.cells.rings) + 0.5) * ring_mm**2
-        mean = self.table[:, 0].astype(np.float64) / self.cells.azimuths
-        return np.einsum("bmk,m->bk", mean, area_mm2)
 
     def harmonics(self, sources: F32, weights: F64) -> NDArray[np.complex64]:
         """Return the azimuthal harmonics of the ghosts on the sensor's rings, complex64[channel, harmonic, ring].
@@ -614,26 +604,10 @@ def response_key(
     settings: GhostSettings,
     coating_loss: float,
 ) -> str:
-    """Return the sha256 (hex) of all that determines a response.
-
-    Names do not count. Glasses count by their indices at the wavelengths that rays are traced at.
-    """
-    traced_nm = *bands.nm, float(np.median(bands.nodes_nm)), D_NM
-    surfaces = [dataclasses.asdict(s) for s in lens.with_round_stop().surfaces]
-    for surface in surfaces:
-        del surface["medium"]
-    content = {
-        "code": _code_hash(),
-        "surfaces": surfaces,
-        "indices": [lens.indices(nm).tolist() for nm in traced_nm],
-        "absorption": [s.absorption_per_mm(bands.wavelength_nm).tolist() for s in lens.surfaces],
-        "sensor_reflectance": lens.sensor_reflectance,
-        "hood": lens.hood and dataclasses.asdict(lens.hood),
-        "bands": dataclasses.asdict(bands),
-        "cells": dataclasses.asdict(cells),
-        "settings": [settings.model, settings.reflections, coating_loss],
-    }
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+    """Return the sha256 (hex) of all that determines a response; the name of the lens does not."""
+    of_lens = dataclasses.replace(lens.with_round_stop(), name="", source="")
+    content = _code_hash(), of_lens, bands, cells, settings.model, settings.reflections, coating_loss
+    return hashlib.sha256(repr(content).encode()).hexdigest()
 
 
 @lru_cache(maxsize=1)

@@ -166,11 +166,10 @@ def _narrowed(
     shape = count, len(route), _COARSE, _COARSE
     margin = spots.margin.numpy().reshape(shape)
     passes = (margin > -1).any(axis=0)
+    boxes_, disc, kept = _around_passing(box, passes, route, len(made.routes))
+    arrivals = Arrivals.none(len(made.routes))
     if reach_mm is None:
-        lattice = _CoarseRays(box=box, passes=passes, inside=passes)
-        low, high, spacing, kept = lattice.bounds(route, len(made.routes))
-        found = lattice.boxes(low, high, spacing, {int(route[k]): k for k in kept})
-        return *found, Arrivals.none(len(made.routes))
+        return boxes_, disc, arrivals
     x, y, fraction = (v.numpy().reshape(shape) for v in (spots.x_mm, spots.y_mm, spots.fraction))
     near = (margin > -1).all(axis=0) & (np.hypot(x[0], y[0]) < reach_mm)
     apart = np.where(near, np.hypot(x[-1] - x[0], y[-1] - y[0]), np.nan).reshape(len(route), -1)
@@ -183,9 +182,6 @@ def _narrowed(
     most = np.stack([np.where(inside, v[0], -far).max(axis=(1, 2)) for v in (x, y)], axis=-1)
     at_entrance = 4 * box[:, 2] * box[:, 3] / (_COARSE - 1) ** 2
     peak, magnification, folded, uneven = _spread(x[0], y[0], fraction[0], inside, near, at_entrance)
-    lattice = _CoarseRays(box=box, passes=passes, inside=inside)
-    arrivals = Arrivals.none(len(made.routes))
-    low, high, spacing, kept = lattice.bounds(route, len(made.routes))
     for k in kept:
         r = route[k]
         if inside[k].any():
@@ -195,67 +191,48 @@ def _narrowed(
         arrivals.move_mm[r] = max(arrivals.move_mm[r], move[k])
         arrivals.folded[r] |= folded[k]
         arrivals.magnification[r], arrivals.uneven[r] = magnification[k], uneven[k]
-    route_boxes, disc = lattice.boxes(low, high, spacing, {int(route[k]): k for k in kept})
-    return route_boxes, disc, arrivals
+    return boxes_, disc, arrivals
 
 
-@dataclass(frozen=True, eq=False)
-class _CoarseRays:
-    """Hold coarse lattices of rays, and compute from them the boxes of the rays that pass, by route.
+def _around_passing(
+    box: F64, passes: NDArray[np.bool_], route: NDArray[np.int64], count: int
+) -> tuple[F64, F64, list[int]]:
+    """Return boxes, float64[route, 4], around rays that pass, their ellipses, float64[route], and the kept bundles.
 
-    Attributes
+    Parameters
     ----------
-    box
-        float64[bundle, 4]: boxes of the lattices.
-    passes, inside
-        bool[bundle, y, x]: rays that pass at any of the wavelengths, and at the first one.
+    box, passes
+        float64[bundle, 4] and bool[bundle, y, x]: boxes of coarse lattices, and their rays that pass.
+    route, count
+        Route of each bundle, and number of routes. The box of a route without a ray that passes is nan.
     """
-
-    box: F64
-    passes: NDArray[np.bool_]
-    inside: NDArray[np.bool_]
-
-    def bounds(self, route: NDArray[np.int64], count: int) -> tuple[F64, F64, F64, list[int]]:
-        """Return lower and upper bounds of the rays that pass and the lattice's spacing, float64[route, 2] each.
-
-        The last value lists the bundles that are kept.
-        """
-        nodes = np.linspace(-1, 1, _COARSE)
-        low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
-        spacing, kept = np.zeros((count, 2)), []
-        for k in np.flatnonzero(self.passes.any(axis=(1, 2))):
-            r, box = route[k], self.box[k]
-            columns, rows = np.flatnonzero(self.passes[k].any(axis=0)), np.flatnonzero(self.passes[k].any(axis=1))
-            here_low = box[:2] + box[2:] * nodes[[columns[0], rows[0]]]
-            here_high = box[:2] + box[2:] * nodes[[columns[-1], rows[-1]]]
-            step = 2 * box[2:] / (_COARSE - 1)
-            # of two boxes of one route, keep the finer one
-            if np.isfinite(low[r, 0]) and (spacing[r] < step).all() and (here_high - here_low < 3 * step).any():
-                continue
-            low[r], high[r] = np.minimum(low[r], here_low - step), np.maximum(high[r], here_high + step)
-            spacing[r] = step
-            kept.append(int(k))
-        return low, high, spacing, kept
-
-    def boxes(self, low: F64, high: F64, spacing: F64, kept: dict[int, int]) -> tuple[F64, F64]:
-        """Return boxes, float64[route, 4], nan where no ray passes, and ellipses, float64[route], by route.
-
-        `kept` maps a route to the last bundle of it that was kept.
-        """
-        nodes = np.linspace(-1, 1, _COARSE)
-        out, good = np.full((len(low), 4), np.nan), np.isfinite(low[:, 0])
-        out[good, 0] = (low[good, 0] + high[good, 0]) / 2
-        out[good, 2] = np.maximum((high[good, 0] - low[good, 0]) / 2, 1e-6)
-        # symmetric about the plane of axis and Sun, so that one side can be mirrored
-        out[good, 1], out[good, 3] = 0.0, np.maximum(np.maximum(high[good, 1], -low[good, 1]), 1e-6)
-        disc = np.zeros(len(out))
-        for r, k in kept.items():
-            ys, xs = np.nonzero(self.passes[k])
-            box = self.box[k]
-            u, v = ((box[i] + box[2 + i] * nodes[n] - out[r, i]) / out[r, 2 + i] for i, n in ((0, xs), (1, ys)))
-            # the ellipse includes one cell beyond those that pass
-            disc[r] = np.hypot(u, v).max() + 0.5 * (spacing[r] / out[r, 2:]).sum()
-        return out, np.clip(disc, 1, np.sqrt(2))
+    nodes = np.linspace(-1, 1, _COARSE)
+    low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
+    spacing, kept = np.zeros((count, 2)), []
+    for k in np.flatnonzero(passes.any(axis=(1, 2))).tolist():
+        r, own = route[k], box[k]
+        columns, rows = np.flatnonzero(passes[k].any(axis=0)), np.flatnonzero(passes[k].any(axis=1))
+        here_low = own[:2] + own[2:] * nodes[[columns[0], rows[0]]]
+        here_high = own[:2] + own[2:] * nodes[[columns[-1], rows[-1]]]
+        step = 2 * own[2:] / (_COARSE - 1)
+        # of two boxes of one route, keep the finer one
+        if np.isfinite(low[r, 0]) and (spacing[r] < step).all() and (here_high - here_low < 3 * step).any():
+            continue
+        low[r], high[r] = np.minimum(low[r], here_low - step), np.maximum(high[r], here_high + step)
+        spacing[r] = step
+        kept.append(k)
+    out, good = np.full((count, 4), np.nan), np.isfinite(low[:, 0])
+    out[good, 0] = (low[good, 0] + high[good, 0]) / 2
+    out[good, 2] = np.maximum((high[good, 0] - low[good, 0]) / 2, 1e-6)
+    # symmetric about the plane of axis and Sun, so that one side can be mirrored
+    out[good, 1], out[good, 3] = 0.0, np.maximum(np.maximum(high[good, 1], -low[good, 1]), 1e-6)
+    disc = np.zeros(count)
+    for k in kept:  # the last bundle of a route decides
+        r, (ys, xs) = route[k], np.nonzero(passes[k])
+        u, v = ((box[k, i] + box[k, 2 + i] * nodes[n] - out[r, i]) / out[r, 2 + i] for i, n in ((0, xs), (1, ys)))
+        # the ellipse includes one cell beyond those that pass
+        disc[r] = np.hypot(u, v).max() + 0.5 * (spacing[r] / out[r, 2:]).sum()
+    return out, np.clip(disc, 1, np.sqrt(2)), kept
 
 
 def _spread(

@@ -232,9 +232,7 @@ class FlareModel:
             self._tracer.hood_width = max(shift, self._tracer.hood_width)
         self._diffraction, self._across = settings.diffraction, settings.across
         self._reach_mm = float(np.hypot(*shape) / 2 * pitch_mm)
-        self._last_boxes: tuple[tuple[float, float], tuple[Tracer, Rays, Arrivals]] | None = None
-        self._last_worn: tuple[float, FlareModel] | None = None
-        self._whole: FlareModel | None = None  # the model with whole coatings, if they are worn here
+        self._whole = self  # the model with whole coatings, if they are worn here
         self._soften()
 
     def _soften(self) -> None:
@@ -333,16 +331,8 @@ class FlareModel:
         return out
 
     def worn(self, coating_loss: float) -> FlareModel:
-        """Return the model with a fraction of the coatings' area gone, as `Tracer.worn` does; the last is kept."""
-        if not coating_loss:
-            return self
-        last = self._last_worn  # another thread may replace it
-        if last is None or last[0] != coating_loss:
-            other = copy.copy(self)
-            other._tracer = self._tracer.worn(coating_loss)
-            other._whole, other._last_boxes, other._last_worn = self, None, None
-            self._last_worn = last = coating_loss, other
-        return last[1]
+        """Return the model with a fraction of the coatings' area gone, as `Tracer.worn` does; the last are kept."""
+        return _worn(self, coating_loss) if coating_loss else self
 
     def image(self, sun_deg: float, azimuth_deg: float = 0.0, *, only: tuple[int, int] | None = None) -> F32:
         """Return the irradiance of all ghosts over the Sun's at the entrance, float32[band, y, x].
@@ -360,13 +350,12 @@ class FlareModel:
         InputError
             The angle is 90° or more.
         """
-        return self._drawn(sun_deg, azimuth_deg, only).irradiance()
-
-    def _drawn(self, sun_deg: float, azimuth_deg: float, only: tuple[int, int] | None) -> Sums:
-        """Return the sums into which all ghosts are drawn."""
         if not 0 <= sun_deg < 90:
             raise InputError(f"sun_deg = {sun_deg:g}: must be from 0 to below 90")
-        turn = float(np.radians(azimuth_deg))
+        return self._drawn(sun_deg, float(np.radians(azimuth_deg)), only).irradiance()
+
+    def _drawn(self, sun_deg: float, turn: float, only: tuple[int, int] | None) -> Sums:
+        """Return the sums into which all ghosts are drawn; rays and cells are freed before the levels are added."""
         made, rays, arrivals = self._boxes(sun_deg, turn)
         shown = self._in_frame(arrivals)
         if only is not None:
@@ -398,16 +387,8 @@ class FlareModel:
 
     def _boxes(self, sun_deg: float, turn: float) -> tuple[Tracer, Rays, Arrivals]:
         """Return the tracer for an azimuth, the boxes of all ghosts, and where they arrive; the last are kept."""
-        key, last = (sun_deg, turn), self._last_boxes
-        if last is None or last[0] != key:
-            made = self._tracer.turned(turn)
-            if self._whole is None:
-                found = boxes(made, sun_deg, self._detail.width, self._reach_mm)
-            else:  # worn coatings change how bright ghosts are, but not where they are
-                found = self._whole._boxes(sun_deg, turn)[1:]
-            last = key, (made, *found)
-            self._last_boxes = last
-        return last[1]
+        # worn coatings change how bright ghosts are, but not where they are
+        return self._tracer.turned(turn), *_boxes_of_whole(self._whole, sun_deg, turn)
 
     def flux_mm2(
         self, sun_deg: float, azimuth_deg: float, only: Collection[tuple[int, ...]], *, across: int = 48
@@ -465,7 +446,7 @@ class FlareModel:
         """
         spectra = GhostSpectra.of(made, rays, reach_mm, _SUBDIVISIONS)
         arrivals = replace(arrivals, peak=arrivals.peak * spectra.of_bands(0).max(axis=1))
-        bright = arrivals.peak > (_LEAST if self._whole is None else 0)
+        bright = arrivals.peak > (_LEAST if self._whole is self else 0)
         return rays.take(bright), arrivals.take(bright), spectra.take(bright)
 
     def _fainter(self, rays: Rays, arrivals: Arrivals) -> NDArray[np.int64]:
@@ -583,6 +564,20 @@ def disc_samples(rings: int) -> F64:
         points.append(radius * np.column_stack([np.cos(angle), np.sin(angle)]))
         inner += n
     return np.concatenate(points)
+
+
+@lru_cache(maxsize=2)
+def _worn(model: FlareModel, coating_loss: float) -> FlareModel:
+    """Return `FlareModel.worn`."""
+    other = copy.copy(model)
+    other._tracer = model._tracer.worn(coating_loss)
+    return other
+
+
+@lru_cache(maxsize=4)
+def _boxes_of_whole(model: FlareModel, sun_deg: float, turn: float) -> tuple[Rays, Arrivals]:
+    """Return the boxes of all ghosts and their arrivals with whole coatings."""
+    return boxes(model._tracer.turned(turn), sun_deg, model._detail.width, model._reach_mm)
 
 
 @lru_cache(maxsize=4)

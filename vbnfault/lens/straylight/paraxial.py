@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -103,48 +104,36 @@ def along(lens: Prescription, path: Sequence[tuple[int, bool]], wavelength_nm: A
         To each surface met.
     """
     wavelength = np.asarray(wavelength_nm, dtype=np.float64)
-    if wavelength.ndim == 0:
-        return _along_at(lens, path, float(wavelength))
-    flat, vertex = _media(lens, tuple(wavelength.ravel().tolist()))
-    index = flat.reshape(len(flat), *wavelength.shape)
-    height, slope = (np.broadcast_to(row, (*wavelength.shape, 2)).copy() for row in np.eye(2))
-    met, onward, before = [], True, 0
-    for row, mirror in path:
-        height = height + abs(vertex[row] - vertex[before]) * slope
-        met.append(np.stack([height, slope], axis=-2))
-        curvature = lens.surfaces[row].curvature_per_mm if row < len(lens.surfaces) else 0.0
-        sense = curvature if onward else -curvature
-        if mirror:
-            slope, onward = slope + 2 * sense * height, not onward
-        else:
-            into, out = (index[row], index[row + 1]) if onward else (index[row + 1], index[row])
-            slope = ((into - out) * sense / out)[..., None] * height + (into / out)[..., None] * slope
-        before = row
-    height = height + (vertex[-1] - vertex[before]) * slope
-    return np.stack([height, slope], axis=-2), np.stack(met)
-
-
-def _along_at(lens: Prescription, path: Sequence[tuple[int, bool]], wavelength_nm: float) -> tuple[F64, F64]:
-    """Return `along` for one wavelength, with plain numbers: many times faster than arrays of two."""
-    index, vertex = (v.tolist() for v in _media(lens, (wavelength_nm,)))
+    index, vertex = _media(lens, tuple(wavelength.ravel().tolist()))
+    # plain numbers for one wavelength: many times faster than arrays of one
+    index = index[:, 0].tolist() if wavelength.ndim == 0 else index.reshape(len(index), *wavelength.shape)
     curvatures = [*(s.curvature_per_mm for s in lens.surfaces), 0.0]
+    # a height or slope is this pair of factors times height and slope in the plane of the first vertex
     (h0, h1), (s0, s1) = (1.0, 0.0), (0.0, 1.0)
     met, onward, before = [], True, 0
     for row, mirror in path:
         gap = abs(vertex[row] - vertex[before])
         h0, h1 = h0 + gap * s0, h1 + gap * s1
-        met.append(((h0, h1), (s0, s1)))
+        met.append(_matrix(wavelength, h0, h1, s0, s1))
         sense = curvatures[row] if onward else -curvatures[row]
         if mirror:
             bend = 2 * sense
             s0, s1, onward = s0 + bend * h0, s1 + bend * h1, not onward
         else:
-            into, out = (index[row][0], index[row + 1][0]) if onward else (index[row + 1][0], index[row][0])
+            into, out = (index[row], index[row + 1]) if onward else (index[row + 1], index[row])
             power, ratio = (into - out) * sense / out, into / out
             s0, s1 = power * h0 + ratio * s0, power * h1 + ratio * s1
         before = row
     gap = vertex[-1] - vertex[before]
-    return np.array(((h0 + gap * s0, h1 + gap * s1), (s0, s1))), np.array(met).reshape(-1, 2, 2)
+    return _matrix(wavelength, h0 + gap * s0, h1 + gap * s1, s0, s1), np.array(met)
+
+
+def _matrix(wavelength: F64, h0: Any, h1: Any, s0: Any, s1: Any) -> Any:
+    """Return matrices of the rows (h0, h1) and (s0, s1), float64[..., 2, 2]."""
+    if wavelength.ndim == 0:
+        return np.array(((h0, h1), (s0, s1)))
+    parts = np.broadcast_arrays(h0, h1, s0, s1, wavelength)[:4]
+    return np.stack(parts, axis=-1).reshape(*wavelength.shape, 2, 2)
 
 
 @lru_cache(maxsize=32)
