@@ -20,8 +20,8 @@ from vbnfault.core.spectra import Bands
 from vbnfault.lens import load_lens, scaled_to_focal_length
 from vbnfault.lens.straylight.irradiance import FlareModel
 from vbnfault.lens.straylight.settings import SensorGrid
+from vbnfault.pipeline.development import take_images
 from vbnfault.pipeline.exposure import meter
-from vbnfault.pipeline.images import take_images
 from vbnfault.pipeline.injection import inject_faults
 from vbnfault.pipeline.labels import label
 from vbnfault.pipeline.record import to_sample

@@ -22,9 +22,8 @@ from vbnfault.render.description import View
 from vbnfault.scene import config
 from vbnfault.scene.coma import ComaTable, PhaseFunctionTable
 from vbnfault.scene.trajectory import as_trajectory
-from vbnfault.world.coma import Coma, Lines, Outflow, Shadow, make_coma, sun_axes
+from vbnfault.world.coma import Coma, Lines, Outflow, Shadow, make_coma, relative_phase, sun_axes
 from vbnfault.world.coma_ground import diffuse_reflectance, dust_towards_sun, irradiance_of_sky
-from vbnfault.world.dust_phase import relative_phase
 from vbnfault.world.haze import haze
 
 RADIUS_M = 1000.0
@@ -269,7 +268,7 @@ def test_an_image_agrees_with_lines_through_every_pixel(
     depth = (length / norm).astype(np.float32).reshape(size, size)
 
     got, optical_depth = haze(dust, shadow, view, depth, semantic)
-    light = dust.relative_light(view.position_L_m, rays, length, shadow) * dust.phase(rays @ SUN)
+    light = dust.relative(view.position_L_m, rays, length, shadow)[0] * dust.phase(rays @ SUN)
     column = dust.column(start, np.sqrt(np.maximum(distance2, 1e-6)), length)
     want = (light * column / (8 * np.pi**2)).reshape(size, size)
     # of the ground: Afρ / (2 π 4 p) for each unit of the column, with the dust in shadow
@@ -315,7 +314,7 @@ def test_light_of_the_sky_is_the_sum_over_20000_directions(zenith_deg: float) ->
     start = rays @ camera
     column = dust.column(start, np.sqrt(np.maximum(camera @ camera - start**2, 1.0)), endless)
     phase_deg = np.degrees(np.arccos(np.clip(-rays @ SUN, -1, 1)))
-    light = dust.relative_light(camera, rays, endless, shadow) * column * RADIUS_M
+    light = dust.relative(camera, rays, endless, shadow)[0] * column * RADIUS_M
     light *= relative_phase("halley_marcus", np.minimum(phase_deg, 150))
     tilts = [(0, 0), (40, 0), (40, 90), (60, 180), (90, 60), (120, 120)]
     facets = np.array([normals_of(up, sunward, *tilt) for tilt in tilts])

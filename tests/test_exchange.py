@@ -18,7 +18,7 @@ from vbnfault.core.errors import InputError
 from vbnfault.pipeline import Session, resolve
 from vbnfault.pipeline.spec import Pose
 from vbnfault.scene import config, exchange, plan
-from vbnfault.world import ground, siting
+from vbnfault.world import ground
 
 # Every test is of a fixed seed; 1e-3 over about 16 comparisons.
 LEVEL = 1e-3 / 16
@@ -114,10 +114,10 @@ def test_more_suns_are_seen_from_the_sites_that_are_chosen_for_them() -> None:
     drawn = {name: values[suns] for name, values in table.variables.items()}
     model = ground.shape_model(session.body)
     random = choose_sites(session.body, 8, scene.dataset.seed)
-    seen = [siting.suns_seen(scene, model, random[k], drawn).mean() for k in range(8)]
-    chosen = siting.suns_seen(scene, model, session.sites[site], drawn)
+    seen = [ground.suns_seen(scene, model, random[k], drawn).mean() for k in range(8)]
+    chosen = ground.suns_seen(scene, model, session.sites[site], drawn)
     assert chosen.mean() > max(0.9, np.mean(seen))
-    assert siting.suns_seen(scene, model, random[0], {**drawn, "sun_elevation_deg": np.full(len(suns), 89.0)}).all()
+    assert ground.suns_seen(scene, model, random[0], {**drawn, "sun_elevation_deg": np.full(len(suns), 89.0)}).all()
 
 
 # The paper's geometry over a small body with coarse ground. Half of the Suns are below the horizon.

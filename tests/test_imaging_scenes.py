@@ -25,9 +25,9 @@ from vbnfault.lens import (
 )
 from vbnfault.lens.footprint import DEFAULT_LENS
 from vbnfault.lens.glass import D_NM
+from vbnfault.pipeline.exposure import _rate_with
 from vbnfault.pipeline.record import to_sample
 from vbnfault.pipeline.spec import SceneExposure, SceneLight
-from vbnfault.pipeline.stars import _rate_with
 from vbnfault.render.description import View
 from vbnfault.scene import config, plan
 from vbnfault.store.schema import spec_from_plain
@@ -134,7 +134,9 @@ def test_stars_go_through_the_lens(sigma_px: float) -> None:
         height_px=256 + 2 * gy,
     )
     dark = Radiance(array=np.zeros((3, view.height_px, view.width_px), np.float32), wavelength_nm=nodes)
-    seen = assemble.with_stars(stars, dark, c, np.eye(3), np.ones(dark.array.shape[1:], dtype=bool), view)
+    bright = assemble.visible_stars(stars, dark, c, np.eye(3), np.ones(dark.array.shape[1:], dtype=bool), view)
+    assert bright is not None
+    seen = bright.added_to(dark)
     image = lens.image(seen)
     _check_stars_are_imaged_alone(stars, c, seen, view)
     catalogue = sky.load_catalogue().brighter_than(2.5)

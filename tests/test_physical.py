@@ -16,13 +16,12 @@ from vbnfault.core import frames
 from vbnfault.core.errors import InputError
 from vbnfault.core.quantities import BODY, SKY, SPACECRAFT
 from vbnfault.pipeline import Session
-from vbnfault.pipeline.exposure import meter
+from vbnfault.pipeline.exposure import add_stars, meter
 from vbnfault.pipeline.noise_budget import green_per_second
 from vbnfault.pipeline.record import to_sample
 from vbnfault.pipeline.rendering import describe, render_view
 from vbnfault.pipeline.resolve import resolve
 from vbnfault.pipeline.spec import Frame
-from vbnfault.pipeline.stars import add_stars
 from vbnfault.render import sampling
 from vbnfault.render.detail import _LEVELS, _SIDE, _UNIT, _pyramid
 from vbnfault.render.runtime import mi

@@ -66,7 +66,7 @@ def test_the_keys_that_the_scene_shows_as_comments_are_accepted(tmp_path: Path) 
     ):
         assert f"\n# {line}" in text
         text = text.replace(f"\n# {line}", f"\n{line}")
-    path.write_text(text, encoding="utf-8")
+    path.write_text(text.replace('model = "cos4"', 'model = "lens"'), encoding="utf-8")
     scene = load_scene(path)
     assert scene.geometry.sun_averted is not None
     assert scene.geometry.sun_averted.reference == "nadir"

@@ -18,7 +18,7 @@ from ..scene import aims, names, plan
 from ..scene.bodies import named_body
 from ..scene.config import Scene
 from ..scene.trajectory import Trajectory
-from ..world import assemble, ground, siting
+from ..world import assemble, ground
 from .progress import duration_text, size_text
 
 _SITES_DESCRIBED = 8  # a site takes 9 ms on a shape of 20,000 facets
@@ -177,7 +177,7 @@ def _suns_seen(session: Session) -> str:
     for index in some.tolist():
         suns = table.suns_of_site(index)
         drawn = {name: values[suns] for name, values in table.variables.items()}
-        of_sites.append(siting.suns_seen(scene, model, session.sites[index], drawn))
+        of_sites.append(ground.suns_seen(scene, model, session.sites[index], drawn))
     own, never, count = (
         sum(int(number) for number in numbers)
         for numbers in zip(*((s.diagonal().sum(), (~s.any(axis=0)).sum(), len(s)) for s in of_sites), strict=True)

@@ -24,8 +24,7 @@ from ..scene.keyed_random import keyed_uniform
 from ..scene.trajectory import FlownPose, Trajectory, as_trajectory, load_trajectory, with_rows
 from ..world import assemble
 from ..world.coma import check_coma
-from ..world.ground import GroundDetail, ground_details
-from ..world.siting import sites_for_suns
+from ..world.ground import GroundDetail, ground_details, sites_for_suns
 from ..world.spacecraft import SpacecraftMesh
 from .record import to_sample
 from .spec import Frame, SampleSpec, Terrain
@@ -117,8 +116,7 @@ class Session:
                 self.trajectory = load_trajectory(scene.trajectory.file)
         if self.trajectory is not None:
             self.trajectory = self.trajectory.repeated(scene.dataset.variants_per_view)
-            scene = scene if poses is None else with_rows(scene, self.trajectory)
-        self.scene = scene
+        self.scene = scene = with_rows(scene, None if poses is None else self.trajectory)
         planned = sum(blocks or (scene.dataset.samples,))
         if self.trajectory is not None and planned > len(self.trajectory):
             raise InputError(
@@ -187,21 +185,14 @@ class Session:
             return sites_for_suns(self.scene, self.body, self.plan_of_sites)
         return choose_sites(self.body, self.scene.dataset.sites, self.scene.dataset.seed)
 
-    def terrain(self, site: int) -> Terrain:
-        """Return the terrain of a site. Only the last one is kept."""
-        if self._terrain is None or self._terrain_key != site:
+    def terrain(self, of: int | GroundDetail) -> Terrain:
+        """Return the terrain of a site, or the one refined for a pose. Only the last one is kept."""
+        if self._terrain is None or self._terrain_key != of:
             self._terrain = None  # release the old one first: a small machine has no memory for two
-            self._terrain = self._new_terrain(self.sites[site])
-            self._terrain_key = site
-        return self._terrain
-
-    def flown_terrain(self, index: int) -> Terrain:
-        """Return the terrain of a row of the table of poses. Rows share terrains; only the last one is kept."""
-        detail = self.ground_detail(index)
-        if self._terrain is None or self._terrain_key != detail:
-            self._terrain = None
-            self._terrain = self._new_terrain(detail.site(self.body, 0), detail)
-            self._terrain_key = detail
+            detail = None if isinstance(of, int) else of
+            site = self.sites[of] if isinstance(of, int) else of.site(self.body, 0)
+            self._terrain = self._new_terrain(site, detail)
+            self._terrain_key = of
         return self._terrain
 
     def ground_detail(self, index: int) -> GroundDetail:
@@ -218,12 +209,7 @@ class Session:
 
     def aimed_terrain(self, pose: FlownPose) -> Terrain:
         """Return the terrain for a pose of a camera that aims. Only the last one is kept."""
-        (detail,) = ground_details(self.scene, self.body, [pose])
-        if self._terrain is None or self._terrain_key != detail:
-            self._terrain = None
-            self._terrain = self._new_terrain(detail.site(self.body, 0), detail)
-            self._terrain_key = detail
-        return self._terrain
+        return self.terrain(ground_details(self.scene, self.body, [pose])[0])
 
     def model_terrain(self, index: int) -> Terrain:
         """Return the shape model as it is as the terrain of a site. Only the last one is kept."""
@@ -344,7 +330,7 @@ class Session:
         """Return what `spec` does; the messages of its errors do not name the scene."""
         site, aims = int(self.plan.site[index]), self.scene.is_aimed
         if self.trajectory is not None:
-            terrain = self.flown_terrain(index)
+            terrain = self.terrain(self.ground_detail(index))
         else:
             terrain = self.model_terrain(site) if aims else self.terrain(site)
         return SampleSpec(

@@ -4,7 +4,7 @@ A view that cannot be used could be drawn again, but this bends the distribution
 more often than a high one, so the kept Suns are too high. With `plan.unusable_views = "exchange"`, a sample keeps
 its Sun and its attitude instead, and what makes the view unusable is exchanged:
 
-- Sites are chosen for the Suns that are drawn there (`world.siting`). The Sun-facing samples of a site have Suns
+- Sites are chosen for the Suns that are drawn there (`world.ground`). The Sun-facing samples of a site have Suns
   of one sector of azimuth, and all elevations.
 - The Sun-facing samples of a shard exchange positions, the Sun-averted ones whole views (`pipeline.resolve`): a
   view without any light goes to a sample whose faults need none.

@@ -612,19 +612,6 @@ def render_vehicle(scene: Scene, mesh: SpacecraftMesh) -> Vehicle:
 # --- stars --------------------------------------------------------------------------------------------------
 
 
-def with_stars(
-    scene: Scene,
-    radiance: Radiance,
-    camera: Camera,
-    J_from_C: F64,
-    open_sky: NDArray[np.bool_],
-    view: View | None = None,
-) -> Radiance:
-    """Return the radiance with the stars of `visible_stars` added; the parameters are the same."""
-    stars = visible_stars(scene, radiance, camera, J_from_C, open_sky, view)
-    return radiance if stars is None else stars.added_to(radiance)
-
-
 def visible_stars(
     scene: Scene,
     radiance: Radiance,
