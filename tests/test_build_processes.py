@@ -16,8 +16,8 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-import victim
 from synthetic import SAMPLES, Deadly, Session, make_spec, run
+from tools import victim
 
 from vbnfault import store as st
 from vbnfault.core.errors import VbnfaultError

@@ -38,7 +38,7 @@ _references: dict[tuple[int, int], str] = {}
 
 
 class Killed(BaseException):
-    """Stands for the end of the process; what cleans up behind it still runs. `tests.kills` kills in earnest."""
+    """Stands for the end of the process; what cleans up behind it still runs. `tools.kills` kills in earnest."""
 
 
 def spec_of(scene: int) -> store.StoreSpec:

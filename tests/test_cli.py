@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-import victim
 from conftest import small_scene
+from tools import victim
 
 from vbnfault import cli, pipeline, store
 from vbnfault.core.quantities import Sample

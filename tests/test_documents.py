@@ -30,7 +30,7 @@ def paths(text: str) -> set[str]:
     """Return every path that a Markdown text names, in code or as the target of a link."""
     words = {word for span in code_spans(text) for word in span.split()}
     found = {w for w in words if re.fullmatch(r"[\w.-]+(/[\w.-]*)+|[\w-]+\.(py|md|toml|cff|json|png)", w)}
-    modules = {m.replace(".", "/") + ".py" for m in re.findall(r"python -m (tests\.\w+)", text)}
+    modules = {m.replace(".", "/") + ".py" for m in re.findall(r"python -m (tests(?:\.\w+)+)", text)}
     linked = {link for link in re.findall(r"\]\(([^)]+)\)", text) if "://" not in link}
     return {path for path in found | modules | linked if "NAME" not in path} - _WRITTEN
 

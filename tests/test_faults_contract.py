@@ -354,7 +354,6 @@ def test_limits_of_straylight_are_those_of_scatter(model: str) -> None:
     fields = registry()["straylight"][model].__dataclass_fields__
     for key, physics in (
         ("roughness_nm", lambda value: scatter.Harvey.of_roughness(roughness_nm=value, index_step=0.5).b0),
-        ("cleanliness_level", particles.obscured_fraction),
         ("cleanliness_level", lambda value: particles.particle_scatter_fraction(value, 550.0)),
     ):
         low, high = fields[key].metadata["limits"]

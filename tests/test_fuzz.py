@@ -5,10 +5,9 @@ from __future__ import annotations
 import random
 from pathlib import Path
 
-import fuzz
-import fuzz_inputs
 import pytest
 import typer
+from tools import fuzz, fuzz_inputs
 
 from vbnfault import cli
 from vbnfault.core.errors import InputError

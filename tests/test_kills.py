@@ -13,7 +13,7 @@ def test_killed_commands_resume_to_one_digest() -> None:
     """Other ways take longer; test_build_dask, test_object_store, test_retake, test_shard_range have them."""
     ways = ["process", "merge", "bucket", "export"]
     options = ["--each", "1", "--steps", "1", "--samples", "8", "--ways", *ways]
-    command = [sys.executable, "-m", "tests.kills", *options]
+    command = [sys.executable, "-m", "tests.tools.kills", *options]
     done = subprocess.run(command, cwd=HERE.parent, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "one digest" in done.stdout

@@ -291,7 +291,7 @@ def test_faults_that_need_the_sun_go_to_views_that_face_it() -> None:
 
 
 class Killed(BaseException):
-    """Stands for the end of the process at a file operation; `tests.kills --rendering retake` kills in earnest."""
+    """Stands for the end of the process at a file operation; `tools.kills --rendering retake` kills in earnest."""
 
 
 def test_a_killed_retake_resumes_to_the_same_digest(

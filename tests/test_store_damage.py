@@ -12,11 +12,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import damage
 import numpy as np
 import pytest
 import zarr
-from damage import SAMPLES, mend, sample, spec
+from tools import damage
+from tools.damage import SAMPLES, mend, sample, spec
 
 from vbnfault import store as st
 from vbnfault.core.errors import InputError, VbnfaultError
@@ -43,7 +43,7 @@ def store(template: tuple[Path, str], tmp_path: Path) -> Path:
 
 
 def test_random_flips_are_found_and_mended_or_harmless(tmp_path: Path) -> None:
-    """2,000 of them: python tests/damage.py."""
+    """2,000 of them: python -m tests.tools.damage."""
     outcomes = damage.damage(12, 5, tmp_path)
     assert outcomes.total() == 12
     assert set(outcomes) <= {"found and mended", "harmless"}
@@ -206,7 +206,7 @@ def test_whatever_else_has_the_name_of_a_folder_makes_way(
 
 @pytest.mark.parametrize("command", damage.COMMANDS)
 def test_a_disk_that_fails_at_any_operation_loses_nothing(tmp_path: Path, command: Callable[[Path], None]) -> None:
-    """All operations: python tests/damage.py --operations."""
+    """All operations: python -m tests.tools.damage --operations."""
     count = damage.operations(command, tmp_path / "count")
     assert count > 40
     chosen = np.random.default_rng(3).choice(count, 4, replace=False).tolist()

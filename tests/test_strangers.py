@@ -1,7 +1,7 @@
 """Links in the place of what vbnfault makes, and stores that a stranger may have made.
 
 Nothing that a command removes or truncates is reached through a link, and no store makes a command write beside its
-output, take memory without end, or show a traceback. `python -m tests.fuzz --kinds stranger` tries many more.
+output, take memory without end, or show a traceback. `python -m tests.tools.fuzz --kinds stranger` tries many more.
 """
 
 from __future__ import annotations
@@ -21,15 +21,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import fuzz
-import fuzz_cases
-import fuzz_stores
 import numpy as np
 import pytest
 from synthetic import filled, make_spec
 from test_bad_stores import COMMANDS, said
 from test_cli import run
 from test_export import tree
+from tools import fuzz, fuzz_cases, fuzz_stores
 
 from vbnfault import store as st
 from vbnfault.core.errors import InputError, VbnfaultError
@@ -48,11 +46,6 @@ def home(tmp_path: Path) -> Path:
 
 
 # --- links ----------------------------------------------------------------------------------------------------
-
-
-def _migrate(sound: Path, here: Path) -> list[object]:
-    (here / ".m.zarr.migrate.partial").symlink_to(here / "home")
-    return ["migrate", sound, "--out", here / "m.zarr"]
 
 
 def _lock(sound: Path, here: Path) -> list[object]:
@@ -85,7 +78,6 @@ def _loop(sound: Path, here: Path) -> list[object]:
 @pytest.mark.parametrize(
     ("make", "code", "sentence"),
     [
-        (_migrate, 0, ""),
         (_lock, 2, ".m.zarr.lock: has the name of a lock, but is a link or a pipe; remove it"),
         (_lock_of_an_export, 2, ".e.lock: has the name of a lock, but is a link or a pipe; remove it"),
         (_lock_that_is_a_pipe, 2, ".m.zarr.lock: has the name of a lock, but is a link or a pipe; remove it"),

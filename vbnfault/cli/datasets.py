@@ -203,23 +203,17 @@ def migrate(
     store: StoreArgument,
     out: Annotated[
         str | None,
-        typer.Option(help="Path of a copy, which takes fewer bytes; without it the store itself is changed."),
+        typer.Option(help="Path or URL of a copy, which takes fewer bytes; without it the store stays as it is."),
     ] = None,
 ) -> None:
-    """Bring a store of an earlier format to that of this vbnfault; values and digest stay the same."""
+    """Bring a store to the format of this vbnfault, and a copy to its codecs; values and digest stay the same."""
     from .. import store as stores
-    from ..dataset.migration import migrate_store
+    from ..dataset import migrate_store
 
-    opened = stores.open_store(store)
-    before, length = opened.spec.format_version, 0
-    if out is not None:
-        stores.check_target(opened, out)
-        length = opened.samples
-    with progress_bar(length, "samples") as bar:
-        migrated = migrate_store(store, out, progress=bar.update)
+    migrated = migrate_store(store, out)
     finished = migrated.finished()
     samples = f"{migrated.samples} samples" + ("" if finished == migrated.samples else f", {finished} finished")
-    typer.echo(f"{migrated.path}: {samples}, format {migrated.spec.format_version}, was {before}")
+    typer.echo(f"{migrated.path}: {samples}, format {stores.FORMAT_VERSION}")
 
 
 @app.command(rich_help_panel=_PANEL)

@@ -17,8 +17,7 @@ if TYPE_CHECKING:
     from .checking import missing_plugins, verify
     from .from_scene import SessionFactory, build_scene, describe_scene
     from .identity import is_exact, planned, scene_identity, store_spec
-    from .merge import merge_stores
-    from .migration import migrate_store
+    from .merge import merge_stores, migrate_store
 
 __all__ = [
     "BuildOptions",
@@ -43,7 +42,7 @@ _HOMES = {
     "describe_scene": "from_scene",
     "is_exact": "identity",
     "merge_stores": "merge",
-    "migrate_store": "migration",
+    "migrate_store": "merge",
     "missing_plugins": "checking",
     "planned": "identity",
     "scene_identity": "identity",

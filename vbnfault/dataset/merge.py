@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -85,12 +85,29 @@ def merge_stores(
     return summary
 
 
+def migrate_store(
+    path: str | os.PathLike[str] | Url, out: str | os.PathLike[str] | Url | None = None, *, progress: bool = True
+) -> Store:
+    """Copy a store to `out` with the codecs of new stores, which take fewer bytes, and open the copy.
+
+    Values and digest stay the same; unfinished samples stay unfinished. Without `out`, the store itself is opened:
+    every format that this vbnfault reads is the current one. For the errors see `join_stores`.
+    """
+    source = store_module.open_store(path)
+    if out is None:
+        return source
+    summary = join_stores([source.path], out, progress=progress, codecs={})
+    card.write_card(summary.path)
+    return store_module.open_store(summary.path)
+
+
 def join_stores(
     stores: Sequence[str | os.PathLike[str] | Url],
     out: str | os.PathLike[str] | Url,
     *,
     move: bool = False,
     progress: bool = True,
+    codecs: Mapping[str, str] | None = None,
 ) -> MergeSummary:
     """Join stores of one dataset, made with `shard_range` or stopped early, into the store at `out`.
 
@@ -105,6 +122,9 @@ def join_stores(
         Remove each shard from its store once `out` holds it. On one file system no byte is copied then.
     progress
         Whether to show the progress on standard error.
+    codecs
+        Codecs of the layers in a new store; by default those of the first of `stores`. Chunks of other codecs are
+        compressed again.
 
     Raises
     ------
@@ -127,7 +147,7 @@ def join_stores(
     with interruptible(lambda: sentence), contextlib.ExitStack() as stack:
         for path in (target, *(source.path for source in sources if move)):
             stack.enter_context(locked(path))
-        merge = _Merge(sources, target, move=move)
+        merge = _Merge(sources, target, move=move, codecs=codecs)
         with Progress(merge.store.samples, shown=progress) as bar:
             summary = merge.run(bar)
     return summary
@@ -150,21 +170,26 @@ class _Counts:
 
 
 class _Merge:
-    """Join stores; the constructor compares them and prepares the store that gets their samples."""
+    """Join stores; the constructor compares them and prepares the store that gets their samples.
 
-    def __init__(self, sources: Sequence[Store], target: Location, *, move: bool) -> None:
+    `codecs` are those of a new store, by default the ones of the first source.
+    """
+
+    def __init__(
+        self, sources: Sequence[Store], target: Location, *, move: bool, codecs: Mapping[str, str] | None = None
+    ) -> None:
         exists = store_module.is_store(target)
         known = [*([store_module.open_store(target)] if exists else []), *sources]
         for other in known[1:]:
             check_same_dataset(other, known[0])
-            _check_same_codecs(other, known[0])
         _check_equal_samples(known)
         self.sources, self._move = sources, move
         if not exists:
             first = sources[0].spec
             attributes = {k: v for k, v in first.attributes.items() if k != versions.VERSIONS_OF_SAMPLES}
-            kept = {"attributes": attributes, "format_version": first.format_version}
-            spec = StoreSpec(**{**first.plain(), **kept})
+            spec = StoreSpec(
+                **{**first.plain(), **({} if codecs is None else {"codecs": codecs})}, attributes=attributes
+            )
             store_module.create(target, spec, sources[0].samples)
         self.store = self._with_versions(store_module.recover(target))
         self._digests = SampleDigests(self.store.samples)
@@ -236,7 +261,8 @@ class _Merge:
             new = {i: digest for i, digest in checked.digests.items() if i not in digests}
             if not new:
                 continue
-            if not digests and new.keys() == finished:
+            same = source.spec.codecs == self.store.spec.codecs
+            if same and not digests and new.keys() == finished:
                 self.store.copy_shard(number, source, finished, link=self._move)
             else:
                 self._add(number, source, new, digests)
@@ -251,19 +277,10 @@ class _Merge:
     def _add(self, number: int, source: Store, new: Collection[int], held: Collection[int]) -> None:
         """Add some samples of a source to a shard of which the store holds others."""
         try:
-            encoded = source.encoded(number, new)
+            encoded = source.encoded(number, new, self.store.spec.codecs)
         except (OSError, ValueError) as error:
             raise VbnfaultError(f"{source.path}: shard {number} changed while it was read ({error})") from error
         self.store.write_shard(number, encoded, damaged=set(self.store.shard(number)).difference(held, new))
-
-
-def _check_same_codecs(store: Store, other: Store) -> None:
-    """Raise InputError if chunks of one store cannot be copied into the other."""
-    if (store.spec.format_version, store.spec.codecs) != (other.spec.format_version, other.spec.codecs):
-        raise InputError(
-            f"{store.path}: has another format or other codecs than {other.path}; make a copy of each with "
-            "vbnfault migrate STORE --out NEW, and merge the copies"
-        )
 
 
 def _check_equal_samples(stores: Sequence[Store]) -> None:

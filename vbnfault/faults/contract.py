@@ -25,7 +25,7 @@ from ..core.quantities import RGBI, Charge, Electrons, Offset, Quantity, RawMosa
 from ..core.registry import DeclarationError
 from ..detector.effects import STEPS as MOSAIC_STEPS
 from ..lens import Prescription, load_lens
-from ..lens.footprint import DEFAULT_LENS, ImageFrame
+from ..lens.image_frame import DEFAULT_LENS, ImageFrame
 from .context import FaultContext, Params
 from .fields import Interval, Severity, parse_field, path
 from .models import register
@@ -180,6 +180,17 @@ class Fault:
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
         """Return the drawn parameters: plain, JSON-able data, sufficient to inject the same fault again."""
         return {}
+
+    def draw_state(self, context: FaultContext, rng: np.random.Generator) -> Params:
+        """Return the parameters of `draw` on which the image depends; the others only describe the fault."""
+        return self.draw(context, rng)
+
+    def added_light(self, params: Params, context: FaultContext, once: Any, *, spikes: Any = None) -> Any:
+        """Return what the fault adds by its parts, for studies (`straylight_lens.AddedLight`); None: unknown.
+
+        `once` remembers results by function and arguments (`lens.straylight.total.Once`).
+        """
+        return None
 
     def alter(self, camera: Camera, params: Params) -> Camera:
         """Return the camera with this fault, if the fault changes a parameter of the instrument."""

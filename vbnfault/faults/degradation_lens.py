@@ -39,7 +39,7 @@ from ..core import buffers, spectra
 from ..core.spectra import Bands
 from ..lens import Prescription
 from ..lens.coating import mean_reflectance
-from ..lens.footprint import ImageFrame
+from ..lens.image_frame import ImageFrame
 from ..lens.straylight.scatter import Harvey
 from .context import FaultContext, Params
 from .contract import LensFault

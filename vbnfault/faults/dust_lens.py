@@ -41,8 +41,9 @@ from scipy.special import j1
 
 from ..lens import RealLens, load_lens
 from ..lens.coating import reflect_transmit
-from ..lens.footprint import Footprint, ImageFrame
+from ..lens.footprint import Footprint
 from ..lens.glass import D_NM
+from ..lens.image_frame import ImageFrame
 from ..lens.rays import forward
 from ..lens.straylight.paraxial import along
 from ..lens.straylight.particles import DUST_INDEX
@@ -173,7 +174,7 @@ class DefocusedDust(LensFault):
 def _footprint(frame: ImageFrame, name: str, row: int, height_mm: float) -> Footprint:
     """Return the footprints on a surface of the lens, or `height_mm` above the sensor if that is not 0."""
     beams = frame.beams(name)
-    return beams.above_sensor(height_mm) if height_mm else beams.on_row(row)
+    return Footprint.above_sensor(beams, height_mm) if height_mm else Footprint.on_row(beams, row)
 
 
 class _Grains(NamedTuple):

@@ -29,7 +29,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..lens.footprint import Beams, ImageFrame
+from ..lens.beams import Beams
+from ..lens.image_frame import ImageFrame
 from .context import FaultContext, Params
 from .contract import LensFault
 from .fields import Interval, Severity, bounds, number

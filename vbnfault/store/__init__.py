@@ -3,8 +3,8 @@
 Only this package imports zarr and obstore. A sample has layers (arrays with one value or vector for each pixel) and
 scalars (everything else). These rules protect a store against kills, power loss and bad disks:
 
-- This package encodes the chunk files itself. zarr would drop a chunk of zeros, and a missing chunk reads as zeros
-  too; zarr would also compress the neighbours of a rebuilt sample again. Reads go through zarr, as a user's do.
+- This package reads and encodes the chunk files itself. zarr would drop a chunk of zeros, and a missing chunk reads
+  as zeros too; zarr would also compress the neighbours of a rebuilt sample again.
 - `files` says where a store is: in a folder (`disk`) or in an object store (`bucket`). On a disk, a file is written
   under a temporary name in the same folder, flushed to the device, and renamed. So each file is either the old or
   the new one, also after a loss of power. `create` makes the whole group this way. A
@@ -38,14 +38,12 @@ from .check import (
 from .codec import Encoded, SharedChunks, encode, mask_union
 from .counts import FaultCounts
 from .files import Location, files_of, located
-from .formats import FORMAT_VERSION
 from .group import MOST_DOCUMENT_BYTES, check_free, create, is_store, open_store, write_samples
 from .labelled import open_dataset
 from .layout import drawn_table, is_sealed, sealed
 from .metadata import append_samples, recover
-from .migration import check_target, migrate, migrate_copy
 from .opened import Store
-from .schema import SPLITS, STRATA, VOLATILE_ATTRIBUTES, StoreSpec
+from .schema import FORMAT_VERSION, SPLITS, STRATA, VOLATILE_ATTRIBUTES, StoreSpec
 from .shards import FetchedSample, ShardReader
 
 __all__ = [
@@ -80,7 +78,6 @@ __all__ = [
     "append_samples",
     "check_free",
     "check_shard",
-    "check_target",
     "count_faults",
     "create",
     "digest",
@@ -93,8 +90,6 @@ __all__ = [
     "is_store",
     "located",
     "mask_union",
-    "migrate",
-    "migrate_copy",
     "open_dataset",
     "open_store",
     "problem_samples",

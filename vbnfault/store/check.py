@@ -23,12 +23,11 @@ from .bucket import Url
 from .codec import DIGEST_BYTES, crc_of_scalars, mask_union, sample_digest, threads
 from .compressors import compressor
 from .counts import FaultCounts
-from .formats import DIGEST_VERSION
 from .group import open_store
 from .layout import drawn_table
 from .metadata import metadata_problems, short
 from .opened import Store
-from .schema import MAX_HELD_BYTES, VOLATILE_ATTRIBUTES, StoreSpec
+from .schema import DIGEST_VERSION, MAX_HELD_BYTES, VOLATILE_ATTRIBUTES, StoreSpec
 
 
 class Problem(NamedTuple):

@@ -16,7 +16,6 @@ from ..core.whole_files import kind_of
 from .bucket import Url
 from .codec import Encoded, encode
 from .files import Files, Location, files_of, located
-from .formats import FIRST_PROGRAM, FORMAT_VERSION, READ_VERSIONS
 from .layout import (
     CHECKSUM,
     DOCUMENT,
@@ -32,7 +31,7 @@ from .layout import (
     to_bytes,
 )
 from .opened import Store
-from .schema import StoreSpec
+from .schema import FORMAT_VERSION, StoreSpec
 
 # --- create, open, write ----------------------------------------------------------------------------------
 
@@ -204,11 +203,11 @@ def _check_format(path: Location, version: Any) -> None:
         raise InputError(
             f"{path}: format_version = {version}: this vbnfault reads up to {FORMAT_VERSION}; install a newer one"
         )
-    if version not in READ_VERSIONS:
+    if version < FORMAT_VERSION:
         raise InputError(
-            f"{path}: format_version = {version}, of vbnfault {FIRST_PROGRAM}: an earlier vbnfault made it, and "
-            f"this one reads {READ_VERSIONS[0]} and {FORMAT_VERSION}; open it with xarray, complete it with "
-            f"vbnfault {FIRST_PROGRAM}, or build it again with another --out or --overwrite"
+            f"{path}: format_version = {version}: an earlier vbnfault made it, and this one reads "
+            f"{FORMAT_VERSION}; open it with xarray, complete it with vbnfault 0.1, or build it again with another "
+            "--out or --overwrite"
         )
 
 

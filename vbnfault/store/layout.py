@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from .arrays import Member
 from .attributes import check_names, number_of_samples
 from .compressors import ZSTD, compressor
-from .schema import StoreSpec
+from .schema import FORMAT_VERSION, StoreSpec
 
 DOCUMENT = "zarr.json"
 SPARE = "spare"
@@ -64,7 +64,7 @@ def root_attributes(spec: StoreSpec, samples: int) -> dict[str, Any]:
         {
             **json.loads(json.dumps(spec.attributes)),
             "format": "vbnfault",
-            "format_version": spec.format_version,
+            "format_version": FORMAT_VERSION,
             "store": json.loads(json.dumps(spec.plain())),
             "samples": samples,
             "coordinates": spec.extra_coordinates,

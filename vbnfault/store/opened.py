@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Collection, Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,7 @@ from .codec import (
     index_size,
     join_shard,
     split_shard,
+    threads,
 )
 from .compressors import compressor, most_compressed
 from .files import Files
@@ -396,13 +398,13 @@ class Store:
             self.files.remove([self.file_name("done", number)])
             self.files.remove([self.file_name(name, number) for name in self.spec.arrays])
 
-    def encoded(self, number: int, samples: Collection[int]) -> dict[int, Encoded]:
-        """Return some samples of a shard as they are stored, for `write_shard` of another store; no digest is set.
+    def encoded(self, number: int, samples: Collection[int], codecs: Mapping[str, str]) -> dict[int, Encoded]:
+        """Return some samples of a shard for `write_shard` of another store with these codecs; no digest is set.
 
         Raises OSError or ValueError if their files are damaged.
         """
         first = self.shard(number).start
-        chunks = {name: self.chunk(name, number) for name in self.spec.pixel_layers}
+        chunks = {name: self._recoded(name, number, samples, codecs[name]) for name in self.spec.pixel_layers}
         columns = {name: self.column(name, number) for name in (*SCALARS, "crc32c")}
         return {
             i: Encoded(
@@ -414,6 +416,18 @@ class Store:
             )
             for i in samples
         }
+
+    def _recoded(self, name: str, number: int, samples: Collection[int], codec: str) -> dict[int, bytes]:
+        """Return the chunks of a layer of samples, compressed again if the codec is another one."""
+        chunks, own = self.chunk(name, number, samples), self.spec.codecs[name]
+        if codec == own or self.spec.empty(name):
+            return chunks
+        size = self.spec.layer_bytes(name)
+        with ThreadPoolExecutor(threads()) as pool:
+            recoded = pool.map(
+                lambda chunk: compressor(codec).encode(compressor(own).decode(chunk, size)), chunks.values()
+            )
+            return dict(zip(chunks, recoded, strict=True))
 
     def _finished(self, number: int, *, strict: bool) -> set[int]:
         """Return the samples of a shard that are marked as finished in `done`.

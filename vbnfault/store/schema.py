@@ -33,8 +33,11 @@ from .arrays import (
 )
 from .attributes import check_plain_spec
 from .compressors import ZSTD, fitting
-from .formats import FORMAT_VERSION, in_format_2
 
+# Number of the format of stores. Version 0.1 of vbnfault wrote format 1, and every version since writes format 3.
+# Digests count formats from DIGEST_VERSION on as one, because their values are the same.
+FORMAT_VERSION = 3
+DIGEST_VERSION = 2
 # Root attributes that say when or how a store was written. The digest leaves them out.
 VOLATILE_ATTRIBUTES = ("created", "modified", "command")
 
@@ -137,8 +140,6 @@ class StoreSpec:
         limits.
     codecs
         Names of the codecs of the layers, by layer; those of `Array.codec` by default.
-    format_version
-        2 or 3, the format of the metadata.
     attributes
         JSON-able root attributes.
 
@@ -171,7 +172,6 @@ class StoreSpec:
     rendered_shape: tuple[int, ...] = ()
     shard_samples: int = 0
     codecs: Mapping[str, str] = field(default_factory=dict)
-    format_version: int = FORMAT_VERSION
     attributes: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -197,8 +197,6 @@ class StoreSpec:
         size = next(n for n in range(min(wished, most), 0, -1) if wished % n == 0)
         object.__setattr__(self, "shard_samples", size)
         codecs = {name: self.codecs.get(name, row.codec) for name, row in self.pixel_layers.items()}
-        if self.format_version == 2:
-            codecs = dict.fromkeys(codecs, ZSTD)
         codecs = {name: fitting(codec, self.layer_bytes(name)) for name, codec in codecs.items()}
         object.__setattr__(self, "codecs", codecs)
 
@@ -314,8 +312,7 @@ class StoreSpec:
                 attributes={**attributes, **extra.get(name, {})},
                 codec=self.codecs.get(name, ZSTD),
             )
-        members |= self.coordinates(samples)
-        return in_format_2(members) if self.format_version == 2 else members
+        return members | self.coordinates(samples)
 
     def coordinates(self, samples: int) -> dict[str, Member]:
         """Return the required layout by name of every coordinate of a store of `samples` samples."""
@@ -366,8 +363,7 @@ class StoreSpec:
     def plain(self) -> dict[str, Any]:
         """Return the fields as plain data, without the root attributes; `spec_from_plain` reads them back."""
         # asdict would copy the whole scene first
-        kept_in_the_root = ("attributes", "format_version")
-        plain = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in kept_in_the_root}
+        plain = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "attributes"}
         if not self.sample_names:
             del plain["sample_names"]  # stores without names stay as they were
         if not self.rendered_shape:
@@ -376,8 +372,6 @@ class StoreSpec:
             del plain["mask_any_joint"]
         if self.distortion_valid_to_deg is None:
             del plain["distortion_valid_to_deg"]
-        if self.format_version == 2:
-            del plain["codecs"]
         return plain
 
     @property
@@ -388,8 +382,7 @@ class StoreSpec:
     @property
     def extra_coordinates(self) -> str:
         """Return the root attribute by which xarray shows arrays as coordinates that are no axis."""
-        names = {"wavelength_nm": True, "row": self.format_version > 2, "name": bool(self.sample_names)}
-        return " ".join(name for name, shown in names.items() if shown)
+        return "wavelength_nm row name" if self.sample_names else "wavelength_nm row"
 
 
 def spec_from_plain(plain: Mapping[str, Any], attributes: Mapping[str, Any]) -> StoreSpec:
@@ -397,5 +390,4 @@ def spec_from_plain(plain: Mapping[str, Any], attributes: Mapping[str, Any]) -> 
     check_plain_spec(plain, StoreSpec)
     known = {f.name for f in fields(StoreSpec)}
     values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in plain.items() if k in known}
-    version = attributes.get("format_version", FORMAT_VERSION)
-    return StoreSpec(**{**values, "attributes": attributes, "format_version": version})
+    return StoreSpec(**{**values, "attributes": attributes})

@@ -31,12 +31,19 @@ from ..core import spectra
 from ..core.errors import InputError, in_file, shown
 from ..core.spectra import Bands
 from ..core.tables import did_you_mean
-from ..faults import Fault, FaultContext, Params, act
+from ..faults import Fault, FaultContext, act
 from ..lens.changes import changed
 from ..lens.straylight.irradiance import flare_model
-from ..lens.straylight.pyramid import scaled
+from ..lens.straylight.scatter import GlareLayout
 from ..lens.straylight.settings import GhostSettings, SensorGrid
-from ..lens.straylight.total import SunlightInLens, veil_per_px
+from ..lens.straylight.total import (
+    COARSE_SPIKES,
+    GhostSource,
+    SpreadLight,
+    SunInLens,
+    ghosts,
+    veil_per_px,
+)
 from ..pipeline.exposure import meter
 from ..pipeline.injection import inject_faults
 from ..pipeline.rendering import render_view
@@ -234,7 +241,7 @@ class SceneEvaluator:
             if not self._adding:
                 raise InputError(
                     f"metrics.names: {shown(name)} needs a fault that adds light, which the scene "
-                    f" {shown(self.spec.scene.base)} has not"
+                    f"{shown(self.spec.scene.base)} has not"
                 )
 
     # --- stages ---------------------------------------------------------------------------------------------------
@@ -306,13 +313,10 @@ class SceneEvaluator:
         """Return the expected light of an evaluation."""
         exposed = self._exposed(evaluation, setting)
         fault = exposed.spec.faults[self._adding]
-        sunlight = getattr(fault, "sunlight", None)
-        rng = exposed.spec.rng("fault", f"{self._adding}/0")
-        if sunlight is None:
-            with self.kept.timed("texture"):
-                light = _added_by(fault, exposed, fault.draw(exposed.context, rng))
-        else:
-            light = self._traced(fault, fault.draw_state(rng), exposed)  # type: ignore[attr-defined]
+        params = fault.draw_state(exposed.context, exposed.spec.rng("fault", f"{self._adding}/0"))
+        added = fault.added_light(params, exposed.context, self._once, spikes=COARSE_SPIKES)
+        with self.kept.timed("light"):
+            light = _added_by(fault, exposed, params) if added is None else self._by_parts(added, exposed)
         camera = exposed.camera
         detector = camera.detector
         return LitImage(
@@ -326,90 +330,38 @@ class SceneEvaluator:
             **light,
         )
 
-    def _traced(self, fault: Any, params: Params, exposed: Exposed) -> dict[str, Any]:
-        """Return the fields of `LitImage` that hold the straylight of a lens; `fault` is a model that traces it."""
-        source = fault.sunlight(params, exposed.context)
-        with self.kept.timed("light"):
-            scene = fault.scene_light(params, exposed.context)
-            of_scene = None if scene is None else np.ascontiguousarray(scene.transpose(2, 0, 1))
-        if source is None:
-            if of_scene is None:
-                unchanged = {"kept": exposed.clean, "added": np.zeros_like(exposed.clean)}
-                return {**unchanged, "direct": exposed.direct_e, "parts_e": {}, "ghosts_e": ()}
-            remaining = 1 - fault.scene_lost(params, exposed.context).astype(np.float32)[:, None, None]
-            direct = None if exposed.direct_e is None else exposed.direct_e * remaining
-            kept_e = exposed.clean * remaining
-            return {"kept": kept_e, "direct": direct, "added": of_scene, "parts_e": {}, "ghosts_e": ()}
-        light: SunlightInLens = source.light
-        camera, pitch_mm = exposed.camera, light.sensor.pitch_mm
-        per_s = source.rates
-        once = self.kept.once
-        # over the Sun's irradiance
-        levels = once("ghosts", light.ghost_key, light.ghost_levels)
-        burst = once("starburst", light.starburst_key, light.starburst_layers)
-        samples = once("glare", light.glare_samples_key, light.glare_samples, "samples")
-        table, glare_beyond, kept = once("glare", light.glare_key, light.glare_light)
-        # in electrons per second
-        burst_gain = light.starburst_gain(burst.flux_mm2 + burst.beyond_mm2)
-        glare_gain = light.glare_gain(kept)
-        glare_key = light.glare_key, light.glare_samples_key
-        with self.kept.timed("light"):
-            parts = {
-                "ghosts": self._channels(
-                    "ghosts", lambda w: scaled(levels.irradiance, w), light.ghost_key, per_s * light.past_baffle
-                ),
-                "starburst": self._channels("starburst", burst.planes, light.starburst_key, per_s * burst_gain),
-                "glare": self._channels(
-                    "glare", lambda w: samples.planes(table * w[:, None]), glare_key, per_s * glare_gain
-                ),
-            }
-            entering, veil_plane = light.veil_light()
-            taken = (burst.flux_mm2 + burst.beyond_mm2) * burst_gain + entering
-            taken = taken + (samples.flux_mm2(table) + glare_beyond) * glare_gain
-            direct_left = light.direct_fraction(levels.flux_mm2 * light.past_baffle, taken)
-            seconds = np.float32(camera.exposure_s)
-            added = parts["ghosts"][0] + parts["starburst"][0]
-            added += parts["glare"][0]
-            added *= seconds
-            lost = source.scene_lost
-            scene_e = exposed.scene_e
-            if of_scene is None:  # what the lens scatters of the scene returns as a veil, distributed as the Sun's
-                veil = veil_per_px(camera_shape(camera), camera.focal_length_px)
-                flux = scene_e.sum(axis=(1, 2), dtype=np.float64) * lost
-                of_scene = veil * flux.astype(np.float32)[:, None, None]
-            sun_veil = (per_s * entering * camera.exposure_s).astype(np.float32)
-            for channel, plane in enumerate(added):
-                plane += veil_plane * sun_veil[channel]
-                plane += of_scene[channel]
-            left, direct = scene_e * (1 - lost).astype(np.float32)[:, None, None], None
-            if exposed.direct_e is not None:
-                direct = exposed.direct_e * direct_left.astype(np.float32)[:, None, None]
-                left += direct
-            ghosts = parts["ghosts"][0].mean(axis=0) * seconds
-            reference = self._traced_ghosts(light, per_s * light.past_baffle)
-            reference = None if reference is None else reference.mean(axis=0) * seconds
-        ghosts_e = self._single_ghosts(light, per_s * light.past_baffle * camera.exposure_s / pitch_mm**2)
-        totals = {name: float(total.mean() * camera.exposure_s) for name, (_, total) in parts.items()}
-        spatial = {"direct": direct, "ghosts": ghosts, "traced_ghosts": reference}
-        return {"kept": left, "added": added, "parts_e": totals, "ghosts_e": ghosts_e, **spatial}
+    def _once(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Return `function(*arguments)`, which is a stage of its own, from its last results where they hold it."""
+        stage, part = _STAGES.get(function, (function.__name__, ""))
+        return self.kept.once(stage, arguments, partial(function, *arguments), part)
 
-    def _traced_ghosts(self, light: SunlightInLens, weights: F64) -> F32 | None:
-        """Return the ghosts of exact rays, float32[channel, y, x] per second; None where no metric compares."""
-        if "ghost_difference" not in self.spec.metrics.names:
-            return None
-        ghosts = replace(light.settings.ghosts, model="traced")
-        traced = replace(light, settings=replace(light.settings, ghosts=ghosts))
-        levels = self.kept.once("ghosts", traced.ghost_key, traced.ghost_levels)
-        return self._channels("ghosts", lambda w: scaled(levels.irradiance, w), traced.ghost_key, weights)[0]
-
-    def _channels(self, name: str, mixed: Callable[[F64], F32], key: Hashable, weights: F64) -> tuple[F32, F64]:
-        """Return a part of straylight in electrons per second, float32[channel, y, x], and its sums by channel."""
-
-        def make() -> tuple[F32, F64]:
-            image = mixed(weights)
-            return image, image.sum(axis=(1, 2), dtype=np.float64)
-
-        return self.kept.once("light", (key, weights.tobytes()), make, name)
+    def _by_parts(self, light: Any, exposed: Exposed) -> dict[str, Any]:
+        """Return the fields of `LitImage` that hold straylight with parts (`Fault.added_light`)."""
+        seconds = np.float32(exposed.camera.exposure_s)
+        left = exposed.scene_e * (1 - light.scene_lost).astype(np.float32)[:, None, None]
+        direct = None
+        if exposed.direct_e is not None:
+            direct = exposed.direct_e * light.direct_left.astype(np.float32)[:, None, None]
+            left += direct
+        added = np.ascontiguousarray(np.moveaxis(light.added, -1, 0))
+        if not light.scene_added:  # what the lens scatters of the scene returns as a veil
+            veil = veil_per_px(camera_shape(exposed.camera), exposed.camera.focal_length_px)
+            flux = exposed.scene_e.sum(axis=(1, 2), dtype=np.float64) * light.scene_lost
+            added = added + veil * flux.astype(np.float32)[:, None, None]
+        fields = {"kept": left, "direct": direct, "added": added, "parts_e": {}, "ghosts_e": ()}
+        if light.of_sun is None:
+            return fields
+        source, sun = light.source, light.of_sun
+        per_mm2 = float(seconds) / source.sensor.pitch_mm**2
+        rates = sun.rates * sun.ghost_gain
+        fields["parts_e"] = {name: float(flux.mean() * per_mm2) for name, flux in sun.flux_mm2.items()}
+        fields["ghosts_e"] = self._single_ghosts(source, rates * per_mm2)
+        fields["ghosts"] = _mean_of_channels(sun.ghosts, rates * seconds)
+        if "ghost_difference" in self.spec.metrics.names:
+            settings = replace(source.settings, ghosts=replace(source.settings.ghosts, model="traced"))
+            traced = self._once(ghosts, replace(source, settings=settings).of_ghosts)
+            fields["traced_ghosts"] = _mean_of_channels(traced, rates * seconds)
+        return fields
 
     # --- single ghosts --------------------------------------------------------------------------------------------
 
@@ -437,17 +389,13 @@ class SceneEvaluator:
             )
         return self._ghost_pairs[rank - 1]
 
-    def _single_ghosts(self, light: SunlightInLens, e_per_mm2: F64) -> tuple[float, ...]:
+    def _single_ghosts(self, light: SunInLens, e_per_mm2: F64) -> tuple[float, ...]:
         """Return the flux of the ghosts that the study follows, in electrons."""
         ranks = [rank for name in self.spec.metrics.names if (rank := image_metrics.ghost_rank(name)) is not None]
         if not ranks:
             return ()
         pairs = tuple(self._ghost_pair(rank) for rank in range(1, max(ranks) + 1))
-
-        def make() -> dict[tuple[int, ...], F64]:
-            return light.ghost_model().flux_mm2(light.sun.angle_deg, light.sun.azimuth_deg, pairs)
-
-        flux = self.kept.once("ghosts", light.ghost_key, make, "single")
+        flux = self._once(_flux_mm2, light.of_ghosts, pairs)
         return tuple(float((e_per_mm2 * flux[pair]).mean()) for pair in pairs)
 
     # --- frames for navigation ------------------------------------------------------------------------------------
@@ -545,6 +493,23 @@ def _value(factor: Any, point: float) -> float | str:
     """Return the value of a factor at a point of the unit interval."""
     value = np.asarray(factor.values(np.array([point])), dtype=object).tolist()[0]
     return value if isinstance(value, str) else float(value)
+
+
+def _flux_mm2(source: GhostSource, paths: tuple[tuple[int, ...], ...]) -> dict[tuple[int, ...], F64]:
+    """Return the flux of the ghosts of some paths on the unbounded sensor plane, float64[band] each."""
+    return source.model.flux_mm2(*source.sun, paths)
+
+
+# Stage and part of the functions that are not stages of their own.
+_STAGES: Mapping[Callable[..., Any], tuple[str, str]] = {
+    _flux_mm2: ("ghosts", "single"),
+    GlareLayout: ("glare", "layout"),
+}
+
+
+def _mean_of_channels(light: SpreadLight, rates: F64) -> F32:
+    """Return light times a rate for each channel, the mean of all, float32[y, x]."""
+    return np.asarray((light.planes * rates.astype(np.float32)[:, None, None]).mean(axis=0))
 
 
 def _added_by(fault: Fault, exposed: Exposed, params: Any) -> dict[str, Any]:

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -43,39 +42,10 @@ class Canvas:
         return np.concatenate([[0], np.cumsum(self.sizes.prod(axis=1) * self.bands)])
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Pyramid:
-    """Hold the irradiance of all ghosts in levels, float32[band, y, x] each, from the finest to the coarsest."""
-
-    canvas: Canvas
-    levels: tuple[F32, ...]
-
-    @cached_property
-    def flux_mm2(self) -> F64:
-        """Return the flux in the frame, float64[band]; coarse levels end at whole pixels of their own."""
-        flux = np.zeros(self.canvas.bands)
-        for k, level in enumerate(self.levels):
-            inside = level[:, MARGIN : level.shape[1] - MARGIN, MARGIN : level.shape[2] - MARGIN]
-            flux += inside.sum(axis=(1, 2), dtype=np.float64) * 4**k
-        return np.asarray(flux * self.canvas.pitch_mm**2)
-
-    @property
-    def irradiance(self) -> F32:
-        """Return the sum of all levels, float32[band, y, x]."""
-        return summed(self.canvas, self.levels)
-
-
-def summed(canvas: Canvas, levels: Sequence[NDArray[Any]], unit: float | None = None) -> F32:
+def summed(canvas: Canvas, levels: Sequence[NDArray[np.int64]], unit: float) -> F32:
     """Return the sum of levels of resolution, each resized to the frame, float32[layer, y, x].
 
-    Parameters
-    ----------
-    canvas
-        The frame.
-    levels
-        float32[layer, y, x] of each level, or int64 in units of `unit`.
-    unit
-        Value of an integer of 1.
+    `levels` are int64[layer, y, x] each; `unit` is the value of an integer of 1.
     """
     out = buffers.empty((len(levels[0]), *canvas.shape))
 
@@ -86,7 +56,7 @@ def summed(canvas: Canvas, levels: Sequence[NDArray[Any]], unit: float | None = 
             height, width = (int(v) for v in canvas.sizes[level])
             here = buffers.empty((height, width))
             # layer by layer, because a copy of all levels takes 45 MB for 1024 pixels
-            np.multiply(levels[level][layer], 1 if unit is None else unit, out=here, dtype=np.float32)
+            np.multiply(levels[level][layer], unit, out=here, dtype=np.float32)
             if below is not None:
                 # folds end in steps, which pixel centres sample unevenly
                 calm = cv2.GaussianBlur(below, (3, 3), _CALM_SIGMA)

@@ -1,4 +1,4 @@
-"""Run the program on many malformed inputs: `python -m tests.fuzz --count 5000 --seed 7`.
+"""Run the program on many malformed inputs: `python -m tests.tools.fuzz --count 5000 --seed 7`.
 
 Each case damages a valid input: a scene, study, lens or sensor file, a mesh of any format, a spacecraft, a texture,
 a SPICE kernel or DSK, options and environment variables, or a store; or it makes the store of a stranger. The
@@ -34,11 +34,11 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parent))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-import fuzz_stores
-from fuzz_cases import CASES, dry, whole_scene
-from fuzz_inputs import ROOT, Seeds, toml
+from tools import fuzz_stores
+from tools.fuzz_cases import CASES, dry, whole_scene
+from tools.fuzz_inputs import ROOT, Seeds, toml
 
 CPU_S = 20
 MEMORY_BYTES = 2 << 30
@@ -185,7 +185,7 @@ class Process:
             "OPENBLAS_NUM_THREADS": "1",
         }
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "tests.fuzz", "--worker", str(folder), "--seed", seed, "--kinds", *CASES],
+            [sys.executable, "-m", "tests.tools.fuzz", "--worker", str(folder), "--seed", seed, "--kinds", *CASES],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
@@ -285,7 +285,7 @@ def report(result: dict[str, Any], seed: str) -> None:
         if result.get(key):
             print(f"  {key}: {result[key]}")
     kinds = f" --kinds {' '.join(CASES)}" if len(CASES) < KINDS else ""
-    print(f"  repeat: python -m tests.fuzz --seed {seed} --only {result['number']}{kinds}", flush=True)
+    print(f"  repeat: python -m tests.tools.fuzz --seed {seed} --only {result['number']}{kinds}", flush=True)
 
 
 def source_hash() -> str:
@@ -298,7 +298,7 @@ def source_hash() -> str:
 
 def main() -> None:
     """Run all cases or one; the exit code is 1 if a case of a full run failed."""
-    parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(prog="python -m tests.tools.fuzz", description=__doc__.split("\n")[0])
     parser.add_argument("--count", type=int, default=500)
     parser.add_argument("--seed", default=None, help="default: a hash of the sources")
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)

@@ -1,6 +1,7 @@
 """Run the program so that it sends itself signals at its n-th file operation, import or process start.
 
-    VICTIM_PLAN='{"main": [{"events": ["write"], "count": 7, "signal": "SIGKILL"}]}' python tests/victim.py cli …
+    VICTIM_PLAN='{"main": [{"events": ["write"], "count": 7, "signal": "SIGKILL"}]}' \
+        python tests/tools/victim.py cli …
 
 So a test interrupts the program at an exact point and does not depend on time. `cli` runs the command line; `build`
 builds synthetic samples (`synthetic.main`). The plan has one list of steps for the program itself (`main`) and one
@@ -40,7 +41,7 @@ def start(
     arguments: Sequence[object], *, main: Sequence[dict] = (), worker: Sequence[dict] = (), **more: Any
 ) -> subprocess.Popen[str]:
     """Start the program with a plan, in its own session (process group); its outputs are pipes."""
-    path = os.pathsep.join([str(HERE.parent), str(HERE)])
+    path = os.pathsep.join([str(HERE.parents[1]), str(HERE.parent)])
     plan = json.dumps({"main": main, "worker": worker})
     return subprocess.Popen(
         [sys.executable, str(HERE / "victim.py"), *map(str, arguments)],

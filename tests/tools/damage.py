@@ -1,7 +1,7 @@
 """Flip random bits of stores and cached terrain; each flip must be detected and repaired, or be harmless.
 
-    python tests/damage.py --count 2000 [--seed 0]
-    python tests/damage.py --operations [--count 500] [--seed 0]    make file operations fail instead
+    python -m tests.tools.damage --count 2000 [--seed 0]
+    python -m tests.tools.damage --operations [--count 500] [--seed 0]    make file operations fail instead
 
 A flip is detected if `verify` reports a problem, or, in a cached patch, if the patch is built again. A flip is
 harmless if a reader still gets the same data. After a detected flip the build command must restore the store
@@ -37,6 +37,9 @@ from typing import Any
 import numpy as np
 import trimesh
 import zarr
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
 from synthetic import fake_sample, make_spec
 
 from vbnfault import store as st

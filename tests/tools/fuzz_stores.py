@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from fuzz_inputs import NUMBERS, TEXTS, changed, hostile, places
+from tools.fuzz_inputs import NUMBERS, TEXTS, changed, hostile, places
 
 from vbnfault.core.errors import VbnfaultError
 

@@ -1,8 +1,9 @@
-"""Note which lines of the package each test executes: a plugin of pytest for tests/mutation.py.
+"""Note which lines of the package each test executes: a plugin of pytest for tests/tools/mutation.py.
 
-`python -m pytest -n 0 -p lines_by_test tests/test_plan.py` with this folder on PYTHONPATH writes to the file named
-by LINES_BY_TEST a JSON with `lines`, of "path:line" the tests that execute it, and `seconds`, the duration of each
-test. What runs in the set-up of a test is noted for its whole file, and what runs outside of tests as "import".
+`python -m pytest -n 0 -p tools.lines_by_test tests/test_plan.py` with the folder `tests` on PYTHONPATH writes
+a JSON to the file named by LINES_BY_TEST: `lines`, of "path:line" the tests that execute it, and `seconds`, the
+duration of each test. What runs in the set-up of a test is noted for its whole file, and what runs outside of tests
+as "import".
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from typing import Any
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 
 
 class _Trace:

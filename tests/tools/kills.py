@@ -1,6 +1,6 @@
 """Make one dataset in every way, kill each way at random events, resume it, and compare the digests.
 
-    python -m tests.kills --count 200 --samples 64
+    python -m tests.tools.kills --count 200 --samples 64
 
 The ways are in `kill_ways.py`: builds in one process, in two, on Dask, in ranges of shards and in a bucket of S3,
 merges, retakes and exports. First each way runs undisturbed; all that make the dataset must have one digest. Then
@@ -34,10 +34,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-sys.path.insert(0, str(Path(__file__).resolve().parent))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
-import victim
+from tools import victim
 
 # The worker processes of a build import this file again, as `__mp_main__`.
 if __name__ == "__mp_main__":
@@ -337,7 +337,7 @@ class Rounds:
 
 def main() -> int:
     """Run the rounds; the exit code is 1 if one failed or if digests differ."""
-    import kill_ways
+    from tools import kill_ways
 
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     options.add_argument("--count", type=int, default=200, help="SIGKILLs in all")

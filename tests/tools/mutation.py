@@ -1,8 +1,8 @@
 """Measure which fraction of mutations of the code the tests detect. This tool is not part of the test suite.
 
     pip install 'cosmic-ray>=8.7'
-    python tests/mutation.py --count 40 --seed 1 --out survivors.json plan labels
-    python tests/mutation.py --only survivors.json --out still.json
+    python -m tests.tools.mutation --count 40 --seed 1 --out survivors.json plan labels
+    python -m tests.tools.mutation --only survivors.json --out still.json
 
 For each group of modules, `--count` mutations are drawn at random. Each one is applied alone to a copy of the
 project, and the group's tests run until the first failure. A mutation is *killed* if a test fails or if the tests
@@ -36,7 +36,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 
 # group → (modules, tests that should detect their mutations)
 GROUPS: dict[str, tuple[list[str], list[str]]] = {
@@ -69,7 +69,7 @@ PARTS: dict[str, set[str]] = {
 _ALWAYS = ["-q", "-n", "0", "-p", "no:cacheprovider", "-m", "not slow"]
 # operators whose mutations rarely show anything: most `|` are in annotations, most decorators make dataclasses
 _LEFT_OUT = ("BitOr", "RemoveDecorator", "VariableInserter", "VariableReplacer")
-_IMPORT = "import"  # name in tests/lines_by_test.py for lines that run outside of tests
+_IMPORT = "import"  # name in tests/tools/lines_by_test.py for lines that run outside of tests
 
 
 # ------------------------------------------------------------------------------------ which test executes a line
@@ -86,7 +86,9 @@ def traced(root: Path, file: str, python: str, kept: Path | None) -> dict[str, A
     if digest not in known:
         with tempfile.TemporaryDirectory() as folder:
             out = Path(folder) / "trace.json"
-            failed, by = run_tests(root, ["-p", "lines_by_test", file], python, None, {"LINES_BY_TEST": str(out)})
+            failed, by = run_tests(
+                root, ["-p", "tools.lines_by_test", file], python, None, {"LINES_BY_TEST": str(out)}
+            )
             if failed:
                 raise SystemExit(f"tests fail without any mutation: {by}")
             known[digest] = json.loads(out.read_text(encoding="utf-8"))

@@ -20,9 +20,9 @@ from pathlib import Path
 from typing import Any
 
 import synthetic
-import victim
 from conftest import small_scene
-from kills import Place, Running, Step, Way
+from tools import victim
+from tools.kills import Place, Running, Step, Way
 
 # What the commands need, except the renderer: a forked process would lack its threads.
 import vbnfault.dataset.from_scene

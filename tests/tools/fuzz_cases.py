@@ -12,8 +12,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import fuzz_stores
-from fuzz_inputs import NUMBERS, TEXTS, Seeds, any_toml, changed, flipped, hostile, places, toml, toml_value
+from tools import fuzz_stores
+from tools.fuzz_inputs import NUMBERS, TEXTS, Seeds, any_toml, changed, flipped, hostile, places, toml, toml_value
 
 Case = tuple[list[str], dict[str, str]]  # arguments, and environment variables
 
