@@ -27,7 +27,7 @@ from vbnfault.render.detail import _LEVELS, _SIDE, _UNIT, _pyramid
 from vbnfault.render.runtime import mi
 from vbnfault.render.vehicle import World
 from vbnfault.scene import config
-from vbnfault.world import assemble, sky
+from vbnfault.world import assemble, ephemeris, sky
 
 TRUTH = ["depth_m", "normal", "semantic", "point_T_m", "incidence_deg", "emission_deg", "phase_deg", "albedo"]
 
@@ -158,7 +158,7 @@ def test_albedo_on_the_spacecraft_is_that_of_its_material(samples: tuple[Session
         v = np.einsum("rk,fk->rf", rays, np.cross(-a, b)) / det
         z = np.einsum("fk,fk->f", c, np.cross(-a, b)) / det
     z[~((u >= 0) & (v >= 0) & (u + v <= 1) & (z > 0))] = np.inf
-    nodes = assemble.wavelengths_nm(s.scene)
+    nodes = ephemeris.wavelengths_nm(s.scene)
     near = int(np.argmin(np.abs(nodes - 649.0)))
     expected = mesh.reflectance(nodes)[mesh.face_material[z.argmin(axis=1)], near]
     got = sample.layers["albedo"][rows, columns]
@@ -340,7 +340,7 @@ def test_bad_worlds_are_told_in_a_sentence(tables: dict[str, dict[str, object]],
 
     def whole() -> None:
         assemble.spacecraft(scene_)
-        assemble.ephemeris(scene_)
+        ephemeris.ephemeris(scene_)
 
     with pytest.raises(InputError) as told:
         whole()

@@ -13,7 +13,7 @@ import pytest
 from vbnfault.core import frames, spice
 from vbnfault.core.errors import InputError
 from vbnfault.scene import config
-from vbnfault.world import assemble
+from vbnfault.world import ephemeris
 
 spiceypy: Any = pytest.importorskip("spiceypy", reason="spiceypy (the extra 'spice') is not installed")
 
@@ -201,7 +201,7 @@ FRAME_1400012_CENTER = {number}
 """)
     for julian_date in (2451545.0, 2456948.25, 2461372.0):  # to 2026
         table = {"title": "t", "body": {"name": name}, "sun": {"julian_date": julian_date}}
-        ours = assemble.ephemeris(config.parse_scene(table, source="t.toml"))[1]
+        ours = ephemeris.ephemeris(config.parse_scene(table, source="t.toml"))[1]
         with spice.kernels(kernel):
             theirs = spice.J_from_T("OF_SHAPE", spice.et_s_from_julian_date(julian_date)).T
         between = frames.quaternion(ours @ theirs.T)

@@ -25,7 +25,7 @@ from vbnfault.pipeline import configure_faults
 from vbnfault.reflectance import radiance_factor
 from vbnfault.scene.config import load_scene
 from vbnfault.testing import check_effect, check_fault, make_context
-from vbnfault.world.assemble import base_camera
+from vbnfault.world.cameras import base_camera
 
 
 def test_the_command_writes_each_kind(tmp_path: Path) -> None:

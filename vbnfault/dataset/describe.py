@@ -18,7 +18,7 @@ from ..scene import aims, names, plan
 from ..scene.bodies import named_body
 from ..scene.config import Scene
 from ..scene.trajectory import Trajectory
-from ..world import assemble, ground
+from ..world import ephemeris, ground
 from .progress import duration_text, size_text
 
 _SITES_DESCRIBED = 8  # a site takes 9 ms on a shape of 20,000 facets
@@ -130,7 +130,7 @@ def _geometry(session: Session) -> list[str]:
     geometry, camera = scene.geometry, scene.camera
     if session.trajectory is not None:
         return _trajectory(session, session.trajectory)
-    sun = f"Sun: {assemble.sun_distance_au(scene):.4g} au away"
+    sun = f"Sun: {ephemeris.sun_distance_au(scene):.4g} au away"
     if scene.spice.spacecraft:
         until = scene.spice.until_julian_date or scene.sun.julian_date
         return [
@@ -202,8 +202,8 @@ def _aims(session: Session, aim: NDArray[np.uint8]) -> list[str]:
         "boresight; roll, pitch and yaw are stored relative to the Sun",
         f"distances: {low:g} to {high:g} m from the site, evenly in their logarithm; at the site "
         f"{_span(pixel * low, pixel * high)} m a pixel",
-        f"Sun: {assemble.sun_distance_au(scene):.4g} au away, date {scene.sun.julian_date:.1f} TDB; phase angle at "
-        f"the site {_bounds(geometry.phase_deg)} deg, {_span(*kept_away)} deg from the boresight unless it is "
+        f"Sun: {ephemeris.sun_distance_au(scene):.4g} au away, date {scene.sun.julian_date:.1f} TDB; phase angle "
+        f"at the site {_bounds(geometry.phase_deg)} deg, {_span(*kept_away)} deg from the boresight unless it is "
         "the aim",
         _redrawn(session),
     ]

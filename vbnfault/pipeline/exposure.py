@@ -13,7 +13,7 @@ from ..core.quantities import BODY, Electrons, Radiance, Truth
 from ..reflectance import radiance_factor
 from ..render.description import View
 from ..scene.config import Scene
-from ..world import assemble
+from ..world import assemble, ephemeris
 from ..world.sky import StarRadiance
 from .spec import Pose, Rendering, SampleSpec, SceneExposure, SceneLight
 
@@ -73,9 +73,9 @@ def _exposure_of_facet_s(scene: Scene, camera: Camera, sun: Direction, view: Dir
     `sun` and `view` are the directions towards the Sun and the camera; the normal of the facet is z.
     """
     reflected = radiance_factor(assemble.ground_reflectance(scene), sun, view)[:, 0] / np.pi
-    sunlight = assemble.sunlight(scene, np.array([0.0, 0.0, -1.0]))  # the direction does not matter
+    sunlight = ephemeris.sunlight(scene, np.array([0.0, 0.0, -1.0]))  # the direction does not matter
     facet = (reflected * sunlight.irradiance_W_m2_nm).astype(np.float32).reshape(-1, 1, 1)
-    wavelength = assemble.wavelengths_nm(scene)
+    wavelength = ephemeris.wavelengths_nm(scene)
     per_second = rate_on_axis(camera, Radiance(array=facet, wavelength_nm=wavelength))
     facet_brightness = float(_brightness(per_second.array, per_second.white_e).max())
     return float(scene.camera.metering_level / max(facet_brightness, 1e-30))
@@ -148,7 +148,7 @@ def add_stars(spec: SampleSpec, pose: Pose, rendering: Rendering, exposure: Scen
 
     def starry() -> tuple[SceneLight, Electrons]:
         T_from_L = spec.terrain.site.T_from_L
-        T_from_J = assemble.target_attitude(spec.scene, T_from_L @ pose.sun_L)
+        T_from_J = ephemeris.target_attitude(spec.scene, T_from_L @ pose.sun_L)
         J_from_C = T_from_J.T @ T_from_L @ pose.L_from_C
         starless = exposure.light.rendered
         stars = assemble.visible_stars(spec.scene, starless, camera, J_from_C, open_sky, rendering.scene.view)

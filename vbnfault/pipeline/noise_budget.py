@@ -21,7 +21,7 @@ from ..core.fine_light import FineLight
 from ..core.memory import release_unused
 from ..core.quantities import Radiance, Truth
 from ..render.description import RenderInput
-from ..world import assemble
+from ..world import ephemeris
 from .exposure import foreseen_exposure_s, rate_on_axis
 from .spec import SampleSpec
 
@@ -365,6 +365,6 @@ def _allocated(squares: F32, goal: F32, most: int) -> NDArray[np.int32]:
 
 def green_per_second(spec: SampleSpec) -> F64:
     """Return electrons per second of the green pixels for unit radiance in each band, float64[band]."""
-    nodes = assemble.wavelengths_nm(spec.scene)
+    nodes = ephemeris.wavelengths_nm(spec.scene)
     unit = Radiance(array=np.eye(len(nodes), dtype=np.float32)[:, :, None], wavelength_nm=nodes)
     return np.asarray(rate_on_axis(spec.camera, unit).array[:, 0, 1], dtype=np.float64)

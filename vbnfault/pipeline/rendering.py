@@ -15,7 +15,7 @@ from ..core.quantities import BODY, SKY, FarSource, Radiance, Truth
 from ..core.sundisc import Projection
 from ..lens.straylight.scene import RenderGrid, surrounding_grids
 from ..render.description import RenderInput, View
-from ..world import assemble
+from ..world import assemble, ephemeris
 from .coma import add_coma
 from .noise_budget import SampledRadiance, green_per_second, sample_to_noise
 from .spec import Pose, Rendering, SampleSpec, SceneLight
@@ -45,8 +45,8 @@ def describe(spec: SampleSpec, pose: Pose) -> RenderInput:
     )
     return RenderInput(
         view=view,
-        sun=assemble.sunlight(scene, pose.sun_L),
-        wavelength_nm=assemble.wavelengths_nm(scene),
+        sun=ephemeris.sunlight(scene, pose.sun_L),
+        wavelength_nm=ephemeris.wavelengths_nm(scene),
         reflectance=assemble.ground_reflectance(scene),
         dust_contrast=assemble.dust_contrast(scene),
         bounces=scene.render.bounces,
@@ -201,17 +201,17 @@ def far_sources(spec: SampleSpec, pose: Pose) -> tuple[FarSource, ...]:
     from .. import render
 
     scene, site = spec.scene, spec.terrain.site
-    bodies = assemble.bright_bodies(scene) if _has_sources_around(spec) else ()
+    bodies = ephemeris.bright_bodies(scene) if _has_sources_around(spec) else ()
     if not bodies:
         return ()
-    T_from_J = assemble.target_attitude(scene, site.T_from_L @ pose.sun_L)
+    T_from_J = ephemeris.target_attitude(scene, site.T_from_L @ pose.sun_L)
     L_from_J = site.T_from_L.T @ T_from_J
-    sunlight = spectra.solar_band_irradiance_W_m2_nm(assemble.wavelengths_nm(scene), 1.0)
+    sunlight = spectra.solar_band_irradiance_W_m2_nm(ephemeris.wavelengths_nm(scene), 1.0)
     out = []
     for body in bodies:
         direction_L = L_from_J @ body.direction_J
         disc = replace(
-            assemble.sunlight(scene, direction_L), angular_radius_rad=max(body.angular_radius_rad, _LEAST_RAD)
+            ephemeris.sunlight(scene, direction_L), angular_radius_rad=max(body.angular_radius_rad, _LEAST_RAD)
         )
         seen = render.sun_visible_fraction(
             spec.terrain.surface, pose.position_L_m[None], [disc], pose.L_from_C[None]

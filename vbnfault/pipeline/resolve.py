@@ -13,7 +13,7 @@ from ..core.errors import VbnfaultError, shown
 from ..render.description import Sunlight
 from ..scene import exchange, names, plan
 from ..scene.trajectory import FlownPose
-from ..world import assemble
+from ..world import ephemeris
 from ..world.aiming import AimedView, aimed_view
 from ..world.ground import encloses
 from .sight import LIT_GRID, faults_needing_light, grid_rays_C, lit_fraction, no_view, placed
@@ -53,7 +53,7 @@ def resolve(spec: SampleSpec, first_try: int = 0) -> Pose:
         No view meets the conditions; the message names the sample and the unmet conditions.
     """
     if spec.scene.is_flown:
-        return _on_the_trajectory(spec, spec.flown or assemble.flown_pose(spec.scene))
+        return _on_the_trajectory(spec, spec.flown or ephemeris.flown_pose(spec.scene))
     if spec.scene.is_aimed:
         return resolve_aimed(spec, first_try)
     required = spec.scene.geometry.sun_visibility == "required"
@@ -144,7 +144,7 @@ class _Views:
         if scene.geometry.height_reference == "local_ground":
             height = ground + height
         directions = [frames.direction_L(d["sun_azimuth_deg"], d["sun_elevation_deg"]) for d in drawn]
-        light = assemble.sunlight(scene, directions[0])
+        light = ephemeris.sunlight(scene, directions[0])
         suns = [replace(light, direction_L=direction) for direction in directions]
         position = np.column_stack([x, y, -height])
         reference = plan.strata(scene)[spec.plan.stratum[spec.index]].reference

@@ -25,7 +25,7 @@ from ..render.description import RenderInput, may_see_sun
 from ..scene.config import Scene
 from ..scene.plan import EarlierViews, Plan, strata
 from ..scene.trajectory import FlownPose
-from ..world import assemble
+from ..world import ephemeris
 from ..world.aiming import aimed_view
 from .record import to_sample
 from .rendering import (
@@ -167,7 +167,7 @@ class RetakeSession:
         if world.trajectory is not None:
             flown = world.trajectory.pose(earlier)
         elif scene.is_flown:
-            flown = assemble.flown_pose(scene)
+            flown = ephemeris.flown_pose(scene)
         elif scene.is_aimed:
             of_model = world.sites[site.index]
             flown = aimed_view(scene, world.body, of_model, plan.aim_of(earlier), variables).pose

@@ -22,7 +22,7 @@ from ..scene import config, plan
 from ..scene.config import Scene, configure_faults
 from ..scene.keyed_random import keyed_uniform
 from ..scene.trajectory import FlownPose, Trajectory, as_trajectory, load_trajectory, with_rows
-from ..world import assemble
+from ..world import assemble, cameras, ephemeris
 from ..world.coma import check_coma
 from ..world.ground import GroundDetail, ground_details, sites_for_suns
 from ..world.spacecraft import SpacecraftMesh
@@ -141,7 +141,7 @@ class Session:
     def base_camera(self) -> Camera:
         """Return the camera with the first architecture and readout direction of the scene, without an exposure."""
         with in_file(self.source):
-            return assemble.base_camera(self.scene)
+            return cameras.base_camera(self.scene)
 
     @cached_property
     def body(self) -> Body:
@@ -162,8 +162,8 @@ class Session:
         with in_file(self.source):
             sentences = (
                 assemble.values_of_another_body(self.scene, self.body),
-                assemble.dark_corners(self.scene),
-                assemble.scaled_lens(self.scene),
+                cameras.dark_corners(self.scene),
+                cameras.scaled_lens(self.scene),
                 assemble.much_hidden(self.scene, self.vehicle),
             )
         for sentence in sentences:
@@ -180,7 +180,7 @@ class Session:
     def sites(self) -> Sites:
         """Return the sites of the scene. Each is drawn at its first use."""
         if self.scene.spice.spacecraft:
-            return assemble.trajectory_sites(self.scene, self.body)
+            return ephemeris.trajectory_sites(self.scene, self.body)
         if self.scene.exchanges_views:
             return sites_for_suns(self.scene, self.body, self.plan_of_sites)
         return choose_sites(self.body, self.scene.dataset.sites, self.scene.dataset.seed)
@@ -349,7 +349,7 @@ class Session:
         if scene.spice.spacecraft:
             first = np.array([self.plan.first_of_view(index)])
             fraction = float(keyed_uniform(scene.dataset.seed, first, "plan", "epoch")[0])
-            values = {"julian_date": assemble.epoch_jd(scene, int(self.plan.site[index]), fraction)}
+            values = {"julian_date": ephemeris.epoch_jd(scene, int(self.plan.site[index]), fraction)}
         if self.trajectory is not None:
             flown = self.trajectory.pose(index)
             values = {"julian_date": flown.julian_date, "distance_au": flown.sun_distance_au}

@@ -21,7 +21,7 @@ from ..scene import keyed_random, plan
 from ..scene.config import Scene
 from ..scene.sampling import DEFAULT_TWINS
 from ..scene.trajectory import FlownPose
-from ..world import assemble
+from ..world import cameras
 from ..world.spacecraft import SpacecraftMesh
 
 if TYPE_CHECKING:
@@ -117,7 +117,7 @@ class SampleSpec:
     @cached_property
     def camera(self) -> Camera:
         """Return the camera of the sample before an exposure is set."""
-        return self.taken_with or assemble.base_camera(
+        return self.taken_with or cameras.base_camera(
             self.scene,
             architecture=int(self.plan.architecture[self.index]),
             readout_direction=int(self.plan.readout_direction[self.index]),

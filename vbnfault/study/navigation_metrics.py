@@ -235,9 +235,9 @@ def _is_free(spec: SampleSpec, positions: F64) -> bool:
 def _sun_visible(spec: SampleSpec, pose: Pose, positions: F64) -> F64:
     """Return the visible fraction of the Sun's disc at positions float64[n, 3] in L, float64[n]."""
     from .. import render
-    from ..world import assemble
+    from ..world import ephemeris
 
-    suns = [assemble.sunlight(spec.scene, pose.sun_L)] * len(positions)
+    suns = [ephemeris.sunlight(spec.scene, pose.sun_L)] * len(positions)
     axes = np.repeat(pose.L_from_C[None], len(positions), axis=0)
     return np.asarray(render.sun_visible_fraction(spec.terrain.surface, positions, suns, axes))
 
