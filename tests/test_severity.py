@@ -178,8 +178,6 @@ def test_a_missing_table_is_named(tmp_path: Path) -> None:
     ("table", "message"),
     [
         ({"severity": 6}, "faults.vignetting.severity = 6: must be a whole number from 1 to 5"),
-        ({"severity": 0}, "faults.vignetting.severity = 0: must be"),
-        ({"severity": True}, "faults.vignetting.severity = True: must be"),
         ({"severity": "high"}, "faults.vignetting.severity = 'high': must be"),
         (
             {"severity": 2, "frame_illuminance_dn": 100},
