@@ -36,8 +36,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..core import spectra
 from ..core.errors import InputError
-from ..core.fine_light import splat
-from ..core.quantities import Irradiance, Radiance
+from ..core.quantities import Irradiance, Radiance, splat
 from ..core.sundisc import Floats, add_mean, pixel_sums
 from .glass import D_NM, RANGE_NM
 from .mapping import ChiefHeights, FieldMap, RadialModel, camera_model, chief_heights, field_map

@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core import buffers, spectra
-from ..core.fine_light import FineLight
 from ..core.memory import release_unused
-from ..core.quantities import BODY, SKY, FarSource, Radiance, Truth
+from ..core.quantities import BODY, SKY, FarSource, FineLight, Radiance, Truth
 from ..core.sundisc import Projection
 from ..lens.straylight.scene import RenderGrid, surrounding_grids
 from ..render.description import RenderInput, View
