@@ -32,7 +32,7 @@ from vbnfault.reflectance.hapke import hapke_at
 from vbnfault.render.description import RenderInput
 from vbnfault.render.runtime import dr, mi
 from vbnfault.render.sampling import Optics, Pixels, Strata, SunDisc
-from vbnfault.scene import config, plan
+from vbnfault.scene import config, plan, redraw
 
 SCENE = "paper_example"  # for its six faults; the view is defined below
 SHARD_SAMPLES = 8
@@ -210,7 +210,7 @@ def _pose(surface: render.TerrainMesh) -> Pose:
         sun_elevation_deg=SUN_ELEVATION_DEG,
         sun_visible_fraction=1.0,
         tries=1,
-        variables=dict.fromkeys(plan.VARIABLES, 0.0),  # placed by hand, not drawn
+        variables=dict.fromkeys(redraw.VARIABLES, 0.0),  # placed by hand, not drawn
         resolved=True,
     )
 

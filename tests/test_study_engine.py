@@ -483,7 +483,7 @@ def test_a_folder_that_holds_something_else_is_left_alone(tmp_path: Path) -> Non
 
 def test_a_folder_of_another_study_is_refused(spec: StudySpec, reference: Path) -> None:
     other = spec.model_copy(update={"design": spec.design.model_copy(update={"n": 64})})
-    with pytest.raises(InputError, match=r"holds another study: design.n is 32 there and 64 here; choose another --out"):
+    with pytest.raises(InputError, match=r"holds another study: design.n is 32 there and 64 here; choose another"):
         run.run_study(other, reference, QUIET, report=False, evaluator=kit.Stopping)
     with pytest.raises(InputError, match=r"evaluator is 'study_kit.Stopping' there and 'study_kit.Function' here"):
         run.run_study(spec, reference, QUIET, report=False, evaluator=kit.Function)

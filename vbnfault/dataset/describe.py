@@ -14,7 +14,7 @@ from ..core import frames
 from ..detector import Detector
 from ..pipeline import Session
 from ..pipeline.exposure import reference_exposure_s
-from ..scene import aims, names, plan
+from ..scene import aims, names, plan, redraw
 from ..scene.bodies import named_body
 from ..scene.config import Scene
 from ..scene.trajectory import Trajectory
@@ -151,9 +151,9 @@ def _geometry(session: Session) -> list[str]:
         f"footprint {_span(across * nearest, across * high)} m across",
         f"{sun}, date {scene.sun.julian_date:.1f} TDB",
     ]
-    if any(s.reference == "nadir" for k, s in enumerate(plan.strata(scene)) if (table.stratum == k).any()):
+    if any(s.reference == "nadir" for k, s in enumerate(redraw.strata(scene)) if (table.stratum == k).any()):
         lines.append(_down(session))
-    for k, stratum in enumerate(plan.strata(scene)):
+    for k, stratum in enumerate(redraw.strata(scene)):
         if not (table.stratum == k).any():
             continue
         towards = _REFERENCES[stratum.reference]
@@ -196,7 +196,7 @@ def _aims(session: Session, aim: NDArray[np.uint8]) -> list[str]:
     counts = np.bincount(aim, minlength=len(aims.AIMS))
     mixed = ", ".join(f"{name} {count}" for name, count in zip(aims.AIMS, counts, strict=True) if count)
     pixel = ground.pixel_rad(scene)
-    kept_away = plan.sun_elongation_deg(scene)
+    kept_away = aims.sun_elongation_deg(scene)
     return [
         f"aims: {mixed}; {geometry.pointing_error_deg:g} deg of pointing error about each axis, any turn about the "
         "boresight; roll, pitch and yaw are stored relative to the Sun",

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..core import frames
 from ..core.errors import VbnfaultError, shown
 from ..render.description import Sunlight
-from ..scene import exchange, names, plan
+from ..scene import aims, exchange, names, plan, redraw
 from ..scene.trajectory import FlownPose
 from ..world import ephemeris
 from ..world.aiming import AimedView, aimed_view
@@ -147,7 +147,7 @@ class _Views:
         light = ephemeris.sunlight(scene, directions[0])
         suns = [replace(light, direction_L=direction) for direction in directions]
         position = np.column_stack([x, y, -height])
-        reference = plan.strata(scene)[spec.plan.stratum[spec.index]].reference
+        reference = redraw.strata(scene)[spec.plan.stratum[spec.index]].reference
         towards_L = references_L(reference, spec.terrain, position, directions)
         axes = [
             frames.L_from_C(towards, d["roll_deg"], d["pitch_deg"], d["yaw_deg"], north_up=reference == "centre")
@@ -212,7 +212,7 @@ def _usable(
         clearance: render.is_clear(surface, views.position_L_m, geometry.clearance_m),
     }
     if stratum == plan.SUN_AVERTED:
-        least = plan.least_sun_angle_deg(scene)
+        least = redraw.least_sun_angle_deg(scene)
         met[f"the Sun at least {least:.1f} deg from the boresight"] = views.sun_angle_deg() >= least
     needing_sun = [name for name in spec.commanded_in_view if spec.faults[name].needs_sun]
     if sun_required and needing_sun:
@@ -221,7 +221,7 @@ def _usable(
         past = "" if vehicle is None else ", past the spacecraft"
         met[f"the whole Sun visible before the camera{past}, for {', '.join(needing_sun)}"] = seen
     good = np.logical_and.reduce(list(met.values()))
-    lit_fraction = plan.strata(scene)[stratum].min_lit_fraction
+    lit_fraction = redraw.strata(scene)[stratum].min_lit_fraction
     needing_light = faults_needing_light(spec) if vehicle is None else []  # a spacecraft in view may be sunlit
     if (lit_fraction or needing_light) and good[:count].any():
         fraction = _lit_fraction(spec, views)
@@ -341,7 +341,7 @@ def _unmet_by_the_view(spec: SampleSpec, view: AimedView) -> str:
     aim, terrain = spec.plan.aim_of(spec.index), spec.terrain
     flown, L_from_T = view.pose, terrain.site.T_from_L.T
     if aim != "sun":
-        low, high = plan.sun_elongation_deg(spec.scene)
+        low, high = aims.sun_elongation_deg(spec.scene)
         angle = np.degrees(np.arccos(np.clip(flown.T_from_C[:, 2] @ flown.sun_direction_T, -1, 1)))
         if not low <= angle <= high:
             return f"the Sun {low:.4g} to {high:.4g} deg from the boresight"

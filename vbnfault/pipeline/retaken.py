@@ -23,7 +23,8 @@ from ..core.quantities import SKY, Radiance, Sample, Truth
 from ..core.sundisc import Pinhole, add_mean
 from ..render.description import RenderInput, may_see_sun
 from ..scene.config import Scene
-from ..scene.plan import EarlierViews, Plan, strata
+from ..scene.plan import EarlierViews, Plan
+from ..scene.redraw import strata
 from ..scene.trajectory import FlownPose
 from ..world import ephemeris
 from ..world.aiming import aimed_view

@@ -51,7 +51,7 @@ class Pose:
     """Hold the outcome of `resolve`: the position and attitude of the camera, and the Sun.
 
     `tries` counts the views drawn; this is the last of them. `variables` are the values of the plan, by the names
-    of `plan.VARIABLES`. `resolved` says whether every condition is met. It is False only if a trajectory places
+    of `redraw.VARIABLES`. `resolved` says whether every condition is met. It is False only if a trajectory places
     the camera, a fault of the sample needs the Sun, and the camera does not see the whole Sun ahead. `terrain` is
     the terrain that was made for this pose, if it is not that of the specification.
     """

@@ -307,7 +307,7 @@ def sites_for_suns(scene: Scene, body: Body, plan: Plan) -> Sites:
 def suns_seen(scene: Scene, model: TerrainMesh, site: Site, drawn: dict[str, F64]) -> NDArray[np.bool_]:
     """Return which Suns are seen at a site, over the shape model `model` in T, bool[position, Sun].
 
-    `drawn` holds the values of n views, float64[n] each, by the names of `plan.VARIABLES`.
+    `drawn` holds the values of n views, float64[n] each, by the names of `redraw.VARIABLES`.
     """
     from .. import render
 
