@@ -404,25 +404,6 @@ def test_the_models_own_defaults_are_the_papers_bounds() -> None:
         assert faults.from_dict(fault, {"model": table["model"]}, source="t").to_dict() == table
 
 
-def test_paper_example_is_the_papers_table_of_injected_parameters() -> None:
-    found = paper_faults("paper_example")
-    assert found["dust_on_optics"]["count"] == [50, 50]
-    assert found["broken_pixels"]["count"] == [9, 9]
-    assert (found["broken_lines"]["white_count"], found["broken_lines"]["black_count"]) == (3, 2)
-    assert found["broken_lines"]["count"] == [5, 5]
-    flares = found["straylight"]["flares"]
-    assert [f["index"] for f in flares] == [3, 4, 5]
-    assert [f["position"] for f in flares] == [0.83, 1.00, 1.17]
-    assert [f["radius"] for f in flares] == [0.11, 0.13, 0.16]
-    assert [f["brightness"] for f in flares] == [1.5, 1.5, 1.5]
-    assert found["vignetting"]["on_axis_illuminance_dn"] == [255, 255]
-    assert found["optics_degradation"]["filter_size_px"] == [3, 3]
-    camera = load_scene("paper_example").camera
-    assert camera.readout_directions == ("right",)
-    assert camera.architectures[0].endswith("_ccd")
-    assert len(camera.architectures) == 1
-
-
 # ------------------------------------------------------------------------------------------------ JSON schema
 
 
