@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -272,32 +272,22 @@ class Session:
         `detail`: facets and boulders for a pose of a table, in place of those of the scene.
         """
         table = self.scene.patch
-        spec = PatchSpec(
-            seed=self.scene.dataset.seed,
-            facet_m=table.facet_m,
-            radius_m=table.radius_m,
-            relief=table.relief,
-            hurst=table.hurst,
-            scarps=table.scarps,
-            intermittency=table.intermittency,
-            angularity=table.angularity,
-            craters_per_km2=table.craters_per_km2,
-            min_boulder_m=table.min_boulder_m if table.boulders else 1e6,
-            boulder_index=table.boulder_index,
-            boulders_per_km2=table.boulders_per_km2,
-            max_triangles=max(table.max_triangles, 2 * len(self.body.faces)),
-            fractured=None if table.fractured is None else Fractured(**table.fractured.model_dump()),
-        )
+        keys: dict[str, Any] = {key: v for key, v in table if key in PatchSpec.__dataclass_fields__}
+        keys |= {
+            "seed": self.scene.dataset.seed,
+            "max_triangles": max(table.max_triangles, 2 * len(self.body.faces)),
+        }
+        near_m = []  # boulders lie as near as that
         if table.fractured is not None:
-            spec = replace(spec, boulder_near_m=max(table.radius_m, spec.boulder_near_m))
+            keys["fractured"] = Fractured(**table.fractured.model_dump())
+            near_m.append(table.radius_m)
         if detail is not None:
-            spec = replace(
-                spec,
-                facet_m=detail.facet_m,
-                radius_m=detail.radius_m,
-                min_boulder_m=detail.boulder_m if table.boulders else 1e6,
-                boulder_near_m=max(detail.radius_m, spec.boulder_near_m),
-            )
+            keys |= {"facet_m": detail.facet_m, "radius_m": detail.radius_m, "min_boulder_m": detail.boulder_m}
+            near_m.append(detail.radius_m)
+        if not table.boulders:
+            keys["min_boulder_m"] = 1e6
+        spec = PatchSpec(**keys)
+        spec = replace(spec, boulder_near_m=max(*near_m, spec.boulder_near_m)) if near_m else spec
         patch = cached_patch(self.body, site, spec)
         kept = len(patch.boulder_diameter_m)
         # for a pose, the number of triangles sets the facets, so more triangles would not keep all boulders either
