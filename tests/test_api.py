@@ -282,8 +282,8 @@ def test_a_flare_refuses_what_the_physics_does_not_take(setting: dict[str, Any],
 def test_the_field_helpers_make_a_fault() -> None:
     import dataclasses
 
+    from vbnfault.core.registry import undoing_registrations
     from vbnfault.faults import from_dict
-    from vbnfault.faults.models import undoing_registrations
 
     with undoing_registrations(always=True):
 

@@ -395,7 +395,7 @@ def test_the_sun_in_a_build_is_vignetted_once() -> None:
     admitted = weights.sum(axis=1) * area * cosine * context.camera.exposure_s
     development = Development(exposure=exposure, context=context, rng=spec.rng)
     draws = draw_faults(spec, development, ["vignetting"], {}, attempt=0)
-    plain, dimmed = (development.signal(draws, names).in_planes for names in ([], ["vignetting"]))
+    plain, dimmed = (development.signal(draws, names) for names in ([], ["vignetting"]))
     assert plain.past_rims is not None
     assert dimmed.past_rims is not None
     # the disc's image is exact in total; float32 sums

@@ -12,8 +12,6 @@ from typing import Any, ClassVar, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from . import buffers
-
 CHANNELS = ("R", "G", "B", "I")
 
 # Rec. 709 luminance of linear RGB: the intensity channel of a camera without W pixels.
@@ -231,20 +229,6 @@ class Irradiance(Quantity):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class RimRows:
-    """Hold the light of a few rows of the image, before the lens's rims and past them.
-
-    - `rows` are these rows; no other row has light past the rims.
-    - `before` float32[row, x, channel] is the light before the rims, in electrons.
-    - `past` float32[row, x, channel] is the additional light past the rims.
-    """
-
-    rows: slice
-    before: NDArray[np.float32]
-    past: NDArray[np.float32]
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
 class Electrons(Quantity):
     """Hold electrons per pixel and channel; every pixel has all channels, R, G, B or those of the mosaic.
 
@@ -255,64 +239,27 @@ class Electrons(Quantity):
     pupil and rims are included already: the Sun's direct image and its traced straylight. The lens's own vignetting
     does not reduce it again. A fault at the rims, such as a slipped ring or a moved hood, multiplies all of it by
     one fraction, that of the Sun's beam which clears the fault (`Fault.passed_to_sun`). None: there is no
-    such light, or it is in `rim_rows`.
-
-    `rim_rows` describes such light if it lies in a few rows only, as the Sun's disc behind a thin lens does. It is
-    then contained in `array`, so that a second plane of zeros takes neither memory nor time.
+    such light.
     """
 
     white_e: NDArray[np.float32]
     past_rims: NDArray[np.float32] | None = None
-    rim_rows: RimRows | None = None
     unit = "e-"
     axes = ("y", "x", "channel")
 
     @property
     def merged(self) -> Electrons:
         """Return all light in one array, as the detector needs it. It is added anew, so that no copy is kept."""
-        if self.rim_rows is not None:
-            return replace(self, rim_rows=None)
         if self.past_rims is None:
             return self
-        array = buffers.empty(self.array.shape, self.array.dtype)
-        return replace(self, array=np.add(self.array, self.past_rims, out=array), past_rims=None)
+        return replace(self, array=self.array + self.past_rims, past_rims=None)
 
     def scaled(self, factor: float) -> Electrons:
-        """Return all light multiplied by a factor; light past the rims in few rows becomes `rim_rows`."""
-        if self.rim_rows is not None:
-            return self.in_planes.scaled(factor)
-        times = np.float32(factor)
-        array = np.multiply(self.array, times, out=buffers.empty(self.array.shape, self.array.dtype))
-        if self.past_rims is None:
-            return replace(self, array=array)
-        rows = _lit_rows(self.past_rims)
-        if rows.stop == rows.start:
-            return replace(self, array=array, past_rims=None)
-        if rows.stop - rows.start > len(array) * _MOST_RIM_ROWS:
-            return replace(self, array=array, past_rims=self.past_rims * times)
-        band = RimRows(rows=rows, before=array[rows].copy(), past=self.past_rims[rows] * times)
-        array[rows] += band.past
-        return replace(self, array=array, past_rims=None, rim_rows=band)
-
-    @property
-    def in_planes(self) -> Electrons:
-        """Return the same light, that past the rims in `past_rims` and not in `rim_rows`."""
-        band = self.rim_rows
-        if band is None:
-            return self
-        array, past = buffers.copy(self.array), buffers.zeros(self.array.shape)
-        array[band.rows], past[band.rows] = band.before, band.past
-        return replace(self, array=array, past_rims=past, rim_rows=None)
-
-
-# Light past the rims in more of the rows than this fraction stays in a plane of its own.
-_MOST_RIM_ROWS = 0.25
-
-
-def _lit_rows(plane: NDArray[np.float32]) -> slice:
-    """Return the range of the rows of a plane that hold anything but 0."""
-    lit = np.flatnonzero(plane.reshape(len(plane), -1).any(axis=1))
-    return slice(int(lit[0]), int(lit[-1]) + 1) if len(lit) else slice(0, 0)
+        """Return all light multiplied by a factor; a plane of no light past the rims becomes None."""
+        times, past = np.float32(factor), self.past_rims
+        return replace(
+            self, array=self.array * times, past_rims=past * times if past is not None and past.any() else None
+        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -50,7 +50,7 @@ from ..lens.straylight.particles import DUST_INDEX
 from .context import FaultContext, Params
 from .contract import LensFault
 from .fields import Interval, Severity, bounds, number
-from .planes import add_to, reaches, times
+from .planes import reaches, times
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -138,17 +138,9 @@ class DefocusedDust(LensFault):
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
         """Return the expected electrons times the transmission of all grains, plus their glow."""
-        return self.apply_to_rows(quantity, slice(None), params, context)
-
-    def reach_rows(self, params: Params) -> int:
-        """Return 0: each pixel has its own factor and glow."""
-        return 0
-
-    def apply_to_rows(self, quantity: Any, rows: slice, params: Params, context: FaultContext) -> Any:
-        """Return the expected electrons of some rows times the transmission of all grains, plus their glow."""
-        out = times(quantity.array, _shadows_once(params, context).transmission[rows])
+        out = times(quantity.array, _shadows_once(params, context).transmission)
         light = _glow_once(params, context)
-        return quantity.with_array(out if light is None else add_to(out, light[rows]))
+        return quantity.with_array(out if light is None else out + light)
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
         """Return the pixels where the loss reaches `mask_loss`, or the glow that fraction of white, bool[y, x].

@@ -58,7 +58,7 @@ from ..lens.straylight.total import (
 from .context import FaultContext, Params
 from .contract import LensFault
 from .fields import Interval, Severity, bounds, choice, flag, number
-from .planes import add_to, intensity_dn, plus, plus_plane, reaches, sums, times
+from .planes import intensity_dn, reaches, sums, times
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -201,10 +201,11 @@ class _LensStraylight(LensFault):
         scene, added = times(quantity.array, 1 - light.scene_lost), light.added
         if not light.scene_added:
             veil = sums(quantity.array) * light.scene_lost
-            added = plus_plane(added, veil_per_px(context.shape, context.camera.focal_length_px), veil)
+            plane = veil_per_px(context.shape, context.camera.focal_length_px)
+            added = added + plane[..., None] * veil.astype(np.float32)
         if quantity.past_rims is None:
-            return quantity.with_array(add_to(scene, added))
-        past = add_to(times(quantity.past_rims, light.direct_left), added)
+            return quantity.with_array(scene + added)
+        past = times(quantity.past_rims, light.direct_left) + added
         return replace(quantity, array=scene, past_rims=past)
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
@@ -246,7 +247,7 @@ class _LensStraylight(LensFault):
         planes = of_sun.total(context.camera.exposure_s)
         added = cv2.merge(list(planes)).reshape(*context.shape, len(planes))
         return AddedLight(
-            added=added if scene is None else plus(added, scene),
+            added=added if scene is None else added + scene,
             direct_left=of_sun.direct_fraction,
             scene_lost=lost,
             scene_added=scene is not None,

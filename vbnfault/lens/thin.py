@@ -33,7 +33,6 @@ import scipy.fft
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtr
 
-from ..core import buffers
 from ..core.quantities import Irradiance, Radiance
 from ..core.sundisc import Pinhole
 
@@ -116,9 +115,7 @@ class ThinLens:
 
     def on_axis(self, radiance: Radiance) -> Irradiance:
         """Return the irradiance of radiance of any shape, which does not depend on the position in the image."""
-        array = buffers.empty(radiance.array.shape, np.result_type(radiance.array, np.float32))
-        np.multiply(radiance.array, self._solid_angle, out=array)
-        return Irradiance(array=array, wavelength_nm=radiance.wavelength_nm)
+        return Irradiance(array=radiance.array * self._solid_angle, wavelength_nm=radiance.wavelength_nm)
 
     def on_frame(self, radiance: Radiance) -> Radiance:
         """Return the radiance itself: the image has the grid of the render."""
@@ -152,8 +149,7 @@ class ThinLens:
         as_scene = self.on_axis(radiance).array
         shape = as_scene.shape[1:]
         cos4 = cos4_map((int(shape[0]), int(shape[1])), self.focal_length_mm * 1e3 / pixel_pitch_um)
-        array = buffers.empty(as_scene.shape, as_scene.dtype)
-        np.multiply(as_scene, cos4, out=array)
+        array = as_scene * cos4
         if self.halo is not None:
             # in float64: the rounding errors of the Sun's disc may be as bright as the scene
             array = np.asarray(self.halo.applied(array.astype(np.float64), self.pixel_rad), dtype=np.float32)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import buffers, spectra
+from ..core import spectra
 from ..core.memory import release_unused
 from ..core.quantities import BODY, SKY, FarSource, FineLight, Radiance, Truth
 from ..core.sundisc import Projection
@@ -62,7 +62,6 @@ def render_view(spec: SampleSpec, pose: Pose) -> Rendering:
     """
     from .. import render
 
-    buffers.clear()  # a render takes the memory that arrays of another sample have left
     camera, scene, surface = spec.camera, describe(spec, pose), spec.terrain.surface
     stars = spec.scene.sky.stars != "off"
     has_coma = spec.scene.coma is not None

@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core import buffers
 from ...core.llvm import backend
 
 F32 = NDArray[np.float32]
@@ -47,21 +46,19 @@ def summed(canvas: Canvas, levels: Sequence[NDArray[np.int64]], unit: float) -> 
 
     `levels` are int64[layer, y, x] each; `unit` is the value of an integer of 1.
     """
-    out = buffers.empty((len(levels[0]), *canvas.shape))
+    out = np.empty((len(levels[0]), *canvas.shape), np.float32)
 
     def resize(layer: int) -> None:
         """Resize and add the levels of one layer, from the coarsest to the finest."""
         below: F32 | None = None
         for level in range(LEVELS - 1, -1, -1):
             height, width = (int(v) for v in canvas.sizes[level])
-            here = buffers.empty((height, width))
             # layer by layer, because a copy of all levels takes 45 MB for 1024 pixels
-            np.multiply(levels[level][layer], unit, out=here, dtype=np.float32)
+            here = np.multiply(levels[level][layer], unit, dtype=np.float32)
             if below is not None:
                 # folds end in steps, which pixel centres sample unevenly
                 calm = cv2.GaussianBlur(below, (3, 3), _CALM_SIGMA)
-                bigger = buffers.empty((2 * calm.shape[0], 2 * calm.shape[1]))
-                cv2.resize(calm, None, dst=bigger, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)
+                bigger = cv2.resize(calm, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)
                 # pixel 0 of a level covers two pixels of the finer level, -M·2 + M and the next
                 here += bigger[MARGIN : MARGIN + height, MARGIN : MARGIN + width]
             below = here

@@ -38,7 +38,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core import buffers
 from ...core.memory import release_unused
 from ...core.spectra import Bands
 from ..paraxial import paraxial_properties
@@ -185,7 +184,7 @@ class SunStraylight:
         rates = self.rates.astype(np.float32)
         scattered = (self.glare + self.veil[:, None]) * self.rates[:, None] * exposure_s
         index, cos4 = self.layout.steps.astype(np.intp), self.layout.cos4  # numpy would convert it for every band
-        out = buffers.empty((len(rates), *index.shape))
+        out = np.empty((len(rates), *index.shape), np.float32)
 
         def add_up(band: int) -> None:
             plane = out[band]
