@@ -22,7 +22,7 @@ from vbnfault.pipeline.exposure import meter
 from vbnfault.pipeline.rendering import render_view
 from vbnfault.pipeline.spec import Pose
 from vbnfault.render.description import Sunlight
-from vbnfault.scene import config, plan, redraw
+from vbnfault.scene import config, redraw
 
 SUNS_DEG = {"low": 12.0, "high": 50.0}
 # name → height above ground in m, degrees below the horizon

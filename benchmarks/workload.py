@@ -32,7 +32,7 @@ from vbnfault.reflectance.hapke import hapke_at
 from vbnfault.render.description import RenderInput
 from vbnfault.render.runtime import dr, mi
 from vbnfault.render.sampling import Optics, Pixels, Strata, SunDisc
-from vbnfault.scene import config, plan, redraw
+from vbnfault.scene import config, redraw
 
 SCENE = "paper_example"  # for its six faults; the view is defined below
 SHARD_SAMPLES = 8
