@@ -23,7 +23,7 @@ from vbnfault.pipeline import Session, masks
 from vbnfault.pipeline.development import Development
 from vbnfault.pipeline.spec import Draw, Frame, SceneExposure, SceneLight
 from vbnfault.scene.config import load_scene
-from vbnfault.world.assemble import mosaic_sensor
+from vbnfault.world.cameras import mosaic_sensor
 
 MODELS = {"broken_pixels": "hot_pixels", "broken_lines": "readout"}
 CLASSES = [name for name, models in registry().items() for m in models.values() if m.needs_mosaic]

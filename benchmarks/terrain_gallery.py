@@ -22,7 +22,7 @@ from vbnfault.pipeline.exposure import meter
 from vbnfault.pipeline.rendering import render_view
 from vbnfault.pipeline.spec import Pose
 from vbnfault.render.description import Sunlight
-from vbnfault.scene import config, plan
+from vbnfault.scene import config, redraw
 
 SUNS_DEG = {"low": 12.0, "high": 50.0}
 # name → height above ground in m, degrees below the horizon
@@ -67,7 +67,7 @@ def pose_at(
         sun_elevation_deg=sun[1],
         sun_visible_fraction=1.0,
         tries=1,
-        variables=dict.fromkeys(plan.VARIABLES, 0.0),  # placed by hand, not drawn
+        variables=dict.fromkeys(redraw.VARIABLES, 0.0),  # placed by hand, not drawn
         resolved=True,
     )
 

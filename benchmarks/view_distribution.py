@@ -44,7 +44,7 @@ from scipy import stats
 
 from vbnfault import store
 from vbnfault.dataset.identity import classes_that_need_sun, stored_plan, stored_scene
-from vbnfault.scene import exchange, names, plan
+from vbnfault.scene import exchange, names, plan, redraw
 
 VARIABLES = ("x_m", "y_m", "height_m", "roll_deg", "pitch_deg", "yaw_deg", "sun_elevation_deg", "sun_azimuth_deg")
 LEVEL = 0.01
@@ -120,7 +120,7 @@ def variables_of(opened: store.Store) -> Iterator[tuple[str, tuple[float, float]
     proposals = [json.loads(str(text)) for text in proposal]
     for code, name in enumerate(names.STRATA):
         for variable in VARIABLES:
-            low, high = (float(bound[code]) for bound in plan.bounds(scene, variable))
+            low, high = (float(bound[code]) for bound in redraw.bounds(scene, variable))
             values = np.array([p[variable] for p, s in zip(proposals, stratum, strict=True) if s == code])
             if len(values) and high > low:
                 yield f"{name} {variable}", (low, high), (values - low) / (high - low)
@@ -194,7 +194,7 @@ def views_of(path: Path) -> list[Views]:
         out.append(
             Views(
                 stratum=name,
-                bounds={v: tuple(float(b[code]) for b in plan.bounds(scene, v)) for v in VARIABLES},
+                bounds={v: tuple(float(b[code]) for b in redraw.bounds(scene, v)) for v in VARIABLES},
                 table={v: table.variables[v][table.stratum == code] for v in VARIABLES},
                 first={v: made.variables[v][whole][here] for v in VARIABLES},
                 kept={v: np.array([view[v] for view in kept])[here] for v in VARIABLES},

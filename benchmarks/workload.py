@@ -20,8 +20,8 @@ from vbnfault.core.spectra import Bands
 from vbnfault.lens import load_lens, scaled_to_focal_length
 from vbnfault.lens.straylight.irradiance import FlareModel
 from vbnfault.lens.straylight.settings import SensorGrid
+from vbnfault.pipeline.development import take_images
 from vbnfault.pipeline.exposure import meter
-from vbnfault.pipeline.images import take_images
 from vbnfault.pipeline.injection import inject_faults
 from vbnfault.pipeline.labels import label
 from vbnfault.pipeline.record import to_sample
@@ -32,7 +32,7 @@ from vbnfault.reflectance.hapke import hapke_at
 from vbnfault.render.description import RenderInput
 from vbnfault.render.runtime import dr, mi
 from vbnfault.render.sampling import Optics, Pixels, Strata, SunDisc
-from vbnfault.scene import config, plan
+from vbnfault.scene import config, redraw
 
 SCENE = "paper_example"  # for its six faults; the view is defined below
 SHARD_SAMPLES = 8
@@ -210,7 +210,7 @@ def _pose(surface: render.TerrainMesh) -> Pose:
         sun_elevation_deg=SUN_ELEVATION_DEG,
         sun_visible_fraction=1.0,
         tries=1,
-        variables=dict.fromkeys(plan.VARIABLES, 0.0),  # placed by hand, not drawn
+        variables=dict.fromkeys(redraw.VARIABLES, 0.0),  # placed by hand, not drawn
         resolved=True,
     )
 

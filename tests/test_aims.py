@@ -337,7 +337,7 @@ def test_limbs_pass_through_the_middle_with_sky_on_one_side(sphere: str) -> None
 
 def test_the_sun_is_in_the_frame_whole_and_others_keep_it_out(sphere: str) -> None:
     session, samples = frames_of(sphere)
-    low_deg, _ = plan.sun_elongation_deg(session.scene)
+    low_deg, _ = aims.sun_elongation_deg(session.scene)
     for index, sample in enumerate(samples):
         x, y = sample.scalars["sun_xy_px"]
         if session.plan.aim_of(index) == "sun":

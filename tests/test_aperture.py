@@ -39,7 +39,7 @@ from vbnfault.lens.straylight.paraxial import paraxial_ghosts
 from vbnfault.lens.straylight.scatter import Cleanliness, GlareLayout, veiling_glare
 from vbnfault.lens.straylight.starburst import starburst
 from vbnfault.scene import config
-from vbnfault.world import assemble
+from vbnfault.world import cameras
 
 LENSES = sorted(resources.packaged("scenes/lenses"))
 SIDE_PX = 64
@@ -51,7 +51,7 @@ def scene(**keys: Any) -> config.Scene:
 
 
 def real(name: str, f_number: float | None = None, **keys: Any) -> RealLens:
-    lens = assemble.base_camera(
+    lens = cameras.base_camera(
         scene(lens=name, **keys, **({} if f_number is None else {"f_number": f_number}))
     ).lens
     assert isinstance(lens, RealLens)
@@ -105,13 +105,13 @@ def test_an_unset_f_number_survives_the_store() -> None:
         first = scene(**keys)
         again = config.parse_scene(first.resolved(), source="again")
         assert again == first
-        assert assemble.base_camera(again).lens == assemble.base_camera(first).lens
+        assert cameras.base_camera(again).lens == cameras.base_camera(first).lens
     assert scene().camera.f_number == 4.0
     assert scene().camera.transmission == 0.9
     assert scene(lens="tessar_50_f2p8").camera.f_number is None
     with pytest.raises(InputError, match=r"camera.*transmission = 0\.5: the lens has its own"):
         scene(lens="tessar_50_f2p8", transmission=0.5)
-    assert assemble.base_camera(scene(f_number=8.0, transmission=0.5)).lens.transmission == 0.5
+    assert cameras.base_camera(scene(f_number=8.0, transmission=0.5)).lens.transmission == 0.5
 
 
 def test_the_store_says_what_the_lens_became() -> None:
@@ -133,7 +133,7 @@ def test_the_store_says_what_the_lens_became() -> None:
 
 
 def context(lens: RealLens) -> FaultContext:
-    camera = replace(assemble.base_camera(scene()), lens=lens)
+    camera = replace(cameras.base_camera(scene()), lens=lens)
     return FaultContext(camera=camera)
 
 

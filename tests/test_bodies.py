@@ -17,7 +17,7 @@ from vbnfault.body.geometry import signed_volume, vertex_normals
 from vbnfault.core.errors import InputError
 from vbnfault.reflectance import BandReflectance, radiance_factor, registry
 from vbnfault.scene import bodies, config
-from vbnfault.world import assemble
+from vbnfault.world import assemble, ephemeris
 
 BODIES = bodies.packaged_bodies()
 Array = NDArray[np.float64]
@@ -351,13 +351,13 @@ def test_another_shape_is_told_what_it_has_of_the_named_body(tmp_path: Path) -> 
 def test_directions_of_the_sun_are_those_of_the_seasons() -> None:
     """Distance and subsolar latitude of two bodies at published dates."""
     moon = scene_of("Moon", sun={"julian_date": 2451547.5})  # perihelion of the Earth, 2000-01-03
-    assert assemble.sun_distance_au(moon) == pytest.approx(0.9833, abs=2e-4)
+    assert ephemeris.sun_distance_au(moon) == pytest.approx(0.9833, abs=2e-4)
     ceres = scene_of("Ceres", sun={"julian_date": 2461599.84})
-    assert assemble.sun_distance_au(ceres) == pytest.approx(2.5452, abs=1e-4)
+    assert ephemeris.sun_distance_au(ceres) == pytest.approx(2.5452, abs=1e-4)
     # the Moon's equator is inclined by 1.54° to the ecliptic (Cassini), so the Sun's latitude never exceeds that
     latitudes = []
     for date in np.linspace(2451545, 2451910, 60):
-        sun_J, own = assemble.ephemeris(scene_of("Moon", sun={"julian_date": float(date)}))
+        sun_J, own = ephemeris.ephemeris(scene_of("Moon", sun={"julian_date": float(date)}))
         latitudes.append(math.degrees(math.asin((own @ sun_J)[2] / np.linalg.norm(sun_J))))
     assert max(np.abs(latitudes)) < 1.7
 

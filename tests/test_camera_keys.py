@@ -22,7 +22,7 @@ from vbnfault.detector import MosaicDetector, amplified, binned, load_sensor
 from vbnfault.lens import load_lens, paraxial_properties
 from vbnfault.pipeline import Session
 from vbnfault.scene.config import Scene, parse_scene
-from vbnfault.world import assemble
+from vbnfault.world import cameras
 
 
 def scene(**camera: Any) -> Scene:
@@ -39,7 +39,7 @@ def width_mm(fov_deg: float, focal_mm: float) -> float:
 def test_a_focal_length_sets_the_field_of_view() -> None:
     camera = scene(focal_length_mm=12.5, width_px=640).camera
     assert width_mm(camera.fov_deg, 12.5) == pytest.approx(640 * 5.5e-3)
-    assert assemble.base_camera(scene(focal_length_mm=12.5)).lens.focal_length_mm == pytest.approx(12.5)
+    assert cameras.base_camera(scene(focal_length_mm=12.5)).lens.focal_length_mm == pytest.approx(12.5)
 
 
 def test_the_pitch_is_that_of_the_detector_and_of_binned_pixels() -> None:
@@ -47,7 +47,7 @@ def test_the_pitch_is_that_of_the_detector_and_of_binned_pixels() -> None:
     for n in (1, 2):
         given = scene(focal_length_mm=152.5, width_px=512, height_px=512, detector="rosetta_navcam", binning=n)
         assert width_mm(given.camera.fov_deg, 152.5) == pytest.approx(512 * n * pitch_mm)
-        camera = assemble.base_camera(given)
+        camera = cameras.base_camera(given)
         assert (camera.lens.focal_length_mm, camera.fov_deg) == (pytest.approx(152.5), given.camera.fov_deg)
 
 
@@ -81,16 +81,16 @@ def test_a_field_that_cannot_be_is_refused(keys: dict[str, Any], sentence: str) 
 def test_a_lens_stays_as_it_is_unless_a_field_is_asked_for() -> None:
     own_mm = paraxial_properties(load_lens("tessar_50_f2p8")).efl_mm
     as_it_is = scene(lens="tessar_50_f2p8")
-    real = assemble.base_camera(as_it_is).lens.real
+    real = cameras.base_camera(as_it_is).lens.real
     assert real is not None
     assert real.prescription.scale == 1
     assert width_mm(as_it_is.camera.fov_deg, own_mm) == pytest.approx(1024 * 5.5e-3)
-    assert assemble.scaled_lens(as_it_is) == ""
+    assert cameras.scaled_lens(as_it_is) == ""
     for asked in ({"fov_deg": 40.0}, {"focal_length_mm": 20.0}):
         scaled = scene(lens="tessar_50_f2p8", **asked)
-        real = assemble.base_camera(scaled).lens.real
+        real = cameras.base_camera(scaled).lens.real
         assert real is not None
-        assert f"scales Tessar 50 mm f/2.8 by {real.focal_length_mm / own_mm:.3g}" in assemble.scaled_lens(scaled)
+        assert f"scales Tessar 50 mm f/2.8 by {real.focal_length_mm / own_mm:.3g}" in cameras.scaled_lens(scaled)
 
 
 def test_a_session_warns_of_a_scaled_lens() -> None:
@@ -180,8 +180,8 @@ def test_a_gain_multiplies_signal_and_hot_pixels_in_dn() -> None:
     dark, louder_dark = (raw(amplified(sensor, g), 0.0, 64, 5, exposure_s=20.0).ravel()[chosen] for g in (1.0, 4.0))
     assert dark.mean() > 1.1 * np.median(raw(sensor, 0.0, 64, 5, exposure_s=20.0))
     assert louder_dark.mean() / dark.mean() == pytest.approx(4, rel=0.05)
-    three = assemble.base_camera(scene(gain=4.0)).detector
-    assert three.white_e == pytest.approx(assemble.base_camera(scene()).detector.white_e / 4)
+    three = cameras.base_camera(scene(gain=4.0)).detector
+    assert three.white_e == pytest.approx(cameras.base_camera(scene()).detector.white_e / 4)
 
 
 def test_a_binned_and_amplified_camera_builds_a_store(tmp_path: Path) -> None:

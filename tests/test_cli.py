@@ -14,10 +14,10 @@ import sys
 import tomllib
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
+import tomli_w
 from conftest import small_scene
 from tools import victim
 
@@ -32,23 +32,10 @@ from vbnfault.pipeline.spec import Frame
 ENVIRONMENT = {**os.environ, "PYTHONWARNINGS": "error::UserWarning"}
 
 
-def toml(table: dict[str, Any]) -> str:
-    """Enough TOML for a scene of plain values and nested tables."""
-
-    def value(v: Any) -> str:
-        if isinstance(v, dict):
-            return "{ " + ", ".join(f"{k} = {value(x)}" for k, x in v.items()) + " }"
-        if isinstance(v, list | tuple):
-            return "[" + ", ".join(map(value, v)) + "]"
-        return json.dumps(v)
-
-    return "\n".join(f"{k} = {value(v)}" for k, v in table.items()) + "\n"
-
-
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("scene") / "small.toml"
-    path.write_text(toml(small_scene(dataset={"samples": 8, "shard_samples": 2, "sites": 4})))
+    path.write_text(tomli_w.dumps(small_scene(dataset={"samples": 8, "shard_samples": 2, "sites": 4})))
     return path
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from poses_kit import columns_of, row
 from scipy.integrate import quad
 
 import vbnfault
@@ -22,9 +23,8 @@ from vbnfault.render.description import View
 from vbnfault.scene import config
 from vbnfault.scene.coma import ComaTable, PhaseFunctionTable
 from vbnfault.scene.trajectory import as_trajectory
-from vbnfault.world.coma import Coma, Lines, Outflow, Shadow, make_coma, sun_axes
+from vbnfault.world.coma import Coma, Lines, Outflow, Shadow, make_coma, relative_phase, sun_axes
 from vbnfault.world.coma_ground import diffuse_reflectance, dust_towards_sun, irradiance_of_sky
-from vbnfault.world.dust_phase import relative_phase
 from vbnfault.world.haze import haze
 
 RADIUS_M = 1000.0
@@ -269,7 +269,7 @@ def test_an_image_agrees_with_lines_through_every_pixel(
     depth = (length / norm).astype(np.float32).reshape(size, size)
 
     got, optical_depth = haze(dust, shadow, view, depth, semantic)
-    light = dust.relative_light(view.position_L_m, rays, length, shadow) * dust.phase(rays @ SUN)
+    light = dust.relative(view.position_L_m, rays, length, shadow)[0] * dust.phase(rays @ SUN)
     column = dust.column(start, np.sqrt(np.maximum(distance2, 1e-6)), length)
     want = (light * column / (8 * np.pi**2)).reshape(size, size)
     # of the ground: Afρ / (2 π 4 p) for each unit of the column, with the dust in shadow
@@ -315,7 +315,7 @@ def test_light_of_the_sky_is_the_sum_over_20000_directions(zenith_deg: float) ->
     start = rays @ camera
     column = dust.column(start, np.sqrt(np.maximum(camera @ camera - start**2, 1.0)), endless)
     phase_deg = np.degrees(np.arccos(np.clip(-rays @ SUN, -1, 1)))
-    light = dust.relative_light(camera, rays, endless, shadow) * column * RADIUS_M
+    light = dust.relative(camera, rays, endless, shadow)[0] * column * RADIUS_M
     light *= relative_phase("halley_marcus", np.minimum(phase_deg, 150))
     tilts = [(0, 0), (40, 0), (40, 90), (60, 180), (90, 60), (120, 120)]
     facets = np.array([normals_of(up, sunward, *tilt) for tilt in tilts])
@@ -354,14 +354,14 @@ def test_a_lambert_surface_sends_even_light_to_all_sides() -> None:
 
 def test_dust_dims_and_lights_the_ground() -> None:
     """Of a sphere from 300 radii: sunlit ground fades by both optical depths, the night side shines a little."""
-    row = pose((300e3, 0, 0), (np.cos(np.radians(60)), 0, np.sin(np.radians(60))))
+    far = pose((300e3, 0, 0), (np.cos(np.radians(60)), 0, np.sin(np.radians(60))))
     keys = {"afrho_cm": 15_000.0, "sunlit_fraction": 0.0, "reddening_per_100nm": 0.0}
     table = small_scene()
     without, only_haze, whole = (
-        simulated({**table, **more}, row)[0].layers["radiance"][1].astype(np.float64)
+        simulated({**table, **more}, far)[0].layers["radiance"][1].astype(np.float64)
         for more in ({}, {"coma": {**keys, "affects_ground": False}}, {"coma": keys})
     )
-    flown = as_trajectory({key: [value] for key, value in row.items()}).pose(0)
+    flown = as_trajectory(columns_of([far])).pose(0)
     sun_C = flown.T_from_C.T @ flown.sun_direction_T
     tangent = (np.arange(64) + 0.5 - 32) / 32 * np.tan(np.radians(1))
     x, y = np.meshgrid(tangent, tangent)
@@ -393,23 +393,10 @@ def test_dust_dims_and_lights_the_ground() -> None:
 
 # --- scenes -------------------------------------------------------------------------------------------------
 
-FAR = {"name": "far", "julian_date": 2457000.5, "sun_distance_au": 1.5}
-
 
 def pose(camera_T_m: Any, sun_T: Any, name: str = "far") -> dict[str, Any]:
-    """Return a row of a table of poses that looks at the origin."""
-    from scipy.spatial.transform import Rotation
-
-    camera = np.array(camera_T_m, dtype=float)
-    z = -camera / np.linalg.norm(camera)
-    x = np.cross([0.3, 0.5, 0.8], z)
-    x /= np.linalg.norm(x)
-    w = Rotation.from_matrix(np.stack([x, np.cross(z, x), z])).as_quat(scalar_first=True)
-    sun = np.array(sun_T, float) / np.linalg.norm(sun_T)
-    columns = {f"camera_{a}_T_m": v for a, v in zip("xyz", camera, strict=True)}
-    columns |= {f"camera_from_T_{a}": v for a, v in zip("wxyz", w, strict=True)}
-    columns |= {f"sun_{a}_T": v for a, v in zip("xyz", sun, strict=True)}
-    return {**FAR, "name": name, **columns}
+    """Return a row of a table of poses at 1.5 au."""
+    return row(name, camera_T_m, np.array(sun_T, float) / np.linalg.norm(sun_T), sun_distance_au=1.5)
 
 
 def small_scene(**coma_table: Any) -> dict[str, Any]:
@@ -442,18 +429,18 @@ def small_scene(**coma_table: Any) -> dict[str, Any]:
 def simulated(table: dict[str, Any], *rows: dict[str, Any]) -> list[Any]:
     """Return the samples of a scene, one for each row of poses."""
     scene = config.parse_scene(table, source="t.toml")
-    session = pipeline.Session(scene, poses={key: [row[key] for row in rows] for key in rows[0]})
+    session = pipeline.Session(scene, poses=columns_of(rows))
     return [session.simulate(k) for k in range(len(rows))]
 
 
 @pytest.mark.filterwarnings("ignore:body.shape = 'ellipsoid'")
 def test_the_radiance_of_an_even_coma_is_that_of_a_column_that_falls_as_one_over_b() -> None:
     """L = E Afρ Φ / (8 π b) from 300 radii away, at the phase angle where Φ has its minimum."""
-    row = pose((300e3, 0, 0), (np.cos(np.radians(53)), 0, np.sin(np.radians(53))))
+    far = pose((300e3, 0, 0), (np.cos(np.radians(53)), 0, np.sin(np.radians(53))))
     keys = {"afrho_cm": 5000.0, "sunlit_fraction": 0.0, "reddening_per_100nm": 0.1, "distance_exponent": 3.0}
     keys |= {"affects_ground": False}
-    without = simulated(small_scene(), row)[0].layers
-    layers = simulated(small_scene(**keys), row)[0].layers
+    without = simulated(small_scene(), far)[0].layers
+    layers = simulated(small_scene(**keys), far)[0].layers
     added = layers["radiance"].astype(np.float64) - without["radiance"]
     np.testing.assert_array_equal(layers["semantic"], without["semantic"])
     np.testing.assert_array_equal(layers["depth_m"], without["depth_m"])
@@ -465,7 +452,7 @@ def test_the_radiance_of_an_even_coma_is_that_of_a_column_that_falls_as_one_over
     bands = spectra.solar_band_irradiance_W_m2_nm(nodes, 1.5) * (1 + 0.1 * (nodes - 550) / 100)
     want = bands[:, None, None] * 50 * 1.5**-3 * 0.3383 / (8 * np.pi * b_m)
     # on the side of the Sun no line meets the shadow; two pixels at the limb are averaged over both sides
-    flown = as_trajectory({key: [value] for key, value in row.items()}).pose(0)
+    flown = as_trajectory(columns_of([far])).pose(0)
     sun_C = flown.T_from_C.T @ flown.sun_direction_T
     sunward_m = 300e3 * (x * sun_C[0] + y * sun_C[1]) / np.hypot(*sun_C[:2])
     sky = (without["semantic"] == SKY) & (sunward_m > 1.4 * RADIUS_M)
@@ -490,7 +477,7 @@ def test_the_radiance_of_an_even_coma_is_that_of_a_column_that_falls_as_one_over
 @pytest.mark.parametrize(("distance_m", "most"), [(45e3, 0.05), (150e3, 0.05), (6e6, 0.02)])
 def test_pixels_that_the_limb_crosses_have_the_light_of_both_sides(distance_m: float, most: float) -> None:
     """Against the mean of 64 pixels of a render eight times as fine, of a sphere 82, 24 and 0.6 pixels wide."""
-    row = pose((distance_m, 0, 0), (np.cos(np.radians(53)), 0, np.sin(np.radians(53))))
+    far = pose((distance_m, 0, 0), (np.cos(np.radians(53)), 0, np.sin(np.radians(53))))
     pixels = 96 if distance_m < 1e5 else 48
 
     def dust(finer: int, **keys: Any) -> np.ndarray:
@@ -502,7 +489,7 @@ def test_pixels_that_the_limb_crosses_have_the_light_of_both_sides(distance_m: f
                 "fov_deg": 2.0 * pixels / 64,
             }
             table["render"] = {"samples_per_pixel": 4, "bounces": 0}
-        first, second = (simulated(table, row)[0].layers["radiance"][1].astype(np.float64) for table in of)
+        first, second = (simulated(table, far)[0].layers["radiance"][1].astype(np.float64) for table in of)
         return first - second
 
     got, fine = dust(1), dust(8)
@@ -519,7 +506,7 @@ def test_jets_turn_with_the_body_and_stop_at_night() -> None:
     keys = {"afrho_cm": 5000.0, "sunlit_fraction": 0.0, "jets": [jet]}
     rows = [pose((0, 120e3, 0), (0.0, 0, 1), "day"), pose((0, 120e3, 0), (0.0, 0, -1), "night")]
     day, night = (s.layers["radiance"][1] for s in simulated(small_scene(**keys), *rows))
-    seen = as_trajectory({key: [rows[0][key]] for key in rows[0]}).pose(0)
+    seen = as_trajectory(columns_of(rows[:1])).pose(0)
     north = seen.T_from_C.T @ np.array([0, 0, 1.0])
     focal = 32 / np.tan(np.radians(1))
     place = 32 + focal * (1600 * north)[:2] / 120e3
@@ -584,22 +571,7 @@ def test_a_jet_follows_the_cosine_of_the_suns_zenith_angle_and_the_distance_its_
     [
         ({"afrho_cm": 0.0}, "coma.afrho_cm = 0.0: must be a number above 0 and at most 1e[+]07"),
         ({}, "coma.afrho_cm: is missing"),
-        ({"afrho_cm": 1.0, "reference_au": 0.0}, "coma.reference_au = 0.0: must be a number from 0.01 to 1000"),
-        (
-            {"afrho_cm": 1.0, "distance_exponent": 21.0},
-            "coma.distance_exponent = 21.0: must be a number from 0 to 20",
-        ),
-        (
-            {"afrho_cm": 1.0, "reddening_per_100nm": 2.0},
-            "coma.reddening_per_100nm = 2.0: must be a number from -0.3",
-        ),
-        ({"afrho_cm": 1.0, "sunlit_fraction": 1.5}, "coma.sunlit_fraction = 1.5: must be a number from 0 to 1"),
-        ({"afrho_cm": 1.0, "random_jets": 65}, "coma.random_jets = 65: must be a whole number from 0 to 64"),
         ({"afrho_cm": 1.0, "random_jet_width_deg": [9.0, 8.0]}, "coma.random_jet_width_deg = .*bounds reversed"),
-        (
-            {"afrho_cm": 1.0, "random_jet_strength": [0.0, 2000.0]},
-            r"coma.random_jet_strength\[1\] = 2000.0: must be",
-        ),
         ({"afrho_cm": 1.0, "phase_function": "halley"}, "coma.phase_function = 'halley': must be .*halley_marcus"),
         (
             {"afrho_cm": 1.0, "phase_function": {"phase_deg": [0.0, 90.0], "value": [1.0, 2.0]}},
@@ -649,4 +621,4 @@ def test_dust_that_is_not_thin_is_refused() -> None:
     _ = pipeline.Session(scene).body
     rows = [pose((3e5, 0, 0), (1, 0, 0.5)), {**pose((3e5, 0, 0), (1, 0, 0.5), "near"), "sun_distance_au": 1.0}]
     with pytest.raises(InputError, match=sentence):
-        _ = pipeline.Session(scene, poses={key: [row[key] for row in rows] for key in rows[0]}).body
+        _ = pipeline.Session(scene, poses=columns_of(rows)).body

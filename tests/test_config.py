@@ -64,29 +64,17 @@ TITLE = 'title = "t"\n'
         ),
         # field of view
         (TITLE + "[camera]\nfov_deg = 0", ["camera.fov_deg = 0:", "0.01 to 140"]),
-        (TITLE + "[camera]\nfov_deg = 200", ["camera.fov_deg = 200:", "0.01 to 140"]),
-        (TITLE + "[camera]\nfov_deg = -65.5", ["camera.fov_deg = -65.5:", "0.01 to 140"]),
         (TITLE + "[camera]\nfov_deg = nan", ["camera.fov_deg = nan:", "0.01 to 140"]),
-        (TITLE + "[camera]\nfov_deg = inf", ["camera.fov_deg = inf:", "0.01 to 140"]),
         # types are not converted
         (TITLE + '[camera]\nfov_deg = "65"', ["camera.fov_deg = '65':", "number", "0.01 to 140"]),
-        (TITLE + "[camera]\nfov_deg = true", ["camera.fov_deg = True:", "number"]),
-        (TITLE + '[camera]\nwidth_px = "1024"', ["camera.width_px = '1024':", "whole number", "16 to 16384"]),
-        (TITLE + "[camera]\nwidth_px = 1024.5", ["camera.width_px = 1024.5:", "whole number"]),
-        (TITLE + "[camera]\nwidth_px = true", ["camera.width_px = True:", "whole number"]),
         (TITLE + "[dataset]\nseed = 1e3", ["dataset.seed = 1000.0:", "whole number"]),
         (TITLE + "camera = 3", ["camera = 3:", "must be"]),
         (TITLE + "[[camera]]\nfov_deg = 3", ["camera =", "must be"]),
         (TITLE + '[dataset]\nlayers = "clean"', ["dataset.layers = 'clean':", "must be"]),
         (TITLE + "[sun]\njulian_date = 2014-11-12", ["sun.julian_date", "2014-11-12", "number"]),
         # ranges
-        (TITLE + "[dataset]\nsamples = 0", ["dataset.samples = 0:", "from 1 to"]),
-        (TITLE + "[dataset]\nseed = -1", ["dataset.seed = -1:", "from 0"]),
-        (TITLE + "[plan]\nfaulty_fraction = 1.2", ["plan.faulty_fraction = 1.2:", "0 to 1"]),
         (TITLE + "[plan]\nclasses_per_sample = [0, 3]", ["plan.classes_per_sample", "= 0:", "1 to 64"]),
         (TITLE + "[geometry]\nheight_m = [-3, 1]", ["geometry.height_m", "= -3:", "from 0"]),
-        (TITLE + "[sun]\ndistance_au = 0", ["sun.distance_au = 0:", "above 0.01", "1000"]),
-        (TITLE + "[body]\nreflectance = 2", ["body.reflectance = 2:", "0 to 1"]),
         (TITLE + "[camera]\nexposure_s = 2e4", ["exposure_s = 20000.0:", "'auto'", "at most 10000"]),
         (TITLE + "[camera]\nexposure_s = 0", ["exposure_s = 0", "'auto'", "above 0"]),
         (TITLE + "[render]\nsamples_per_pixel = 8", ["samples_per_pixel = 8:", "1, 4, 16, 64"]),
@@ -109,11 +97,11 @@ TITLE = 'title = "t"\n'
         (TITLE + '[dataset]\nlayers = ["clean", "clean"]', ["dataset.layers = ", "clean is named twice"]),
         (
             TITLE + "[camera]\nexposure_min_s = 3\nexposure_max_s = 1",
-            ["exposure_min_s", "exposure_max_s", "reversed"],
+            ["exposure_min_s = 3", "exposure_max_s", "reversed"],
         ),
         (
             TITLE + "[render]\nband_min_nm = 700\nband_max_nm = 400",
-            ["band_min_nm", "band_max_nm", "reversed"],
+            ["band_min_nm = 700", "band_max_nm", "reversed"],
         ),
         # not TOML
         (TITLE + "x = ", ["not a TOML file"]),
@@ -126,28 +114,14 @@ TITLE = 'title = "t"\n'
         (TITLE + "[body]\nsemi_axes_m = [0, 1, 1]", ["body.semi_axes_m[0] = 0:", "1e+09"]),
         (TITLE + '[camera]\nexposure_s = "fast"', ["exposure_s = 'fast'", "'auto'"]),
         (TITLE + "[dataset]\nsplit = {train = 0.5}", ["train", "0.5"]),
-        (
-            TITLE + "[camera]\nexposure_min_s = 3\nexposure_max_s = 1",
-            ["exposure_min_s = 3"],
-        ),
-        (
-            TITLE + "[render]\nband_min_nm = 700\nband_max_nm = 400",
-            ["band_min_nm = 700"],
-        ),
+        ("title = 2020-01-01", ["title"]),
+        (TITLE + '"a\\nb" = 1', ["unknown key"]),
     ],
 )
 def test_refused_in_one_sentence(text: str | bytes, must_say: list[str], tmp_path: Path) -> None:
     sentence = refusal(text, tmp_path)
     for part in must_say:
         assert part in sentence
-
-
-def test_a_date_is_no_title(tmp_path: Path) -> None:
-    assert "title" in refusal("title = 2020-01-01", tmp_path)
-
-
-def test_a_key_with_a_newline_still_makes_one_line(tmp_path: Path) -> None:
-    assert "unknown key" in refusal(TITLE + '"a\\nb" = 1', tmp_path)
 
 
 def schema_numbers() -> list[tuple[str, str, dict[str, Any]]]:
@@ -161,13 +135,6 @@ def schema_numbers() -> list[tuple[str, str, dict[str, Any]]]:
             if options and any("inimum" in k or "aximum" in k for k in options[0]):
                 found.append((table, key, options[0]))
     return found
-
-
-def test_the_walk_over_the_numbers_finds_them() -> None:
-    assert len(schema_numbers()) > 30
-    assert {("camera", "fov_deg"), ("sun", "distance_au"), ("body", "reflectance"), ("dataset", "seed")} <= {
-        (table, key) for table, key, _ in schema_numbers()
-    }
 
 
 @pytest.mark.parametrize(
@@ -194,6 +161,7 @@ def test_every_number_is_refused_just_outside_its_range(table: str, key: str, sc
 
 
 def test_every_number_is_accepted_at_its_bounds() -> None:
+    assert len(schema_numbers()) > 30
     for table, key, schema in schema_numbers():
         if (table, key) in (("render", "band_min_nm"), ("render", "band_max_nm"), ("dataset", "split")):
             continue  # bound to each other
@@ -298,6 +266,7 @@ def test_unset_bounds_follow_the_field_of_view_and_set_ones_stay() -> None:
 def test_resolved_scene_is_a_scene_again() -> None:
     for name in PACKAGED:
         scene = load_scene(name)
+        assert scene.title == name
         plain = scene.resolved()
         assert json.loads(json.dumps(plain)) == plain
         assert parse_scene(plain, source="again") == scene
@@ -348,14 +317,6 @@ def test_a_scene_cannot_be_edited() -> None:
 
 
 # -------------------------------------------------------------------------------------------- packaged scenes
-
-
-@pytest.mark.parametrize("name", PACKAGED)
-def test_packaged_scenes_load_with_their_faults(name: str) -> None:
-    scene = load_scene(name)
-    assert scene.title == name
-    for fault_class, table in scene.faults.items():
-        assert faults.from_dict(fault_class, table, source=name).fault == fault_class
 
 
 def test_mission_classes_carry_the_faults_of_the_papers_table() -> None:
@@ -441,25 +402,6 @@ def test_the_models_own_defaults_are_the_papers_bounds() -> None:
     found["broken_pixels"]["salt_and_pepper_fraction"] = 0.05
     for fault, table in found.items():
         assert faults.from_dict(fault, {"model": table["model"]}, source="t").to_dict() == table
-
-
-def test_paper_example_is_the_papers_table_of_injected_parameters() -> None:
-    found = paper_faults("paper_example")
-    assert found["dust_on_optics"]["count"] == [50, 50]
-    assert found["broken_pixels"]["count"] == [9, 9]
-    assert (found["broken_lines"]["white_count"], found["broken_lines"]["black_count"]) == (3, 2)
-    assert found["broken_lines"]["count"] == [5, 5]
-    flares = found["straylight"]["flares"]
-    assert [f["index"] for f in flares] == [3, 4, 5]
-    assert [f["position"] for f in flares] == [0.83, 1.00, 1.17]
-    assert [f["radius"] for f in flares] == [0.11, 0.13, 0.16]
-    assert [f["brightness"] for f in flares] == [1.5, 1.5, 1.5]
-    assert found["vignetting"]["on_axis_illuminance_dn"] == [255, 255]
-    assert found["optics_degradation"]["filter_size_px"] == [3, 3]
-    camera = load_scene("paper_example").camera
-    assert camera.readout_directions == ("right",)
-    assert camera.architectures[0].endswith("_ccd")
-    assert len(camera.architectures) == 1
 
 
 # ------------------------------------------------------------------------------------------------ JSON schema

@@ -18,7 +18,7 @@ from vbnfault.render import atmosphere, earth
 from vbnfault.render.description import View
 from vbnfault.render.runtime import dr, mi
 from vbnfault.scene import config
-from vbnfault.world import assemble
+from vbnfault.world import ephemeris
 
 F64 = NDArray[np.float64]
 RADIUS_M, SCALE_M = 6.371e6, 8430.0
@@ -88,7 +88,7 @@ def test_the_light_of_the_whole_earth_is_as_measured() -> None:
     keys |= {"render.samples_per_pixel": 4, "dataset.layers": ["clean", "radiance"]}
     scene = config.load_scene("earth_observation", keys)
     session = Session(scene, poses=poses)
-    sun = spectra.solar_band_irradiance_W_m2_nm(assemble.wavelengths_nm(scene), 1.0)
+    sun = spectra.solar_band_irradiance_W_m2_nm(ephemeris.wavelengths_nm(scene), 1.0)
     solid_angle = (2 * np.tan(half) / size_px) ** 2
     flux = np.array(
         [

@@ -17,8 +17,8 @@ from vbnfault.core import frames
 from vbnfault.core.errors import InputError
 from vbnfault.pipeline import Session, resolve
 from vbnfault.pipeline.spec import Pose
-from vbnfault.scene import config, exchange, plan
-from vbnfault.world import ground, siting
+from vbnfault.scene import config, exchange, plan, redraw
+from vbnfault.world import ground
 
 # Every test is of a fixed seed; 1e-3 over about 16 comparisons.
 LEVEL = 1e-3 / 16
@@ -48,12 +48,12 @@ def test_straylight_comes_first_as_in_the_papers_equation() -> None:
 def test_every_variable_is_uniform_and_the_sun_out_of_averted_frames(stratum: int) -> None:
     scene, table = paper()
     here = table.stratum == stratum
-    for name in plan.VARIABLES:
-        low, high = (bound[stratum] for bound in plan.bounds(scene, name))
+    for name in redraw.VARIABLES:
+        low, high = (bound[stratum] for bound in redraw.bounds(scene, name))
         assert stats.kstest((table.variables[name][here] - low) / (high - low), "uniform").pvalue > LEVEL
     if stratum == plan.SUN_AVERTED:
         angle = frames.boresight_angle_deg(*(table.variables[name][here] for name in ("roll_deg", "pitch_deg")))
-        assert angle.min() >= plan.least_sun_angle_deg(scene)
+        assert angle.min() >= redraw.least_sun_angle_deg(scene)
 
 
 def test_suns_of_a_site_come_from_one_sector_and_views_move_within_a_shard() -> None:
@@ -69,8 +69,8 @@ def test_suns_of_a_site_come_from_one_sector_and_views_move_within_a_shard() -> 
         assert {k // 8 for k in members} == {index // 8}
         assert {table.stratum[k] for k in members} == {table.stratum[index]}
         seen = [table.view(scene, index, attempt) for attempt in range(len(members))]
-        moved = plan.VARIABLES if not facing[index] else ("x_m", "y_m", "height_m")
-        for name in plan.VARIABLES:
+        moved = redraw.VARIABLES if not facing[index] else ("x_m", "y_m", "height_m")
+        for name in redraw.VARIABLES:
             of_members = table.variables[name][members].tolist()
             kept = [table.variables[name][index]] * len(members)
             assert sorted(view[name] for view in seen) == sorted(of_members if name in moved else kept)
@@ -85,7 +85,7 @@ def test_an_appended_block_leaves_views_and_sites_of_the_first_alone() -> None:
     short, long = (
         plan.make_plan(scene, list(scene.faults), b, need_sun=["straylight"]) for b in ([100], [100, 60])
     )
-    for name in plan.VARIABLES:
+    for name in redraw.VARIABLES:
         np.testing.assert_array_equal(short.variables[name], long.variables[name][:100])
     for index in range(100):
         assert short.members(index) == long.members(index)
@@ -114,10 +114,10 @@ def test_more_suns_are_seen_from_the_sites_that_are_chosen_for_them() -> None:
     drawn = {name: values[suns] for name, values in table.variables.items()}
     model = ground.shape_model(session.body)
     random = choose_sites(session.body, 8, scene.dataset.seed)
-    seen = [siting.suns_seen(scene, model, random[k], drawn).mean() for k in range(8)]
-    chosen = siting.suns_seen(scene, model, session.sites[site], drawn)
+    seen = [ground.suns_seen(scene, model, random[k], drawn).mean() for k in range(8)]
+    chosen = ground.suns_seen(scene, model, session.sites[site], drawn)
     assert chosen.mean() > max(0.9, np.mean(seen))
-    assert siting.suns_seen(scene, model, random[0], {**drawn, "sun_elevation_deg": np.full(len(suns), 89.0)}).all()
+    assert ground.suns_seen(scene, model, random[0], {**drawn, "sun_elevation_deg": np.full(len(suns), 89.0)}).all()
 
 
 # The paper's geometry over a small body with coarse ground. Half of the Suns are below the horizon.

@@ -16,7 +16,7 @@ from vbnfault.core.quantities import BODY, SKY, Electrons, Radiance
 from vbnfault.pipeline import exposure
 from vbnfault.scene import config
 from vbnfault.scene.config import Scene
-from vbnfault.world import assemble
+from vbnfault.world import cameras, ephemeris
 
 SIZE = {"width_px": 32, "height_px": 32}
 
@@ -28,8 +28,8 @@ def parsed(**tables: Any) -> Scene:
 
 def facet(scene: Scene) -> Radiance:
     """A frame full of Lambert's ground whose normal is 45 degrees from the Sun: L = rho E cos(45) / pi."""
-    wavelength = assemble.wavelengths_nm(scene)
-    sun = assemble.sunlight(scene, np.array([0.0, 0.0, -1.0])).irradiance_W_m2_nm
+    wavelength = ephemeris.wavelengths_nm(scene)
+    sun = ephemeris.sunlight(scene, np.array([0.0, 0.0, -1.0])).irradiance_W_m2_nm
     table = scene.body.reflectance
     rho = spectra.reflectance(table if isinstance(table, str | float) else table.model_dump(), wavelength)
     light = (rho * sun * np.cos(np.radians(45)) / np.pi).astype(np.float32)
@@ -41,7 +41,7 @@ def test_the_reference_exposure_puts_a_facet_at_45_degrees_at_the_metering_level
     level: float, slope_mag_deg: float
 ) -> None:
     scene = parsed(camera={"metering_level": level}, body={"photometry": {"phase_slope_mag_deg": slope_mag_deg}})
-    camera = assemble.base_camera(scene)
+    camera = cameras.base_camera(scene)
     found = camera.expose(facet(scene), exposure.reference_exposure_s(scene, camera))
     # a facet that light meets and leaves at 45 degrees in planes at right angles has a phase of 60 degrees
     dimmed = 10 ** (-0.4 * slope_mag_deg * 60)
@@ -52,7 +52,7 @@ def test_the_reference_exposure_puts_a_facet_at_45_degrees_at_the_metering_level
 
 def metered(scene: Scene, brightness: np.ndarray, semantic: np.ndarray) -> tuple[float, float]:
     """Return the metered exposure of a frame of given brightness after one second, and the reference."""
-    camera: Camera = assemble.base_camera(scene)
+    camera: Camera = cameras.base_camera(scene)
     white = np.ones(4, dtype=np.float32)
     rate = Electrons(array=np.tile(brightness[..., None].astype(np.float32), (1, 1, 4)), white_e=white)
     truth: Any = SimpleNamespace(semantic=semantic)
@@ -113,7 +113,7 @@ def test_the_exposure_stays_within_the_cameras_limits() -> None:
 
 def test_electrons_of_a_second_are_the_rate() -> None:
     scene = parsed()
-    camera = assemble.base_camera(scene)
+    camera = cameras.base_camera(scene)
     light = facet(scene)
     rate = camera.expose(light, 1.0)
     # by the lens's irradiance and the detector's exposure of a quarter of a second, apart from Camera.expose
@@ -126,7 +126,7 @@ def test_electrons_of_a_second_are_the_rate() -> None:
 def test_a_view_without_ground_is_foreseen_at_the_references_exposure(detector: str) -> None:
     """The ground of a view whose frame is all sky has no pixels, which both detectors must accept."""
     scene = parsed(camera={"detector": detector} if detector else {})
-    camera = assemble.base_camera(scene)
+    camera = cameras.base_camera(scene)
     sky = SimpleNamespace(semantic=np.full((32, 32), SKY, dtype=np.uint8))
     view = SimpleNamespace(intrinsics=(40.0, 40.0, 16.0, 16.0), width_px=32, height_px=32)
     foreseen = exposure.foreseen_exposure_s(scene, camera, sky, view, facet(scene))

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation as Reference
 from vbnfault.core import frames
 from vbnfault.core.errors import InputError
 from vbnfault.scene import config
-from vbnfault.world import assemble
+from vbnfault.world import ephemeris
 
 ROTATION_67P = frames.Rotation(
     pole_ra_deg=69.54, pole_dec_deg=64.11, prime_meridian_deg=114.69, period_h=24 * 360 / 696.543884683
@@ -323,7 +323,7 @@ def test_a_parabola_has_no_mean_motion() -> None:
     table = {"eccentricity": 1.0, "perihelion_au": 1.0, "inclination_deg": 0.0, "node_deg": 0.0}
     table |= {"argument_deg": 0.0, "perihelion_jd": 2457000.0}
     scene = config.parse_scene(small_scene(orbit=table), source="test")
-    assert np.isfinite(assemble.ephemeris(scene)[0]).all()
+    assert np.isfinite(ephemeris.ephemeris(scene)[0]).all()
     with pytest.raises(InputError, match=r"orbit.mean_motion_deg_day = 0.1: a parabola .* has none"):
         config.parse_scene(small_scene(orbit={**table, "mean_motion_deg_day": 0.1}), source="test")
 
@@ -378,16 +378,16 @@ def test_a_bodys_own_orbit() -> None:
     from dataclasses import asdict
 
     elements = asdict(frames.ORBIT_67P)
-    built_in = assemble.ephemeris(config.parse_scene(small_scene(), source="test"))[0]
+    built_in = ephemeris.ephemeris(config.parse_scene(small_scene(), source="test"))[0]
     written = config.parse_scene(small_scene(orbit=elements), source="test")
-    np.testing.assert_array_equal(assemble.ephemeris(written)[0], built_in)
+    np.testing.assert_array_equal(ephemeris.ephemeris(written)[0], built_in)
     del elements["mean_motion_deg_day"]
     derived = config.parse_scene(small_scene(orbit=elements), source="test")
     # Gauss's constant and the published mean motion agree to 1e-7, over 273 days from perihelion
-    np.testing.assert_allclose(assemble.ephemeris(derived)[0], built_in, rtol=1e-5)
+    np.testing.assert_allclose(ephemeris.ephemeris(derived)[0], built_in, rtol=1e-5)
     circle = {"eccentricity": 0.0, "perihelion_au": 1.0, "perihelion_jd": 2456974.0 - 365.2568984 / 4}
     circle |= {"inclination_deg": 0.0, "node_deg": 0.0, "argument_deg": 0.0}
-    sun = assemble.ephemeris(config.parse_scene(small_scene(orbit=circle), source="test"))[0]
+    sun = ephemeris.ephemeris(config.parse_scene(small_scene(orbit=circle), source="test"))[0]
     # a quarter of a Gaussian year after perihelion on +x: on +y of the ecliptic
     tilt = np.radians(frames.OBLIQUITY_DEG)
     np.testing.assert_allclose(-sun, [0, np.cos(tilt), np.sin(tilt)], atol=1e-8)

@@ -21,7 +21,7 @@ from vbnfault.lens import (
 )
 from vbnfault.lens.glass import C_NM, D_NM, F_NM
 from vbnfault.scene import config
-from vbnfault.world import assemble
+from vbnfault.world import cameras
 
 
 @pytest.mark.parametrize("name", LENSES)
@@ -113,7 +113,7 @@ def test_a_frame_wider_than_the_lenss_field_is_told() -> None:
     sizes = {"width_px": 96, "height_px": 96}
     table = small_scene(camera={**sizes, "lens": "tessar_50_f2p8"}) | {"faults": {"dust_on_optics": {}}}
     scene = config.parse_scene(table, source="test")
-    lens = assemble.base_camera(scene).lens.real
+    lens = cameras.base_camera(scene).lens.real
     assert lens is not None
     field = lens.coverage
     for off_deg, is_lit in ((-0.5, True), (1.5, False)):  # field angles of the tables are 0.9 deg apart
@@ -124,7 +124,7 @@ def test_a_frame_wider_than_the_lenss_field_is_told() -> None:
     lit = np.degrees(np.arctan(lens.undistorted(pixels.ravel()))) < field.field_deg
     # a pixel at the edge of the lit part counts as a whole here: of some 75 px along it, half a pixel each
     assert field.lit_fraction == pytest.approx(lit.mean(), abs=75 * 0.5 / 48**2)
-    sentence = assemble.dark_corners(scene)
+    sentence = cameras.dark_corners(scene)
     assert sentence.startswith("camera.fov_deg = 65: Tessar 50 mm f/2.8 passes light up to 35.")
     assert f"the frame's corners lie at {field.corner_deg:.1f} deg, so 5.3% of the frame is dark" in sentence
     with pytest.warns(UserWarning, match=r"camera\.fov_deg = 65"):
@@ -133,7 +133,7 @@ def test_a_frame_wider_than_the_lenss_field_is_told() -> None:
         small_scene(camera={**sizes, "lens": "tessar_50_f2p8", "fov_deg": 45.0}), source="t"
     )
     for quiet in (narrow, *map(config.load_scene, resources.packaged("scenes"))):
-        assert assemble.dark_corners(quiet) == ""
+        assert cameras.dark_corners(quiet) == ""
 
 
 def test_directions_far_outside_have_a_place_too() -> None:

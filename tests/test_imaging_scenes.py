@@ -25,13 +25,13 @@ from vbnfault.lens import (
 )
 from vbnfault.lens.glass import D_NM
 from vbnfault.lens.image_frame import DEFAULT_LENS
+from vbnfault.pipeline.exposure import _rate_with
 from vbnfault.pipeline.record import to_sample
 from vbnfault.pipeline.spec import SceneExposure, SceneLight
-from vbnfault.pipeline.stars import _rate_with
 from vbnfault.render.description import View
 from vbnfault.scene import config, plan
 from vbnfault.store.schema import spec_from_plain
-from vbnfault.world import assemble, sky
+from vbnfault.world import assemble, cameras, ephemeris, sky
 
 
 def scene(tmp: Path | None = None, **keys: Any) -> config.Scene:
@@ -46,9 +46,9 @@ def test_bad_lenses_are_told_in_a_sentence(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"camera.*focus = 'best': needs lens"):
         scene(focus="best")
     with pytest.raises(InputError, match=r"camera\.lens: no_such: .*nikkor_35_f2p8"):
-        assemble.base_camera(scene(lens="no_such"))
+        cameras.base_camera(scene(lens="no_such"))
     with pytest.raises(InputError, match=r"camera\.lens_coating = 'gold': must be one of none, mgf2"):
-        assemble.base_camera(scene(lens="tessar_50_f2p8", lens_coating="gold"))
+        cameras.base_camera(scene(lens="tessar_50_f2p8", lens_coating="gold"))
 
 
 def test_a_lens_beside_the_scene_file_is_found_and_told_by_its_contents(tmp_path: Path) -> None:
@@ -57,7 +57,7 @@ def test_a_lens_beside_the_scene_file_is_found_and_told_by_its_contents(tmp_path
     (tmp_path / "scene.toml").write_text('title = "x"\n[camera]\nlens = "own.toml"\nlens_coating = "v"\n')
     found = config.load_scene(tmp_path / "scene.toml")
     assert found.camera.lens == str((tmp_path / "own.toml").resolve())
-    lens = assemble.base_camera(found).lens
+    lens = cameras.base_camera(found).lens
     assert isinstance(lens, RealLens)
     assert lens.prescription.surfaces[0].coating
     named = config.load_scene(tmp_path / "scene.toml", {"camera.lens": "tessar_50_f2p8"})
@@ -65,7 +65,7 @@ def test_a_lens_beside_the_scene_file_is_found_and_told_by_its_contents(tmp_path
     identities = [dataset.scene_identity(pipeline.Session(s)) for s in (found, named)]
     assert identities[0]["camera"] == identities[1]["camera"]
     assert identities[0]["camera"]["lens"].startswith("sha256:")
-    assert assemble.base_camera(named).lens is assemble.base_camera(named).lens  # its tables are made once
+    assert cameras.base_camera(named).lens is cameras.base_camera(named).lens  # its tables are made once
 
 
 def test_the_lens_of_a_thin_camera_is_told_by_its_contents(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -122,7 +122,7 @@ def test_stars_go_through_the_lens(sigma_px: float) -> None:
         render={"bands": 3, "band_min_nm": 550.0, "band_max_nm": 620.0},
     )
     stars = config.parse_scene(table, source="test")
-    c, nodes, date = assemble.base_camera(stars), assemble.wavelengths_nm(stars), stars.sun.julian_date
+    c, nodes, date = cameras.base_camera(stars), ephemeris.wavelengths_nm(stars), stars.sun.julian_date
     lens = c.lens
     assert isinstance(lens, RealLens)
     gx, gy = c.lens.guard_px
@@ -134,7 +134,9 @@ def test_stars_go_through_the_lens(sigma_px: float) -> None:
         height_px=256 + 2 * gy,
     )
     dark = Radiance(array=np.zeros((3, view.height_px, view.width_px), np.float32), wavelength_nm=nodes)
-    seen = assemble.with_stars(stars, dark, c, np.eye(3), np.ones(dark.array.shape[1:], dtype=bool), view)
+    bright = assemble.visible_stars(stars, dark, c, np.eye(3), np.ones(dark.array.shape[1:], dtype=bool), view)
+    assert bright is not None
+    seen = bright.added_to(dark)
     image = lens.image(seen)
     _check_stars_are_imaged_alone(stars, c, seen, view)
     catalogue = sky.load_catalogue().brighter_than(2.5)
@@ -163,7 +165,7 @@ def test_stars_go_through_the_lens(sigma_px: float) -> None:
 
 
 def test_a_thin_lens_has_neither_distortion_nor_guard_band() -> None:
-    thin = assemble.base_camera(scene())
+    thin = cameras.base_camera(scene())
     assert isinstance(thin.lens, ThinLens)
     assert thin.lens.guard_px == (0, 0)
     assert thin.lens.name == "thin lens"

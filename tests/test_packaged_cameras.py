@@ -22,7 +22,7 @@ from vbnfault.detector.sensor import load_sensor
 from vbnfault.lens import ThinLens, load_lens
 from vbnfault.reflectance.contract import Diffuse
 from vbnfault.scene import config
-from vbnfault.world import assemble
+from vbnfault.world import assemble, cameras, ephemeris
 
 LENSES = sorted(resources.packaged("scenes/lenses"))
 DETECTORS = sorted(resources.packaged("scenes/detectors"))
@@ -40,8 +40,8 @@ def test_the_sun_in_the_field_does_not_saturate_a_packaged_scene(name: str) -> N
     if fault is None or "veil_fraction" not in fault.to_dict():
         assert fault is None or fault.model == "texture"  # no veil
         return
-    camera, nodes = assemble.base_camera(scene), assemble.wavelengths_nm(scene)
-    sun = assemble.sunlight(scene, np.array([0.0, 0.0, -1.0])).irradiance_W_m2_nm
+    camera, nodes = cameras.base_camera(scene), ephemeris.wavelengths_nm(scene)
+    sun = ephemeris.sunlight(scene, np.array([0.0, 0.0, -1.0])).irradiance_W_m2_nm
     veil = max(fault.to_dict()["veil_fraction"]) * sun * camera.lens.transmittance(nodes)
     veil /= 4 * camera.lens.f_number**2
     on_sensor = Irradiance(array=veil.astype(np.float32)[:, None, None], wavelength_nm=nodes)
@@ -144,7 +144,7 @@ def test_nothing_is_darker_beside_a_saturated_strut_than_it_is_measured(name: st
 def test_the_navigation_camera_is_the_published_one() -> None:
     """NSSDCA 2004-006A-17: 152.5 mm; 70 mm, f/2.2; behind the attenuator 30 mm, f/5.1, and 580 times less light."""
     scene = config.load_scene("navcam67p")
-    camera = assemble.base_camera(scene)
+    camera = cameras.base_camera(scene)
     lens = camera.lens
     assert isinstance(lens, ThinLens)
     # the published figures have two to four digits
@@ -157,9 +157,9 @@ def test_the_navigation_camera_is_the_published_one() -> None:
 
 def test_the_navigation_camera_sees_to_1000_nm() -> None:
     scene = config.load_scene("navcam67p")
-    nodes = assemble.wavelengths_nm(scene)
+    nodes = ephemeris.wavelengths_nm(scene)
     assert (nodes[0], nodes[-1]) == (400.0, 1000.0)
-    detector = assemble.base_camera(scene).detector
+    detector = cameras.base_camera(scene).detector
     assert isinstance(detector, MosaicDetector)
     efficiency = detector.sensor.efficiency.at(np.array([400.0, 450.0, 650.0, 900.0, 1000.0]))[0]
     assert (efficiency > 0.03).all()

@@ -16,19 +16,18 @@ from vbnfault.core import frames
 from vbnfault.core.errors import InputError
 from vbnfault.core.quantities import BODY, SKY, SPACECRAFT
 from vbnfault.pipeline import Session
-from vbnfault.pipeline.exposure import meter
+from vbnfault.pipeline.exposure import add_stars, meter
 from vbnfault.pipeline.noise_budget import green_per_second
 from vbnfault.pipeline.record import to_sample
 from vbnfault.pipeline.rendering import describe, render_view
 from vbnfault.pipeline.resolve import resolve
 from vbnfault.pipeline.spec import Frame
-from vbnfault.pipeline.stars import add_stars
 from vbnfault.render import sampling
 from vbnfault.render.detail import _LEVELS, _SIDE, _UNIT, _pyramid
 from vbnfault.render.runtime import mi
 from vbnfault.render.surface import World
 from vbnfault.scene import config
-from vbnfault.world import assemble, sky
+from vbnfault.world import assemble, ephemeris, sky
 
 TRUTH = ["depth_m", "normal", "semantic", "point_T_m", "incidence_deg", "emission_deg", "phase_deg", "albedo"]
 
@@ -159,7 +158,7 @@ def test_albedo_on_the_spacecraft_is_that_of_its_material(samples: tuple[Session
         v = np.einsum("rk,fk->rf", rays, np.cross(-a, b)) / det
         z = np.einsum("fk,fk->f", c, np.cross(-a, b)) / det
     z[~((u >= 0) & (v >= 0) & (u + v <= 1) & (z > 0))] = np.inf
-    nodes = assemble.wavelengths_nm(s.scene)
+    nodes = ephemeris.wavelengths_nm(s.scene)
     near = int(np.argmin(np.abs(nodes - 649.0)))
     expected = mesh.reflectance(nodes)[mesh.face_material[z.argmin(axis=1)], near]
     got = sample.layers["albedo"][rows, columns]
@@ -341,7 +340,7 @@ def test_bad_worlds_are_told_in_a_sentence(tables: dict[str, dict[str, object]],
 
     def whole() -> None:
         assemble.spacecraft(scene_)
-        assemble.ephemeris(scene_)
+        ephemeris.ephemeris(scene_)
 
     with pytest.raises(InputError) as told:
         whole()

@@ -18,7 +18,7 @@ from vbnfault.reflectance import DiscReflectance, radiance_factor, registry
 from vbnfault.reflectance.hapke import COLUMNS, HAPKE_TABLES, Hapke, geometric_albedo, hapke_at
 from vbnfault.render.description import RenderInput, Sunlight, View
 from vbnfault.scene import config
-from vbnfault.world import assemble
+from vbnfault.world import assemble, ephemeris
 
 # w, g, B0, h_s, B_C0, h_c, roughness (deg), K
 SETS = {
@@ -311,7 +311,7 @@ def test_a_model_defined_here_alone_is_rendered() -> None:
         RenderInput(
             view=seen,
             sun=sun,
-            wavelength_nm=assemble.wavelengths_nm(scene),
+            wavelength_nm=ephemeris.wavelengths_nm(scene),
             reflectance=ground,
             samples_per_pixel=4,
             key=0,

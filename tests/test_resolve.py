@@ -12,7 +12,7 @@ from vbnfault.core import frames
 from vbnfault.pipeline import Session, resolve
 from vbnfault.pipeline.spec import Pose, SampleSpec
 from vbnfault.scene import config, plan
-from vbnfault.world import assemble
+from vbnfault.world import ephemeris
 
 N = 500
 
@@ -92,7 +92,7 @@ def test_redrawn_samples_follow_the_conditional_distribution(resolved: tuple[Ses
     ground = render.ground_height_m(surface, x, y, 424.3)
     position = np.column_stack([x, y, -(ground + height)])
     suns = [
-        assemble.sunlight(session.scene, frames.direction_L(a, b)) for a, b in zip(azimuth, elevation, strict=True)
+        ephemeris.sunlight(session.scene, frames.direction_L(a, b)) for a, b in zip(azimuth, elevation, strict=True)
     ]
     good = render.is_clear(surface, position, session.scene.geometry.clearance_m)
     good &= render.sun_visible_fraction(surface, position, suns) == 1.0

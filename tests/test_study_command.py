@@ -36,18 +36,11 @@ def test_a_dry_run_says_how_much_a_study_evaluates_and_writes_nothing(
     assert lines[4].startswith("warning: design.n = 8: below n = 16 ")
 
 
-def test_a_file_in_place_of_the_folder_is_one_sentence(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "out").touch()
-    code, said, errors = run(monkeypatch, capsys, "study", "flare_lens", "--out", str(tmp_path / "out"))
-    assert (code, said) == (2, "")
-    assert errors.splitlines()[-1] == f"vbnfault: {tmp_path}/out: is a file, not a folder; choose another --out"
-
-
 @pytest.mark.parametrize(
     ("setting", "sentence"),
     [
+        ("design.n=9", "design.n = 9: must be a power of two with method = 'sobol', such as 8 or"),
+        ("desing.n=8", "desing: unknown key (did you mean design?)"),
         ("factor[4].high=-0.5", "factor[4].low = -0.03, high = -0.5: bounds reversed or equal"),
         ("factor.4.key=lens.coating.thicknes", "did you mean lens.coating.thickness?"),
         ("factor[15].low=1", "factor[15].low = 1: factor is a list; its entries are 0 to 14"),

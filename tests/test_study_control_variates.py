@@ -121,6 +121,8 @@ def test_incomplete_samples_and_several_blocks_have_control_variates() -> None:
     found = indices.compute(indices.Results(design, tuple(kit.Function.metrics[:1]), blocks[..., None, None]))
     np.testing.assert_allclose(found["ST"].values[0, 0, :2], [0.2, 0.8], atol=1e-3)
     np.testing.assert_allclose(found["ST_by_seed"].values[0, 0, :2], [[1, 0], [0, 1]], atol=1e-2)
+    assert list(found["seed"].values) == [4, 9]
+    assert found["ST_seed_deviation"].values[0, 0, 0] == pytest.approx(2**-0.5, abs=0.02)
     assert float(found["explained"].squeeze()) == pytest.approx(1.0)
 
 

@@ -19,7 +19,6 @@ import study_kit as kit
 import xarray
 
 import vbnfault
-from vbnfault.core import toml_files
 from vbnfault.core.errors import InputError, VbnfaultError
 from vbnfault.dataset import BuildOptions
 from vbnfault.dataset.errors import Interrupted
@@ -145,19 +144,6 @@ def test_the_law_of_total_variance_splits_models_from_factors() -> None:
     assert float(data["model_share"][0]) == pytest.approx(6 / (6 + y[base].var()), rel=1e-12)
     low, high = data["model_share_interval"].values[0]
     assert low < float(data["model_share"][0]) < high
-
-
-def test_blocks_are_pooled_and_seeds_have_their_own_indices() -> None:
-    spec = kit.spec(2, 0.0, 1.0, design={"n": 256}, scene={"samples": 2, "seeds": [4, 9]})
-    design = make_design(spec)
-    x = np.array(design.values, dtype=float)
-    # the first seed varies with x0 alone, the second with x1 alone, with four times the variance
-    blocks = np.stack([np.stack([x[0], x[0] + 50]), np.stack([2 * x[1], 2 * x[1] - 7])])[..., None, None]
-    data = indices.compute(indices.Results(design, tuple(kit.Function.metrics[:1]), blocks))
-    np.testing.assert_allclose(data["ST"].values[0, 0, :2], [0.2, 0.8], atol=0.02)
-    np.testing.assert_allclose(data["ST_by_seed"].values[0, 0, :2], [[1, 0], [0, 1]], atol=0.02)
-    assert list(data["seed"].values) == [4, 9]
-    assert data["ST_seed_deviation"].values[0, 0, 0] == pytest.approx(2**-0.5, abs=0.02)
 
 
 @pytest.mark.parametrize("n", [1, 2, 4, 8])
@@ -431,31 +417,6 @@ def test_too_few_samples_say_how_many_are_needed(tmp_path: Path) -> None:
     assert "at most about design.n = " in sentence
 
 
-def test_the_command_says_what_is_wrong_in_one_sentence(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    from vbnfault.cli import main
-
-    file = tmp_path / "study.toml"
-    file.write_text(toml_files.toml_text(kit.spec().resolved()), encoding="utf-8")
-    for name, setting, sentence in (
-        ("nothing", "design.n=8", "nothing: neither a file nor a packaged name; studies: "),
-        (
-            str(file),
-            "design.n=9",
-            "design.n = 9: must be a power of two with method = 'sobol', such as 8 or",
-        ),
-        (str(file), "desing.n=8", "desing: unknown key (did you mean design?)"),
-        (str(file), "metrics.names=[]", "metrics.names = []: must be a list of at least 1"),
-    ):
-        monkeypatch.setattr(sys, "argv", ["vbnfault", "study", name, "--out", "x", "--set", setting])
-        with pytest.raises(SystemExit) as end:
-            main()
-        assert end.value.code == 2
-        (line,) = capsys.readouterr().err.splitlines()
-        assert sentence in line
-
-
 def test_unknown_metrics_and_columns_of_one_name_are_refused(tmp_path: Path) -> None:
     for tables, sentence in (
         ({"metrics": {"names": ["yy"]}}, r"unknown metric 'yy'"),
@@ -483,9 +444,9 @@ def test_a_folder_that_holds_something_else_is_left_alone(tmp_path: Path) -> Non
 
 def test_a_folder_of_another_study_is_refused(spec: StudySpec, reference: Path) -> None:
     other = spec.model_copy(update={"design": spec.design.model_copy(update={"n": 64})})
-    with pytest.raises(InputError, match=r"holds another study: design.n = 32 \(now 64\); choose another --out"):
+    with pytest.raises(InputError, match=r"holds another study: design.n is 32 there and 64 here; choose another"):
         run.run_study(other, reference, QUIET, report=False, evaluator=kit.Stopping)
-    with pytest.raises(InputError, match=r"evaluator = 'study_kit.Stopping' \(now 'study_kit.Function'\)"):
+    with pytest.raises(InputError, match=r"evaluator is 'study_kit.Stopping' there and 'study_kit.Function' here"):
         run.run_study(spec, reference, QUIET, report=False, evaluator=kit.Function)
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import tomli_w
 from conftest import small_scene
 from PIL import Image
 
@@ -51,7 +52,7 @@ def study(tmp_path_factory: Any, *factors: dict[str, Any], **tables: Any) -> Stu
     scene["faults"] = {"straylight": tables.pop("straylight", LENS)}
     scene["render"] |= {"bands": 2, **tables.pop("render", {})}
     path = tmp_path_factory.mktemp("study") / "scene.toml"
-    path.write_text(toml(scene), encoding="utf-8")
+    path.write_text(tomli_w.dumps(scene), encoding="utf-8")
     plain = {
         "title": "test",
         "design": {"method": "sobol", "n": 2},
@@ -61,21 +62,6 @@ def study(tmp_path_factory: Any, *factors: dict[str, Any], **tables: Any) -> Stu
         **tables,
     }
     return parse_study(plain, source="study")
-
-
-def toml(table: Mapping[str, Any]) -> str:
-    """Plain data as TOML with inline tables."""
-
-    def text(value: Any) -> str:
-        if isinstance(value, Mapping):
-            return "{" + ", ".join(f"{key} = {text(v)}" for key, v in value.items()) + "}"
-        if isinstance(value, list | tuple):
-            return "[" + ", ".join(map(text, value)) + "]"
-        if isinstance(value, bool):
-            return str(value).lower()
-        return f"'{value}'" if isinstance(value, str) else repr(value)
-
-    return "\n".join(f"{key} = {text(value)}" for key, value in table.items()) + "\n"
 
 
 def point(values: Mapping[str, float | str], role: str = "point", model: str = "", view: int = 0) -> Evaluation:
@@ -205,7 +191,7 @@ OF_ONE_GLASS: dict[str, Any] = {
 
 def test_ghost_flux_follows_the_square_of_the_mean_reflectance(tmp_path_factory: pytest.TempPathFactory) -> None:
     path = tmp_path_factory.mktemp("lens") / "lens.toml"
-    path.write_text(toml(OF_ONE_GLASS), encoding="utf-8")
+    path.write_text(tomli_w.dumps(OF_ONE_GLASS), encoding="utf-8")
     spec = study(
         tmp_path_factory,
         factor("lens.coating.thickness", 0, 1, "fraction"),
@@ -456,7 +442,7 @@ def test_a_study_of_navigation_alone_is_evaluated_and_reported(tmp_path: Path) -
         plan={"mode": "per_class", "faulty_fraction": 1.0},
     )
     scene["faults"] = {"broken_lines": {}}
-    (tmp_path / "scene.toml").write_text(toml(scene), encoding="utf-8")
+    (tmp_path / "scene.toml").write_text(tomli_w.dumps(scene), encoding="utf-8")
     lines = {"key": "scene.faults.broken_lines.count", "distribution": "categorical", "values": [1, 12]}
     spec = parse_study(
         {

@@ -25,7 +25,7 @@ from vbnfault.pipeline import configure_faults
 from vbnfault.reflectance import radiance_factor
 from vbnfault.scene.config import load_scene
 from vbnfault.testing import check_effect, check_fault, make_context
-from vbnfault.world.assemble import base_camera
+from vbnfault.world.cameras import base_camera
 
 
 def test_the_command_writes_each_kind(tmp_path: Path) -> None:
@@ -66,7 +66,7 @@ def test_the_keys_that_the_scene_shows_as_comments_are_accepted(tmp_path: Path) 
     ):
         assert f"\n# {line}" in text
         text = text.replace(f"\n# {line}", f"\n{line}")
-    path.write_text(text, encoding="utf-8")
+    path.write_text(text.replace('model = "cos4"', 'model = "lens"'), encoding="utf-8")
     scene = load_scene(path)
     assert scene.geometry.sun_averted is not None
     assert scene.geometry.sun_averted.reference == "nadir"

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from poses_kit import Rows, columns_of, row
 from scipy.spatial.transform import Rotation
 
 import vbnfault
@@ -22,25 +23,7 @@ from vbnfault.scene import config, trajectory
 from vbnfault.scene.trajectory import COLUMNS, FlownPose, Trajectory, as_trajectory, load_trajectory
 from vbnfault.world import assemble, ground
 
-Rows = list[dict[str, Any]]
 RADIUS_M = 500.0
-
-
-def looking_at_the_origin(camera_T_m: np.ndarray, roll_deg: float = 0.0) -> np.ndarray:
-    """Return camera_from_T, w first, of a camera whose boresight meets the origin of T."""
-    z = -camera_T_m / np.linalg.norm(camera_T_m)
-    x = np.cross([0.3, 0.5, 0.8], z)
-    x /= np.linalg.norm(x)
-    camera_from_T = np.stack([x, np.cross(z, x), z])
-    camera_from_T = Rotation.from_euler("z", roll_deg, degrees=True).as_matrix() @ camera_from_T
-    return Rotation.from_matrix(camera_from_T).as_quat(scalar_first=True)
-
-
-def row(name: str, camera_T_m: Any, sun_T: Any = (0.0, 0.6, 0.8), **values: Any) -> dict[str, Any]:
-    """Return one row of a table; the camera looks at the origin of T."""
-    camera = np.array(camera_T_m, dtype=float)
-    numbers = [2457000.5, *camera, *looking_at_the_origin(camera), *sun_T, 2.5]
-    return {**dict(zip(COLUMNS, [name, *numbers], strict=True)), **values}
 
 
 def rows() -> Rows:
@@ -61,11 +44,6 @@ def write(path: Path, table: Rows, columns: tuple[str, ...] = COLUMNS) -> Path:
         text.append(",".join(v if isinstance(v, str) else repr(float(v)) for v in (values[c] for c in columns)))
     path.write_text("\n".join(text) + "\n")
     return path
-
-
-def columns_of(table: Rows) -> dict[str, list[Any]]:
-    """Return a table as columns."""
-    return {name: [values[name] for values in table] for name in COLUMNS}
 
 
 @pytest.fixture(scope="module")

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import ALL_FAULTS, small_scene
+from poses_kit import columns_of, row
 from scipy import stats
 from synthetic import flip
 
@@ -332,23 +333,8 @@ def test_damage_to_a_shared_chunk_concerns_all_that_share_it(tmp_path: Path) -> 
 
 def test_rows_of_a_table_of_poses_are_seen_several_times() -> None:
     scene = config.load_scene("navcam67p", {"dataset.variants_per_view": 2, "dataset.shard_samples": 8})
-    row = {
-        "name": "a",
-        "julian_date": 2456900.0,
-        "camera_x_T_m": 60e3,
-        "camera_y_T_m": 0.0,
-        "camera_z_T_m": 0.0,
-        "camera_from_T_w": 0.5,
-        "camera_from_T_x": 0.5,
-        "camera_from_T_y": -0.5,
-        "camera_from_T_z": -0.5,
-        "sun_x_T": 1.0,
-        "sun_y_T": 0.0,
-        "sun_z_T": 0.0,
-        "sun_distance_au": 3.4,
-    }
-    rows = [row, {**row, "name": "b", "camera_x_T_m": 80e3}]
-    session = Session(scene, poses={key: [one[key] for one in rows] for key in row})
+    rows = [row(name, (camera_x_T_m, 0, 0), (1.0, 0, 0)) for name, camera_x_T_m in (("a", 60e3), ("b", 80e3))]
+    session = Session(scene, poses=columns_of(rows))
     assert session.trajectory is not None
     assert session.trajectory.name == ("a/0", "a/1", "b/0", "b/1")
     assert len(session.plan) == 4

@@ -20,7 +20,7 @@ from vbnfault.pipeline import Session, resolve, sight
 from vbnfault.pipeline.record import to_sample
 from vbnfault.pipeline.rendering import render_view
 from vbnfault.pipeline.spec import Frame, Pose, SampleSpec, Terrain
-from vbnfault.scene import config, plan
+from vbnfault.scene import config, plan, redraw
 
 SAMPLES = {"samples": 24, "sites": 1, "shard_samples": 8, "layers": ["clean"]}
 
@@ -158,7 +158,7 @@ def test_the_fraction_of_sunlit_ground_agrees_with_the_renderers_angles(terrain:
 
 def test_views_without_lit_ground_are_drawn_again_and_the_strata_may_differ(terrain: Terrain) -> None:
     asked = session(geometry={"min_lit_fraction": 0.3, "sun_facing": {"min_lit_fraction": 0.0}})
-    facing, averted = plan.strata(asked.scene)
+    facing, averted = redraw.strata(asked.scene)
     assert (facing.min_lit_fraction, averted.min_lit_fraction) == (0.0, 0.3)
     free = session()
     tries: dict[int, list[int]] = {plan.SUN_FACING: [], plan.SUN_AVERTED: []}
@@ -213,7 +213,7 @@ def test_a_commanded_fault_that_cannot_show_gets_another_view(
         assert frame.views <= frame.pose.tries
         # what is stored is the view that was kept
         kept = s.plan.view(s.scene, index, frame.pose.tries - 1)
-        assert {name: sample.scalars["proposal"][name] for name in plan.VARIABLES} == kept
+        assert {name: sample.scalars["proposal"][name] for name in redraw.VARIABLES} == kept
         angles = [sample.scalars[name] for name in ("roll_deg", "pitch_deg", "yaw_deg")]
         down = np.array([0.0, 0.0, 1.0])
         np.testing.assert_allclose(frame.pose.L_from_C, frames.L_from_C(down, *angles), atol=1e-12)
@@ -349,7 +349,7 @@ def test_a_flown_pose_is_kept_with_its_sun_hidden_and_refused_within_the_ground(
 ) -> None:
     """Poses of SPICE are what was flown: straylight without a Sun is not injected, and the sample says so."""
     from vbnfault.core import spice
-    from vbnfault.world import assemble
+    from vbnfault.world import ephemeris
 
     s = session({"straylight": {}}, plan=EVERY)
     spice_table = s.scene.spice.model_copy(update={"spacecraft": "X", "kernels": ("k",), "frame": "F"})
@@ -363,8 +363,8 @@ def test_a_flown_pose_is_kept_with_its_sun_hidden_and_refused_within_the_ground(
             camera_position_T_m=position, T_from_C=site.T_from_L @ frames.L_from_C0(boresight)
         )
         sun_T = site.T_from_L @ frames.unit(np.array(sun_L))
-        monkeypatch.setattr(assemble, "spacecraft_pose", lambda *_: placed)
-        monkeypatch.setattr(assemble, "ephemeris", lambda *_: (3.0 * sun_T, np.eye(3)))
+        monkeypatch.setattr(ephemeris, "spacecraft_pose", lambda *_: placed)
+        monkeypatch.setattr(ephemeris, "ephemeris", lambda *_: (3.0 * sun_T, np.eye(3)))
         return resolve.resolve(SampleSpec(index=0, scene=scene, plan=flown, faults=s.faults, terrain=terrain))
 
     up, down = np.array([0.0, 0.0, -1.0]), np.array([0.0, 0.0, 1.0])

@@ -23,7 +23,7 @@ from vbnfault.lens.glass import (
 from vbnfault.lens.prescription_file import write_lens
 from vbnfault.lens.zemax import _FORMULAS, read_catalogue, read_lens
 from vbnfault.scene import config
-from vbnfault.world import assemble
+from vbnfault.world import cameras
 
 HEAD = "VERS 190513 0 123457 L123457\nMODE SEQ\nNAME a triplet\nUNIT MM X W X CM MR CPMM\nENPD 10\nGCAT SCHOTT\n"
 OBJECT = 'SURF 0\n  TYPE STANDARD\n  CURV 0.0 0 0 0 0 ""\n  DISZ INFINITY\n  DIAM 0 0 0 0 1 ""\n'
@@ -330,7 +330,7 @@ def test_a_scene_takes_a_zemax_lens_and_knows_its_catalogues(tmp_path: Path) -> 
     path = written(tmp_path)
     catalogue = written(tmp_path, CATALOGUE, "schott.agf")
     scene = config.load_scene("quickstart", {"camera.lens": str(path), "faults.vignetting.model": "lens"})
-    assert assemble.base_camera(scene).lens.name == "a triplet"
+    assert cameras.base_camera(scene).lens.name == "a triplet"
     before = _lens_digest(scene.camera.lens)
     assert before.count("+") == 1
     catalogue.write_text(CATALOGUE.replace("9.92000E-01", "9.91000E-01"), encoding="utf-8")

@@ -51,11 +51,11 @@ GROUPS: dict[str, tuple[list[str], list[str]]] = {
         ["tests/test_labels.py", "tests/test_pipeline.py", "tests/test_truth.py"],
     ),
     "images": (
-        ["vbnfault/pipeline/injection.py", "vbnfault/pipeline/development.py", "vbnfault/pipeline/images.py"],
+        ["vbnfault/pipeline/injection.py", "vbnfault/pipeline/development.py"],
         ["tests/test_pipeline.py", "tests/test_labels.py"],
     ),
     "exposure": (
-        ["vbnfault/pipeline/rendering.py", "vbnfault/pipeline/exposure.py", "vbnfault/pipeline/stars.py"],
+        ["vbnfault/pipeline/rendering.py", "vbnfault/pipeline/exposure.py"],
         ["tests/test_exposure.py", "tests/test_pipeline.py", "tests/test_physical.py"],
     ),
     "store": (["vbnfault/store/*.py"], ["tests/test_store*.py"]),

@@ -14,11 +14,11 @@ from ..core import frames
 from ..detector import Detector
 from ..pipeline import Session
 from ..pipeline.exposure import reference_exposure_s
-from ..scene import aims, names, plan
+from ..scene import aims, names, plan, redraw
 from ..scene.bodies import named_body
 from ..scene.config import Scene
 from ..scene.trajectory import Trajectory
-from ..world import assemble, ground, siting
+from ..world import ephemeris, ground
 from .progress import duration_text, size_text
 
 _SITES_DESCRIBED = 8  # a site takes 9 ms on a shape of 20,000 facets
@@ -130,7 +130,7 @@ def _geometry(session: Session) -> list[str]:
     geometry, camera = scene.geometry, scene.camera
     if session.trajectory is not None:
         return _trajectory(session, session.trajectory)
-    sun = f"Sun: {assemble.sun_distance_au(scene):.4g} au away"
+    sun = f"Sun: {ephemeris.sun_distance_au(scene):.4g} au away"
     if scene.spice.spacecraft:
         until = scene.spice.until_julian_date or scene.sun.julian_date
         return [
@@ -151,9 +151,9 @@ def _geometry(session: Session) -> list[str]:
         f"footprint {_span(across * nearest, across * high)} m across",
         f"{sun}, date {scene.sun.julian_date:.1f} TDB",
     ]
-    if any(s.reference == "nadir" for k, s in enumerate(plan.strata(scene)) if (table.stratum == k).any()):
+    if any(s.reference == "nadir" for k, s in enumerate(redraw.strata(scene)) if (table.stratum == k).any()):
         lines.append(_down(session))
-    for k, stratum in enumerate(plan.strata(scene)):
+    for k, stratum in enumerate(redraw.strata(scene)):
         if not (table.stratum == k).any():
             continue
         towards = _REFERENCES[stratum.reference]
@@ -177,7 +177,7 @@ def _suns_seen(session: Session) -> str:
     for index in some.tolist():
         suns = table.suns_of_site(index)
         drawn = {name: values[suns] for name, values in table.variables.items()}
-        of_sites.append(siting.suns_seen(scene, model, session.sites[index], drawn))
+        of_sites.append(ground.suns_seen(scene, model, session.sites[index], drawn))
     own, never, count = (
         sum(int(number) for number in numbers)
         for numbers in zip(*((s.diagonal().sum(), (~s.any(axis=0)).sum(), len(s)) for s in of_sites), strict=True)
@@ -196,14 +196,14 @@ def _aims(session: Session, aim: NDArray[np.uint8]) -> list[str]:
     counts = np.bincount(aim, minlength=len(aims.AIMS))
     mixed = ", ".join(f"{name} {count}" for name, count in zip(aims.AIMS, counts, strict=True) if count)
     pixel = ground.pixel_rad(scene)
-    kept_away = plan.sun_elongation_deg(scene)
+    kept_away = aims.sun_elongation_deg(scene)
     return [
         f"aims: {mixed}; {geometry.pointing_error_deg:g} deg of pointing error about each axis, any turn about the "
         "boresight; roll, pitch and yaw are stored relative to the Sun",
         f"distances: {low:g} to {high:g} m from the site, evenly in their logarithm; at the site "
         f"{_span(pixel * low, pixel * high)} m a pixel",
-        f"Sun: {assemble.sun_distance_au(scene):.4g} au away, date {scene.sun.julian_date:.1f} TDB; phase angle at "
-        f"the site {_bounds(geometry.phase_deg)} deg, {_span(*kept_away)} deg from the boresight unless it is "
+        f"Sun: {ephemeris.sun_distance_au(scene):.4g} au away, date {scene.sun.julian_date:.1f} TDB; phase angle "
+        f"at the site {_bounds(geometry.phase_deg)} deg, {_span(*kept_away)} deg from the boresight unless it is "
         "the aim",
         _redrawn(session),
     ]

@@ -36,7 +36,7 @@ from ..scene.retaken_plan import make_retaken_plan
 from ..scene.sampling import OF_AN_AIM
 from ..scene.target import EARTH
 from ..store import StoreSpec
-from ..world import assemble
+from ..world import assemble, ephemeris
 
 # A new version of one of these libraries may change pixel values.
 _LIBRARIES = ("mitsuba", "drjit", "numpy", "scipy", "trimesh", "scikit-image", "colour-science", "zarr")
@@ -203,11 +203,11 @@ def _contents_of_files(identity: dict[str, Any], scene: Scene) -> None:
         identity["spacecraft"]["model"] = f"sha256:{'+'.join(digests)}"
     if scene.spice.kernels:
         # the text of a meta-kernel only lists other kernels, so the digest is that of the resulting ephemeris
-        sun_J_au, T_from_J = assemble.ephemeris(scene)
+        sun_J_au, T_from_J = ephemeris.ephemeris(scene)
         follows = [*sun_J_au.tolist(), *T_from_J.ravel().tolist()]
         if scene.spice.spacecraft:
             for k in range(scene.dataset.sites):
-                pose = assemble.spacecraft_pose(scene, assemble.epoch_jd(scene, k, 0.5))
+                pose = ephemeris.spacecraft_pose(scene, ephemeris.epoch_jd(scene, k, 0.5))
                 follows += [*pose.camera_position_T_m.tolist(), *pose.T_from_C.ravel().tolist()]
         numbers = content_hash(follows)
         identity["spice"]["kernels"] = [f"ephemeris:{numbers}"]
@@ -236,7 +236,7 @@ def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
     individuals = scene.camera.individuals
     _check_origins(session.faults)
     kinds = tuple(masks.kind(fault, is_ccd=camera.is_ccd) for fault in session.faults.values())
-    references = assemble.attitude_references(scene)
+    references = ephemeris.attitude_references(scene)
     return StoreSpec(
         height=camera.height_px,
         width=camera.width_px,
@@ -249,7 +249,7 @@ def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
             _mask_rule(kind, fault) for kind, fault in zip(kinds, session.faults.values(), strict=True)
         ),
         soft_layers=tuple(fault.soft_layer for fault in session.faults.values()),
-        wavelength_nm=tuple(float(w) for w in assemble.wavelengths_nm(scene)),
+        wavelength_nm=tuple(float(w) for w in ephemeris.wavelengths_nm(scene)),
         layers=layers,
         site_names=tuple(f"site_{k:05d}" for k in range(dataset.sites)),
         lens_names=(camera.lens.name,),

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..core.quantities import BODY, SKY, SUN, Radiance, Truth
 from ..render.description import RenderInput
-from ..world import assemble
+from ..world import ephemeris
 from ..world.coma import SHADOW_CELLS, Shadow, make_coma, sun_axes
 from ..world.coma_ground import on_ground
 from ..world.haze import Edges, edge_positions_px, haze, sky_around
@@ -50,7 +50,7 @@ def add_coma(
             semantic=np.where(ground, np.uint8(SKY), truth.semantic),
             depth_m=np.where(ground, np.float32(np.inf), truth.depth_m),
         )
-    distance_au = assemble.sun_distance_au(spec.scene)
+    distance_au = ephemeris.sun_distance_au(spec.scene)
     coma = make_coma(table, terrain.body, terrain.site, pose.sun_L, distance_au, spec.seed)
     axes = sun_axes(coma.outflow.sun)
     heights = render.heights_towards_sun(surface, coma.centre_L_m, axes, coma.reach_m, SHADOW_CELLS)

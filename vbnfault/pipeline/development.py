@@ -17,7 +17,7 @@ from ..camera import Camera
 from ..core.quantities import RGBI, Electrons
 from ..faults import MOSAIC_STEPS, Fault, FaultContext, physical_order
 from . import masks
-from .spec import Draw, SceneExposure
+from .spec import Draw, Images, Injection, SampleSpec, SceneExposure, stored_layers
 
 Draws = Mapping[str, Draw]
 Keys = tuple[tuple[str, int], ...]
@@ -309,3 +309,18 @@ def _informing(fault: Fault, draws: Draws) -> list[str]:
 def _acting_keys(draws: Draws, names: Iterable[str]) -> tuple[tuple[tuple[str, int], Keys], ...]:
     """Return the keys of some draws, each with the keys of the draws that inform its fault."""
     return tuple((draws[name].key, _keys(draws, _informing(draws[name].fault, draws))) for name in names)
+
+
+def take_images(spec: SampleSpec, injection: Injection) -> Images:
+    """Take the images that the scene stores. They share radiance, exposure and noise."""
+    draws, development = injection.draws, injection.development
+    layers = stored_layers(spec.scene, spec.faults)
+    image = development.image(draws)
+    twins = [layer.removeprefix("without_") for layer in layers if layer.startswith("without_")]
+    return Images(
+        image=image,
+        clean=development.image({}),
+        without={name: development.twin(draws, name) if name in draws else image for name in twins},
+        raw=development.raw(draws) if "raw" in layers else None,
+        defects=development.defects(draws) if "defects" in layers else None,
+    )

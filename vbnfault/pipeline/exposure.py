@@ -1,4 +1,4 @@
-"""Set the exposure of a sample: fixed, or metered on its sunlit ground."""
+"""Set the exposure of a sample, fixed or metered on its sunlit ground, and add the stars that it can show."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ from ..core.quantities import BODY, Electrons, Radiance, Truth
 from ..reflectance import radiance_factor
 from ..render.description import View
 from ..scene.config import Scene
-from ..world import assemble
-from .spec import Rendering, SampleSpec, SceneExposure
+from ..world import assemble, ephemeris
+from ..world.sky import StarRadiance
+from .spec import Pose, Rendering, SampleSpec, SceneExposure, SceneLight
 
 Direction = tuple[float, float, float]
 
@@ -72,9 +73,9 @@ def _exposure_of_facet_s(scene: Scene, camera: Camera, sun: Direction, view: Dir
     `sun` and `view` are the directions towards the Sun and the camera; the normal of the facet is z.
     """
     reflected = radiance_factor(assemble.ground_reflectance(scene), sun, view)[:, 0] / np.pi
-    sunlight = assemble.sunlight(scene, np.array([0.0, 0.0, -1.0]))  # the direction does not matter
+    sunlight = ephemeris.sunlight(scene, np.array([0.0, 0.0, -1.0]))  # the direction does not matter
     facet = (reflected * sunlight.irradiance_W_m2_nm).astype(np.float32).reshape(-1, 1, 1)
-    wavelength = assemble.wavelengths_nm(scene)
+    wavelength = ephemeris.wavelengths_nm(scene)
     per_second = rate_on_axis(camera, Radiance(array=facet, wavelength_nm=wavelength))
     facet_brightness = float(_brightness(per_second.array, per_second.white_e).max())
     return float(scene.camera.metering_level / max(facet_brightness, 1e-30))
@@ -134,3 +135,40 @@ def rate_on_axis(camera: Camera, radiance: Radiance) -> Electrons:
 def _brightness(electrons: NDArray[np.float32], white_e: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the greatest of a pixel's channels as a fraction of white, float32[y, x]."""
     return np.asarray(reduce(np.maximum, np.moveaxis(electrons / white_e, -1, 0)))
+
+
+# --- stars --------------------------------------------------------------------------------------------------
+
+
+def add_stars(spec: SampleSpec, pose: Pose, rendering: Rendering, exposure: SceneExposure) -> SceneExposure:
+    """Add the stars that the exposure can show. They are added after metering, so they do not affect it."""
+    if rendering.open_sky is None:
+        return exposure
+    camera, open_sky = exposure.camera, rendering.open_sky
+
+    def starry() -> tuple[SceneLight, Electrons]:
+        T_from_L = spec.terrain.site.T_from_L
+        T_from_J = ephemeris.target_attitude(spec.scene, T_from_L @ pose.sun_L)
+        J_from_C = T_from_J.T @ T_from_L @ pose.L_from_C
+        starless = exposure.light.rendered
+        stars = assemble.visible_stars(spec.scene, starless, camera, J_from_C, open_sky, rendering.scene.view)
+        if stars is None:
+            return exposure.light, exposure.rate
+        light = SceneLight(lens=exposure.light.lens, rendered=stars.added_to(starless))
+        return light, _rate_with(stars, exposure, light.rendered)
+
+    # read noise and exposure decide which stars are faint enough to be left out
+    light, rate = rendering.shared.once("stars", (camera.optics, camera.detector.read_noise_e_rms), starry)
+    return replace(exposure, light=light, rate=rate)
+
+
+def _rate_with(stars: StarRadiance, exposure: SceneExposure, starry: Radiance) -> Electrons:
+    """Return the electrons expected after one second of a radiance that contains the stars."""
+    camera: Camera = exposure.camera
+    if camera.lens.real is None:
+        return camera.expose(starry, 1.0)
+    # a lens with surfaces spreads light over few pixels, so that most of the stars' own image is dark and quick
+    array = np.zeros(starry.array.shape, np.float32)  # pages that stay empty take no memory
+    array[:, stars.rows, stars.columns] = stars.radiance
+    own = camera.expose(Radiance(array=array, wavelength_nm=starry.wavelength_nm), 1.0)
+    return replace(exposure.rate, array=exposure.rate.array + own.array)

@@ -6,15 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..faults import MOSAIC_STEPS, FaultContext
-from . import masks
+from ..faults import FaultContext
 from .development import Development, Draws, acting_at, informs
 from .spec import Draw, Injection, Pose, Rendering, SampleSpec, SceneExposure, stored_layers
 
 _DRAW_TRIES = 8
-# If a step changes a pixel by this many DN, the change survives every later optical step within the paper's tables
-# (cos⁴ at 255 → 105 keeps 41 %). Such a fault counts as visible without a full comparison.
-_CLEARLY_VISIBLE_DN = 6.0
 # A fault that changes the light by less than a count moves the noise-free image across a few roundings. The image
 # with noise rounds elsewhere: as many of its pixels are expected to change, but where these are few, none may.
 _FEW_PX, _MORE_THAN_ROUNDING_DN = 32, 2.0
@@ -57,7 +53,7 @@ def inject_faults(
     development.image({})  # pixels of the other images are taken from the clean one
     draws = draw_faults(spec, development, commanded, {}, attempt)
     _prepare_signals(development, draws)
-    while invisible := _invisible(development, draws, stored="mask_effect" in spec.scene.dataset.layers):
+    while invisible := _invisible(development, draws):
         draws = {name: draw for name, draw in draws.items() if name not in invisible}
         attempt += 1
         if attempt <= last:
@@ -132,28 +128,18 @@ def _prepare_signals(development: Development, draws: Draws) -> None:
 # --- visibility --------------------------------------------------------------------------------------------
 
 
-def _invisible(development: Development, draws: Draws, *, stored: bool) -> list[str]:
-    """Return the drawn faults without any effect on the noise-free image, or on the one with noise.
-
-    `stored` is True if the scene stores all effects. They are then computed anyway, and no cheaper test is made.
-    """
-
-    def is_invisible(name: str) -> bool:
-        return _is_invisible(development, draws, name)
-
-    if stored:
-        if not draws:
-            return []
-        development.image(draws, noisy=False)  # all effects need it
-        # without a fault that informs others, their light is computed anew, with much memory
-        last = [name for name in draws if informs(draws[name].fault)]
-        invisible = {name: is_invisible(name) for name in draws if name not in last}
-        if last:
-            development.forget_steps(draws)
-            invisible |= {name: is_invisible(name) for name in last}
-        return [name for name in draws if invisible[name]]
-    doubtful = sorted(_doubtful(development, draws))
-    return [n for n in doubtful if not _shows_on_some_rows(development, draws, n) and is_invisible(n)]
+def _invisible(development: Development, draws: Draws) -> list[str]:
+    """Return the drawn faults without any effect on the noise-free image, or on the one with noise."""
+    if not draws:
+        return []
+    development.image(draws, noisy=False)  # all effects need it
+    # without a fault that informs others, their light is computed anew, with much memory
+    last = [name for name in draws if informs(draws[name].fault)]
+    invisible = [name for name in draws if name not in last and _is_invisible(development, draws, name)]
+    if last:
+        development.forget_steps(draws)
+        invisible += [name for name in last if _is_invisible(development, draws, name)]
+    return invisible
 
 
 def _is_invisible(development: Development, draws: Draws, name: str) -> bool:
@@ -165,63 +151,3 @@ def _is_invisible(development: Development, draws: Draws, name: str) -> bool:
     if development.effect(draws, name, _MORE_THAN_ROUNDING_DN).any():
         return False
     return np.array_equal(development.image(draws).array, development.twin(draws, name).array)
-
-
-def _shows_on_some_rows(development: Development, draws: Draws, name: str) -> bool:
-    """Return whether an optical fault is already clearly visible in every eighth row of the noise-free image.
-
-    False does not mean that the fault is invisible.
-    """
-    if not development.is_local(draws, name):
-        return False
-    context, camera = development.context, development.exposure.camera
-    optical = acting_at(draws, "electrons")
-    rows = slice(context.shape[0] // 32, None, 8)
-    images = []
-    for names in (optical, [n for n in optical if n != name]):
-        signal = development.signal(draws, names).merged
-        some = signal.with_array(np.ascontiguousarray(signal.array[rows]))
-        images.append(camera.detector.develop(some, camera.exposure_s, None).array)
-    level = draws[name].fault.effect_level_dn
-    visible = masks.effect(images[0], images[1], level)
-    strong = masks.effect(images[0], images[1], max(level, _MORE_THAN_ROUNDING_DN))
-    for other in acting_at(draws, "rgbi"):
-        overwritten = draws[other].fault.footprint(draws[other].params, context)
-        if overwritten is not None:
-            visible &= ~overwritten[rows]
-    return bool((visible & strong).any() or np.count_nonzero(visible) > _FEW_PX)
-
-
-def _doubtful(development: Development, draws: Draws) -> set[str]:
-    """Return the drawn faults of which a cheap test cannot say that they are clearly visible."""
-    if not development.leaves_camera(draws):
-        return set(draws)
-    doubtful = {
-        name
-        for name, draw in draws.items()
-        if draw.fault.effect_mask or not set(MOSAIC_STEPS).isdisjoint(draw.fault.steps)
-    }
-    optical, context = acting_at(draws, "electrons"), development.context
-    # A clearly visible fault shows on this part of the pixels. For the other faults the caller tests all pixels.
-    some = (slice(context.shape[0] // 32, None, 16), slice(None, None, 4))
-    for k, name in enumerate(optical):
-        before, after = (
-            np.minimum(q.array[some], q.white_e) * (255 / q.white_e)
-            for q in (development.signal(draws, optical[: k + n]).merged for n in (0, 1))
-        )
-        if np.abs(after - before).max(initial=0) < _CLEARLY_VISIBLE_DN:
-            doubtful.add(name)
-    image = development.image({name: draws[name] for name in optical})
-    clearly_changed = []
-    for name in acting_at(draws, "rgbi"):
-        changed_image = draws[name].fault.apply(image, draws[name].params, context)
-        pixels = np.flatnonzero(masks.effect(changed_image.array, image.array))
-        was, now = (q.array.reshape(-1, 4)[pixels].astype(np.int16) for q in (image, changed_image))
-        clearly_changed.append((name, pixels[(np.abs(now - was) >= _CLEARLY_VISIBLE_DN).any(axis=1)]))
-        image = changed_image
-    overwritten = np.zeros(context.shape[0] * context.shape[1], dtype=bool)
-    for name, pixels in reversed(clearly_changed):  # changes that a later fault overwrites do not count
-        if overwritten[pixels].all():
-            doubtful.add(name)
-        overwritten[pixels] = True
-    return doubtful

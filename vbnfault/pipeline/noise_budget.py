@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ..core.quantities import FineLight, Radiance, Truth
 from ..render.description import RenderInput
-from ..world import assemble
+from ..world import ephemeris
 from .exposure import foreseen_exposure_s, rate_on_axis
 from .spec import SampleSpec
 
@@ -359,6 +359,6 @@ def _allocated(squares: F32, goal: F32, most: int) -> NDArray[np.int32]:
 
 def green_per_second(spec: SampleSpec) -> F64:
     """Return electrons per second of the green pixels for unit radiance in each band, float64[band]."""
-    nodes = assemble.wavelengths_nm(spec.scene)
+    nodes = ephemeris.wavelengths_nm(spec.scene)
     unit = Radiance(array=np.eye(len(nodes), dtype=np.float32)[:, :, None], wavelength_nm=nodes)
     return np.asarray(rate_on_axis(spec.camera, unit).array[:, 0, 1], dtype=np.float64)

@@ -12,7 +12,7 @@ from ..core import frames
 from ..core.quantities import Sample
 from ..scene import plan
 from ..scene.config import Scene
-from ..world import assemble
+from ..world import assemble, ephemeris
 from . import masks
 from .spec import Frame, stored_layers
 
@@ -96,10 +96,10 @@ def _geometry(frame: Frame) -> dict[str, Any]:
         "position_L_m": pose.position_L_m,
         "camera_from_T": frames.quaternion((T_from_L @ pose.L_from_C).T),
         "T_from_L": T_from_L,
-        "T_from_J": assemble.target_attitude(spec.scene, sun_T),
+        "T_from_J": ephemeris.target_attitude(spec.scene, sun_T),
         "site_T_m": site.position_T_m,
         "sun_direction_T": sun_T,
-        "sun_distance_au": assemble.sun_distance_au(spec.scene),
+        "sun_distance_au": ephemeris.sun_distance_au(spec.scene),
         "julian_date": spec.scene.sun.julian_date,
         "sun_azimuth_deg": pose.sun_azimuth_deg,
         "sun_elevation_deg": pose.sun_elevation_deg,

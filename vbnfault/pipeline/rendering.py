@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +13,7 @@ from ..core.quantities import BODY, SKY, FarSource, FineLight, Radiance, Truth
 from ..core.sundisc import Projection
 from ..lens.straylight.scene import RenderGrid, surrounding_grids
 from ..render.description import RenderInput, View
-from ..world import assemble
-from .atmosphere import add_atmosphere
+from ..world import assemble, ephemeris
 from .coma import add_coma
 from .noise_budget import SampledRadiance, green_per_second, sample_to_noise
 from .spec import Pose, Rendering, SampleSpec, SceneLight
@@ -44,8 +43,8 @@ def describe(spec: SampleSpec, pose: Pose) -> RenderInput:
     )
     return RenderInput(
         view=view,
-        sun=assemble.sunlight(scene, pose.sun_L),
-        wavelength_nm=assemble.wavelengths_nm(scene),
+        sun=ephemeris.sunlight(scene, pose.sun_L),
+        wavelength_nm=ephemeris.wavelengths_nm(scene),
         reflectance=assemble.ground_reflectance(scene),
         dust_contrast=assemble.dust_contrast(scene),
         bounces=scene.render.bounces,
@@ -63,24 +62,14 @@ def render_view(spec: SampleSpec, pose: Pose) -> Rendering:
     from .. import render
 
     camera, scene, surface = spec.camera, describe(spec, pose), spec.terrain.surface
-    angles = bool(ANGLE_LAYERS & set(spec.scene.dataset.layers))
     stars = spec.scene.sky.stars != "off"
     has_coma = spec.scene.coma is not None
     has_air = spec.scene.body.atmosphere is not None
-    guide: Truth | None  # truth on the grid of the render, which bounces, stars, a coma and air need
-    if camera.lens.resamples:
-        truth = render.truth(
-            surface,
-            scene.view,
-            scene.sun,
-            angles=angles,
-            slopes=camera.seen_slopes,
-            projection=camera.projection,
-        )
+    truth = seen_truth(spec, scene)
+    guide: Truth | None = truth
+    if camera.lens.resamples:  # bounces, stars, a coma and air need truth on the grid of the render
         needed = scene.bounces or stars or has_coma or has_air
         guide = render.truth(surface, scene.view, scene.sun) if needed else None
-    else:
-        truth = guide = render.truth(surface, scene.view, scene.sun, angles=angles)
     body = body_of_few_pixels(spec, pose, scene)
     shown = scene if body is None else replace(scene, shows_ground=False)
     if spec.scene.render.noise_fraction is None:
@@ -104,6 +93,17 @@ def render_view(spec: SampleSpec, pose: Pose) -> Rendering:
         surroundings=surroundings(spec, scene),
         far_sources=far_sources(spec, pose),
     )
+
+
+def seen_truth(spec: SampleSpec, scene: RenderInput) -> Truth:
+    """Return truth at the chief rays of the image's pixel centres, without a body of few pixels."""
+    from .. import render
+
+    camera, angles = spec.camera, bool(ANGLE_LAYERS & set(spec.scene.dataset.layers))
+    lens: dict[str, Any] = (
+        {"slopes": camera.seen_slopes, "projection": camera.projection} if camera.lens.resamples else {}
+    )
+    return render.truth(spec.terrain.surface, scene.view, scene.sun, angles=angles, **lens)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -197,17 +197,17 @@ def far_sources(spec: SampleSpec, pose: Pose) -> tuple[FarSource, ...]:
     from .. import render
 
     scene, site = spec.scene, spec.terrain.site
-    bodies = assemble.bright_bodies(scene) if _has_sources_around(spec) else ()
+    bodies = ephemeris.bright_bodies(scene) if _has_sources_around(spec) else ()
     if not bodies:
         return ()
-    T_from_J = assemble.target_attitude(scene, site.T_from_L @ pose.sun_L)
+    T_from_J = ephemeris.target_attitude(scene, site.T_from_L @ pose.sun_L)
     L_from_J = site.T_from_L.T @ T_from_J
-    sunlight = spectra.solar_band_irradiance_W_m2_nm(assemble.wavelengths_nm(scene), 1.0)
+    sunlight = spectra.solar_band_irradiance_W_m2_nm(ephemeris.wavelengths_nm(scene), 1.0)
     out = []
     for body in bodies:
         direction_L = L_from_J @ body.direction_J
         disc = replace(
-            assemble.sunlight(scene, direction_L), angular_radius_rad=max(body.angular_radius_rad, _LEAST_RAD)
+            ephemeris.sunlight(scene, direction_L), angular_radius_rad=max(body.angular_radius_rad, _LEAST_RAD)
         )
         seen = render.sun_visible_fraction(
             spec.terrain.surface, pose.position_L_m[None], [disc], pose.L_from_C[None]
@@ -246,3 +246,27 @@ def surroundings(spec: SampleSpec, scene: RenderInput) -> tuple[Radiance, ...]:
             )
         )
     return tuple(out)
+
+
+def add_atmosphere(spec: SampleSpec, scene: RenderInput, truth: Truth, radiance: Radiance) -> Radiance:
+    """Return the radiance behind and within the scene's atmosphere; without one it is returned as it is.
+
+    `truth` is on the grid of the radiance.
+    """
+    body, site = spec.scene.body, spec.terrain.site
+    if body.atmosphere is None:
+        return radiance
+    from .. import render
+    from ..render.atmosphere import rayleigh_depth
+
+    air = render.Air(
+        semi_axes_m=np.array(body.semi_axes_m),
+        centre_L_m=-site.T_from_L.T @ site.position_T_m,
+        T_from_L=site.T_from_L,
+        optical_depth=rayleigh_depth(scene.wavelength_nm, body.atmosphere.optical_depth),
+        scale_height_m=body.atmosphere.scale_height_m,
+    )
+    is_ground = truth.semantic == BODY
+    added, left = render.air_light(air, scene.view, scene.sun.direction_L, truth.depth_m, is_ground)
+    sunlight = scene.sun.irradiance_W_m2_nm.astype(np.float32)[:, None, None]
+    return replace(radiance, array=radiance.array * left + sunlight * added)

@@ -16,20 +16,28 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..body import Body, Site
+from ..body import Site
 from ..core import frames
 from ..core.errors import VbnfaultError
 from ..core.quantities import SKY, Radiance, Sample, Truth
 from ..core.sundisc import Pinhole, add_mean
 from ..render.description import RenderInput, may_see_sun
 from ..scene.config import Scene
-from ..scene.plan import EarlierViews, Plan, strata
+from ..scene.plan import EarlierViews, Plan
+from ..scene.redraw import strata
 from ..scene.trajectory import FlownPose
-from ..world import assemble
+from ..world import ephemeris
 from ..world.aiming import aimed_view
-from ..world.spacecraft import SpacecraftMesh
 from .record import to_sample
-from .rendering import ANGLE_LAYERS, body_of_few_pixels, describe, far_sources, surroundings, with_body
+from .rendering import (
+    ANGLE_LAYERS,
+    body_of_few_pixels,
+    describe,
+    far_sources,
+    seen_truth,
+    surroundings,
+    with_body,
+)
 from .resolve import references_L
 from .session import Session
 from .sight import in_local_frame
@@ -72,17 +80,13 @@ class StoredView:
 class _TerrainOnDemand(Terrain):
     """Hold a terrain whose surface is made when it is first used."""
 
-    def __init__(
-        self, body: Body, site: Site, vehicle: SpacecraftMesh | None, make: Callable[[], TerrainMesh]
-    ) -> None:
-        for name, value in (("body", body), ("site", site), ("vehicle", vehicle), ("_make", make)):
-            object.__setattr__(self, name, value)
+    def __init__(self, world: Session, site: Site, make: Callable[[], Terrain]) -> None:
+        self.__dict__.update(body=world.body, site=site, vehicle=world.vehicle, make=make)
 
     @cached_property
     def surface(self) -> TerrainMesh:  # type: ignore[override]
         """Return the renderer's copy of the patch."""
-        make: Callable[[], TerrainMesh] = self.__dict__["_make"]
-        return make()
+        return self.__dict__["make"]().surface  # type: ignore[no-any-return]
 
 
 class RetakeSession:
@@ -164,19 +168,17 @@ class RetakeSession:
         if world.trajectory is not None:
             flown = world.trajectory.pose(earlier)
         elif scene.is_flown:
-            flown = assemble.flown_pose(scene)
+            flown = ephemeris.flown_pose(scene)
         elif scene.is_aimed:
             of_model = world.sites[site.index]
             flown = aimed_view(scene, world.body, of_model, plan.aim_of(earlier), variables).pose
 
-        def surface() -> TerrainMesh:
+        def made() -> Terrain:
             if world.trajectory is not None:
-                return world.flown_terrain(earlier).surface
-            if scene.is_aimed and flown is not None:
-                return world.aimed_terrain(flown).surface
-            return world.terrain(site.index).surface
+                return world.terrain(world.ground_detail(earlier))
+            return world.aimed_terrain(flown) if scene.is_aimed and flown is not None else world.terrain(site.index)
 
-        terrain = _TerrainOnDemand(world.body, site, world.vehicle, surface)
+        terrain = _TerrainOnDemand(world, site, made)
         pose = (
             in_local_frame(site, flown)
             if flown is not None
@@ -252,12 +254,7 @@ def _rendering(spec: SampleSpec, pose: Pose, stored: StoredView) -> Rendering:
         light = None if body is None else body.light
         radiance = replace(radiance, fine=light if parts is None else parts.joined(light))
     if truth is None:
-        angles = bool(ANGLE_LAYERS & set(spec.scene.dataset.layers))
-        slopes = camera.seen_slopes if camera.lens.resamples else None
-        projection = camera.projection if camera.lens.resamples else None
-        truth = render.truth(
-            spec.terrain.surface, scene.view, scene.sun, angles=angles, slopes=slopes, projection=projection
-        )
+        truth = seen_truth(spec, scene)
         truth = truth if body is None else with_body(truth, body, camera.projection)
     open_sky = None
     if spec.scene.sky.stars != "off":

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,10 +22,9 @@ from ..scene import config, plan
 from ..scene.config import Scene, configure_faults
 from ..scene.keyed_random import keyed_uniform
 from ..scene.trajectory import FlownPose, Trajectory, as_trajectory, load_trajectory, with_rows
-from ..world import assemble
+from ..world import assemble, cameras, ephemeris
 from ..world.coma import check_coma
-from ..world.ground import GroundDetail, ground_details
-from ..world.siting import sites_for_suns
+from ..world.ground import GroundDetail, ground_details, sites_for_suns
 from ..world.spacecraft import SpacecraftMesh
 from .record import to_sample
 from .spec import Frame, SampleSpec, Terrain
@@ -114,8 +113,7 @@ class Session:
                 self.trajectory = load_trajectory(scene.trajectory.file)
         if self.trajectory is not None:
             self.trajectory = self.trajectory.repeated(scene.dataset.variants_per_view)
-            scene = scene if poses is None else with_rows(scene, self.trajectory)
-        self.scene = scene
+        self.scene = scene = with_rows(scene, None if poses is None else self.trajectory)
         planned = sum(blocks or (scene.dataset.samples,))
         if self.trajectory is not None and planned > len(self.trajectory):
             raise InputError(
@@ -140,7 +138,7 @@ class Session:
     def base_camera(self) -> Camera:
         """Return the camera with the first architecture and readout direction of the scene, without an exposure."""
         with in_file(self.source):
-            return assemble.base_camera(self.scene)
+            return cameras.base_camera(self.scene)
 
     @cached_property
     def body(self) -> Body:
@@ -161,8 +159,8 @@ class Session:
         with in_file(self.source):
             sentences = (
                 assemble.values_of_another_body(self.scene, self.body),
-                assemble.dark_corners(self.scene),
-                assemble.scaled_lens(self.scene),
+                cameras.dark_corners(self.scene),
+                cameras.scaled_lens(self.scene),
                 assemble.much_hidden(self.scene, self.vehicle),
             )
         for sentence in sentences:
@@ -179,26 +177,19 @@ class Session:
     def sites(self) -> Sites:
         """Return the sites of the scene. Each is drawn at its first use."""
         if self.scene.spice.spacecraft:
-            return assemble.trajectory_sites(self.scene, self.body)
+            return ephemeris.trajectory_sites(self.scene, self.body)
         if self.scene.exchanges_views:
             return sites_for_suns(self.scene, self.body, self.plan_of_sites)
         return choose_sites(self.body, self.scene.dataset.sites, self.scene.dataset.seed)
 
-    def terrain(self, site: int) -> Terrain:
-        """Return the terrain of a site. Only the last one is kept."""
-        if self._terrain is None or self._terrain_key != site:
+    def terrain(self, of: int | GroundDetail) -> Terrain:
+        """Return the terrain of a site, or the one refined for a pose. Only the last one is kept."""
+        if self._terrain is None or self._terrain_key != of:
             self._terrain = None  # release the old one first: a small machine has no memory for two
-            self._terrain = self._new_terrain(self.sites[site])
-            self._terrain_key = site
-        return self._terrain
-
-    def flown_terrain(self, index: int) -> Terrain:
-        """Return the terrain of a row of the table of poses. Rows share terrains; only the last one is kept."""
-        detail = self.ground_detail(index)
-        if self._terrain is None or self._terrain_key != detail:
-            self._terrain = None
-            self._terrain = self._new_terrain(detail.site(self.body, 0), detail)
-            self._terrain_key = detail
+            detail = None if isinstance(of, int) else of
+            site = self.sites[of] if isinstance(of, int) else of.site(self.body, 0)
+            self._terrain = self._new_terrain(site, detail)
+            self._terrain_key = of
         return self._terrain
 
     def ground_detail(self, index: int) -> GroundDetail:
@@ -215,12 +206,7 @@ class Session:
 
     def aimed_terrain(self, pose: FlownPose) -> Terrain:
         """Return the terrain for a pose of a camera that aims. Only the last one is kept."""
-        (detail,) = ground_details(self.scene, self.body, [pose])
-        if self._terrain is None or self._terrain_key != detail:
-            self._terrain = None
-            self._terrain = self._new_terrain(detail.site(self.body, 0), detail)
-            self._terrain_key = detail
-        return self._terrain
+        return self.terrain(ground_details(self.scene, self.body, [pose])[0])
 
     def model_terrain(self, index: int) -> Terrain:
         """Return the shape model as it is as the terrain of a site. Only the last one is kept."""
@@ -281,32 +267,22 @@ class Session:
         `detail`: facets and boulders for a pose of a table, in place of those of the scene.
         """
         table = self.scene.patch
-        spec = PatchSpec(
-            seed=self.scene.dataset.seed,
-            facet_m=table.facet_m,
-            radius_m=table.radius_m,
-            relief=table.relief,
-            hurst=table.hurst,
-            scarps=table.scarps,
-            intermittency=table.intermittency,
-            angularity=table.angularity,
-            craters_per_km2=table.craters_per_km2,
-            min_boulder_m=table.min_boulder_m if table.boulders else 1e6,
-            boulder_index=table.boulder_index,
-            boulders_per_km2=table.boulders_per_km2,
-            max_triangles=max(table.max_triangles, 2 * len(self.body.faces)),
-            fractured=None if table.fractured is None else Fractured(**table.fractured.model_dump()),
-        )
+        keys: dict[str, Any] = {key: v for key, v in table if key in PatchSpec.__dataclass_fields__}
+        keys |= {
+            "seed": self.scene.dataset.seed,
+            "max_triangles": max(table.max_triangles, 2 * len(self.body.faces)),
+        }
+        near_m = []  # boulders lie as near as that
         if table.fractured is not None:
-            spec = replace(spec, boulder_near_m=max(table.radius_m, spec.boulder_near_m))
+            keys["fractured"] = Fractured(**table.fractured.model_dump())
+            near_m.append(table.radius_m)
         if detail is not None:
-            spec = replace(
-                spec,
-                facet_m=detail.facet_m,
-                radius_m=detail.radius_m,
-                min_boulder_m=detail.boulder_m if table.boulders else 1e6,
-                boulder_near_m=max(detail.radius_m, spec.boulder_near_m),
-            )
+            keys |= {"facet_m": detail.facet_m, "radius_m": detail.radius_m, "min_boulder_m": detail.boulder_m}
+            near_m.append(detail.radius_m)
+        if not table.boulders:
+            keys["min_boulder_m"] = 1e6
+        spec = PatchSpec(**keys)
+        spec = replace(spec, boulder_near_m=max(*near_m, spec.boulder_near_m)) if near_m else spec
         patch = cached_patch(self.body, site, spec)
         kept = len(patch.boulder_diameter_m)
         # for a pose, the number of triangles sets the facets, so more triangles would not keep all boulders either
@@ -339,7 +315,7 @@ class Session:
         """Return what `spec` does; the messages of its errors do not name the scene."""
         site, aims = int(self.plan.site[index]), self.scene.is_aimed
         if self.trajectory is not None:
-            terrain = self.flown_terrain(index)
+            terrain = self.terrain(self.ground_detail(index))
         else:
             terrain = self.model_terrain(site) if aims else self.terrain(site)
         return SampleSpec(
@@ -358,7 +334,7 @@ class Session:
         if scene.spice.spacecraft:
             first = np.array([self.plan.first_of_view(index)])
             fraction = float(keyed_uniform(scene.dataset.seed, first, "plan", "epoch")[0])
-            values = {"julian_date": assemble.epoch_jd(scene, int(self.plan.site[index]), fraction)}
+            values = {"julian_date": ephemeris.epoch_jd(scene, int(self.plan.site[index]), fraction)}
         if self.trajectory is not None:
             flown = self.trajectory.pose(index)
             values = {"julian_date": flown.julian_date, "distance_au": flown.sun_distance_au}

@@ -14,7 +14,7 @@ from ..core import frames
 from ..core.errors import VbnfaultError
 from ..scene.instrument import CameraTable
 from ..scene.trajectory import FlownPose
-from ..world import assemble
+from ..world import ephemeris
 from ..world.spacecraft import SpacecraftMesh
 from .spec import Pose, SampleSpec, Terrain
 
@@ -31,7 +31,7 @@ def placed(spec: SampleSpec, terrain: Terrain, flown: FlownPose) -> Pose:
     from .. import render
 
     pose = in_local_frame(terrain.site, flown)
-    light = assemble.sunlight(spec.scene, pose.sun_L)
+    light = ephemeris.sunlight(spec.scene, pose.sun_L)
     position, axes = pose.position_L_m[None], pose.L_from_C[None]
     visible = float(render.sun_visible_fraction(terrain.surface, position, [light], axes)[0])
     variables = spec.plan.view(spec.scene, spec.index, 0)

@@ -21,7 +21,7 @@ from ..scene import keyed_random, plan
 from ..scene.config import Scene
 from ..scene.sampling import DEFAULT_TWINS
 from ..scene.trajectory import FlownPose
-from ..world import assemble
+from ..world import cameras
 from ..world.spacecraft import SpacecraftMesh
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ class Pose:
     """Hold the outcome of `resolve`: the position and attitude of the camera, and the Sun.
 
     `tries` counts the views drawn; this is the last of them. `variables` are the values of the plan, by the names
-    of `plan.VARIABLES`. `resolved` says whether every condition is met. It is False only if a trajectory places
+    of `redraw.VARIABLES`. `resolved` says whether every condition is met. It is False only if a trajectory places
     the camera, a fault of the sample needs the Sun, and the camera does not see the whole Sun ahead. `terrain` is
     the terrain that was made for this pose, if it is not that of the specification.
     """
@@ -117,7 +117,7 @@ class SampleSpec:
     @cached_property
     def camera(self) -> Camera:
         """Return the camera of the sample before an exposure is set."""
-        return self.taken_with or assemble.base_camera(
+        return self.taken_with or cameras.base_camera(
             self.scene,
             architecture=int(self.plan.architecture[self.index]),
             readout_direction=int(self.plan.readout_direction[self.index]),

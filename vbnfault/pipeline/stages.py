@@ -16,14 +16,13 @@ from typing import ParamSpec, Protocol, TypeVar
 from ..core.errors import VbnfaultError
 from ..core.quantities import Radiance
 from ..core.shared_results import SharedResults
-from .exposure import meter
-from .images import take_images
+from .development import take_images
+from .exposure import add_stars, meter
 from .injection import asking_for_another_view, inject_faults
 from .labels import label
 from .rendering import render_view
 from .resolve import resolve
 from .spec import Frame, Injection, Pose, Rendering, SampleSpec, SceneExposure
-from .stars import add_stars
 
 P = ParamSpec("P")
 T = TypeVar("T")

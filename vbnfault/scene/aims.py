@@ -11,6 +11,7 @@ sample.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,10 @@ from numpy.typing import NDArray
 from ..core.errors import InputError
 from . import keyed_random
 from .config import Scene
+from .redraw import least_sun_angle_deg
+
+if TYPE_CHECKING:
+    from .plan import Plan
 
 F64 = NDArray[np.float64]
 
@@ -138,3 +143,16 @@ def draw(scene: Scene, samples: NDArray[np.int64], aim: NDArray[np.uint8], attem
 def of_aim(values: Mapping[str, float], aim: str) -> dict[str, float]:
     """Return the values that a view of an aim needs."""
     return {name: values[name] for name in NEEDED[aim]}
+
+
+def view(plan: Plan, scene: Scene, index: int, attempt: int) -> dict[str, float]:
+    """Return the values of a sample's view at a try, as far as its aim needs them; the aim stays."""
+    assert plan.aim is not None
+    drawn = draw(scene, plan.draw[index : index + 1], plan.aim[index : index + 1], attempt)
+    return of_aim({name: float(column[0]) for name, column in drawn.items()}, plan.aim_of(index))
+
+
+def sun_elongation_deg(scene: Scene) -> tuple[float, float]:
+    """Return the allowed angles between boresight and Sun where the camera aims, but not at the Sun."""
+    given = scene.geometry.sun_elongation_deg
+    return (least_sun_angle_deg(scene), 180.0) if given is None else (given[0], given[1])

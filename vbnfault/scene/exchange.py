@@ -4,7 +4,7 @@ A view that cannot be used could be drawn again, but this bends the distribution
 more often than a high one, so the kept Suns are too high. With `plan.unusable_views = "exchange"`, a sample keeps
 its Sun and its attitude instead, and what makes the view unusable is exchanged:
 
-- Sites are chosen for the Suns that are drawn there (`world.siting`). The Sun-facing samples of a site have Suns
+- Sites are chosen for the Suns that are drawn there (`world.ground`). The Sun-facing samples of a site have Suns
   of one sector of azimuth, and all elevations.
 - The Sun-facing samples of a shard exchange positions, the Sun-averted ones whole views (`pipeline.resolve`): a
   view without any light goes to a sample whose faults need none.
@@ -17,11 +17,18 @@ a value is drawn again: first the position, then the whole view.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import NDArray
 
-from . import keyed_random
-from .names import SUN_FACING
+from ..core.frames import boresight_angle_deg
+from . import keyed_random, redraw
+from .config import Scene
+from .names import SUN_AVERTED, SUN_FACING
+
+if TYPE_CHECKING:
+    from .plan import Plan
 
 # Largest distance of two samples of a shard, plus 1: a shard has at most 16.
 MOST = 16
@@ -70,8 +77,6 @@ def pitches(
     least_deg
         Least angle between boresight and Sun. A view for which no exchange helps is left as it is.
     """
-    from ..core.frames import boresight_angle_deg
-
     _, views, view_of = np.unique(samples, return_index=True, return_inverse=True)
     pitch = pitch_deg[views]
     for p in np.unique(part[part >= 0]):
@@ -85,3 +90,37 @@ def pitches(
                 other = others[np.argmax(good)]
                 pitch[here[k]], pitch[other] = pitch[other], pitch[here[k]]
     pitch_deg[:] = pitch[view_of.ravel()]
+
+
+def draw(
+    scene: Scene,
+    samples: NDArray[np.int64],
+    stratum: NDArray[np.uint8],
+    light: NDArray[np.int64],
+    paired: NDArray[np.bool_],
+    block: NDArray[np.int64],
+) -> dict[str, NDArray[np.float64]]:
+    """Return the first views, as `redraw.draw`, in which samples of a block exchange pitches at first."""
+    drawn = redraw.uniform(scene, samples, stratum, light, paired)
+    if redraw.strata(scene)[SUN_AVERTED].reference == "sun":
+        averted, least = np.where(stratum == SUN_AVERTED, block, -1), redraw.least_sun_angle_deg(scene)
+        pitches(samples, averted, drawn["roll_deg"], drawn["pitch_deg"], least)
+    redraw.keep_sun_out_of_view(scene, samples, stratum, drawn, 0)
+    return drawn
+
+
+def view(plan: Plan, scene: Scene, index: int, attempt: int) -> dict[str, float]:
+    """Return the variables of a sample's view at a try: exchanged, then drawn again as little as possible."""
+    members, facing = plan.members(index), plan.stratum[index] == SUN_FACING
+    if attempt < len(members):
+        other = members[(members.index(plan.first_of_view(index)) + attempt) % len(members)]
+        taken = redraw.POSITION if facing else redraw.VARIABLES
+        whose = {name: other if name in taken else index for name in redraw.VARIABLES}
+        return {name: float(plan.variables[name][k]) for name, k in whose.items()}
+    kept: tuple[str, ...] = ()
+    if attempt < len(members) + KEPT_TRIES:
+        kept = (*redraw.SUN, *redraw.ATTITUDE) if facing else redraw.SUN if plan.paired[index] else ()
+    row = slice(index, index + 1)
+    key = plan.draw[row]  # a Sun that cannot be kept is drawn again
+    drawn = redraw.draw(scene, key, plan.stratum[row], key, plan.paired[row], attempt=attempt)
+    return {name: float(plan.variables[name][index] if name in kept else v[0]) for name, v in drawn.items()}

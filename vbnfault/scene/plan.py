@@ -7,10 +7,8 @@ counts allow. Every number is keyed by its sample, so a longer block keeps the n
 exceptions are the fault matrix, which is balanced over the whole block, and the strata and bounds that follow from
 it.
 
-A sample's view (position, Sun, attitude) is a function of (sample, try). Where a view cannot be used, the whole
-view is drawn again within the same bounds. The views that are kept therefore follow the table's distribution, under
-the condition that they can be used. With `plan.unusable_views = "exchange"` they follow the table itself: see
-`scene.exchange`.
+A sample's view (position, Sun, attitude) is a function of (sample, try). `scene.redraw` draws it and says what the
+next try is; so do `scene.exchange` with `plan.unusable_views = "exchange"`, and `scene.aims` where the camera aims.
 """
 
 from __future__ import annotations
@@ -23,21 +21,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import frames
 from ..core.errors import InputError
-from . import aims, exchange, keyed_random
+from . import aims, exchange, keyed_random, redraw
 from .config import Scene
+from .fault_matrix import draw_block
 from .names import SPLITS, SUN_AVERTED, SUN_FACING
-from .sampling import StratumTable
-
-_SUN = ("sun_azimuth_deg", "sun_elevation_deg")
-_ATTITUDE = ("roll_deg", "pitch_deg", "yaw_deg")
-_POSITION = ("x_m", "y_m", "height_m")
-VARIABLES = (*_SUN, *_ATTITUDE, *_POSITION)
-_MAX_ATTITUDE_TRIES = 1000
-# Limits of the search for rows to exchange between splits: rows compared on each side, and exchanges.
-_ROWS_COMPARED = 128
-_MAX_EXCHANGES = 200
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -131,27 +119,11 @@ class Plan:
         """
         if self.views is not None:
             return self.views.plan.view(self.views.scene, index // self.views.repeats, attempt)
-        row = slice(index, index + 1)
-        key = self.draw[row]
-        first = {name: float(values[index]) for name, values in self.variables.items()}
         if attempt == 0:
+            first = {name: float(values[index]) for name, values in self.variables.items()}
             return first if self.aim is None else aims.of_aim(first, self.aim_of(index))
-        if self.aim is not None:
-            drawn = aims.draw(scene, key, self.aim[row], attempt)
-            return aims.of_aim({name: float(column[0]) for name, column in drawn.items()}, self.aim_of(index))
-        members = self.members(index)
-        kept: tuple[str, ...] = ()
-        if self.group is not None:
-            facing = self.stratum[index] == SUN_FACING
-            if attempt < len(members):
-                other = members[(members.index(self.first_of_view(index)) + attempt) % len(members)]
-                taken = _POSITION if facing else VARIABLES
-                return {name: float(self.variables[name][other if name in taken else index]) for name in VARIABLES}
-            if attempt < len(members) + exchange.KEPT_TRIES:
-                kept = (*_SUN, *_ATTITUDE) if facing else _SUN if self.paired[index] else ()
-        light = self.light[row] if self.group is None else key  # a Sun that cannot be kept is drawn again
-        drawn = _views(scene, key, self.stratum[row], light, self.paired[row], attempt=attempt)
-        return {name: first[name] if name in kept else float(column[0]) for name, column in drawn.items()}
+        rule = aims.view if self.aim is not None else exchange.view if self.group is not None else redraw.view
+        return rule(self, scene, index, attempt)
 
     def suns_of_site(self, site: int) -> NDArray[np.int64]:
         """Return the Sun-facing samples for whose Suns a site is chosen: those of the first block that has any."""
@@ -189,7 +161,7 @@ def make_plan(
     parts = []
     for b, (start, end) in enumerate(itertools.pairwise(starts.tolist())):
         rows = slice(start, end)
-        parts.append(_block(scene, (tuple(faults), frozenset(need_sun)), (b, start), shard[rows], split[rows]))
+        parts.append(draw_block(scene, (tuple(faults), frozenset(need_sun)), (b, start), shard[rows], split[rows]))
     injected = np.concatenate([p[0] for p in parts])
     stratum = np.concatenate([p[1] for p in parts])
     block = np.repeat(np.arange(len(sizes)), sizes)
@@ -202,10 +174,12 @@ def make_plan(
         draw = exchange.by_azimuth(scene.dataset.seed, draw, block, stratum, site)
         light = draw[light]
     aim = np.concatenate([p[2] for p in parts]) if scene.is_aimed else None
-    if aim is None:
-        variables = _views(scene, draw, stratum, light, paired, block=block)
-    else:
+    if aim is not None:
         variables = aims.draw(scene, draw, aim, 0)
+    elif scene.exchanges_views:
+        variables = exchange.draw(scene, draw, stratum, light, paired, block)
+    else:
+        variables = redraw.draw(scene, draw, stratum, light, paired)
     return Plan(
         faults=tuple(faults),
         variables=variables,
@@ -249,109 +223,6 @@ def shortcomings(scene: Scene, table: Plan) -> list[str]:
     return out
 
 
-def least_sun_angle_deg(scene: Scene) -> float:
-    """Return the least angle between a Sun-averted boresight and the Sun.
-
-    It is √2·FoV/2, as for the paper's square frame, or the frame's half diagonal where that is larger: in a frame
-    that is higher than wide.
-    """
-    camera = scene.camera
-    diagonal = np.hypot(1.0, camera.height_px / camera.width_px) * np.tan(np.radians(camera.fov_deg) / 2)
-    return float(max(np.sqrt(2) * camera.fov_deg / 2, np.degrees(np.arctan(diagonal))))
-
-
-def sun_elongation_deg(scene: Scene) -> tuple[float, float]:
-    """Return the allowed angles between boresight and Sun where the camera aims, but not at the Sun."""
-    given = scene.geometry.sun_elongation_deg
-    return (least_sun_angle_deg(scene), 180.0) if given is None else (given[0], given[1])
-
-
-def strata(scene: Scene) -> tuple[StratumTable, StratumTable]:
-    """Return the bounds of the Sun-facing and of the Sun-averted stratum, with all defaults filled in."""
-    facing, averted = scene.geometry.sun_facing, scene.geometry.sun_averted
-    assert facing is not None
-    assert averted is not None
-    return facing, averted
-
-
-# --- views --------------------------------------------------------------------------------------------------
-
-
-def bounds(scene: Scene, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the lower and the upper bounds of a variable, float64[stratum] each."""
-    tables = (scene.geometry, scene.geometry) if name in _POSITION else strata(scene)
-    lo, hi = zip(*(getattr(t, name) for t in tables), strict=True)
-    return np.array(lo), np.array(hi)
-
-
-def _views(
-    scene: Scene,
-    samples: NDArray[np.int64],
-    stratum: NDArray[np.uint8],
-    light: NDArray[np.int64],
-    paired: NDArray[np.bool_],
-    *,
-    attempt: int = 0,
-    block: NDArray[np.int64] | None = None,
-) -> dict[str, NDArray[np.float64]]:
-    """Return uniform draws of all variables within the bounds of each sample's stratum, float64[n] each.
-
-    `attempt` counts from 0; later attempts are redraws. Paired samples draw the Sun within the bounds of both
-    strata, with the key of one of the two. They keep this Sun at every attempt, unless views are exchanged. If so,
-    and `block` is given, Sun-averted samples of a block exchange pitches until the Sun is out of view.
-    """
-    sun_attempt = attempt if scene.exchanges_views else 0
-    drawn = {}
-    for name in VARIABLES:
-        low, high = bounds(scene, name)
-        lo, hi = low[stratum], high[stratum]
-        if name in _SUN and scene.plan.pair_strata:
-            lo, hi = np.where(paired, low.max(), lo), np.where(paired, high.min(), hi)
-            u = keyed_random.keyed_uniform(scene.dataset.seed, light, "plan", f"{name}/{sun_attempt}")
-        else:
-            u = keyed_random.keyed_uniform(scene.dataset.seed, samples, "plan", f"{name}/{attempt}")
-        drawn[name] = lo + u * (hi - lo)
-    if scene.exchanges_views and block is not None and strata(scene)[SUN_AVERTED].reference == "sun":
-        averted = np.where(stratum == SUN_AVERTED, block, -1)
-        pitch = drawn["pitch_deg"]
-        exchange.pitches(samples, averted, drawn["roll_deg"], pitch, least_sun_angle_deg(scene))
-    _keep_sun_out_of_view(scene, samples, stratum, drawn, attempt)
-    return drawn
-
-
-def _keep_sun_out_of_view(
-    scene: Scene,
-    samples: NDArray[np.int64],
-    stratum: NDArray[np.uint8],
-    variables: dict[str, NDArray[np.float64]],
-    attempt: int,
-) -> None:
-    """Draw roll and pitch of Sun-averted samples again, in place, until the Sun is out of view.
-
-    The paper's bounds leave 8 % of the Sun-averted draws looking at the Sun, where roll and pitch are both near
-    half a turn. Where the angles count from the Sun, only roll and pitch decide this. Where they count from the
-    nadir or the centre, the function does nothing. Raises InputError where the bounds keep the Sun in view.
-    """
-    if strata(scene)[SUN_AVERTED].reference != "sun":
-        return
-    names = ("roll_deg", "pitch_deg")
-    least = least_sun_angle_deg(scene)
-    lo, hi = (np.array(b)[:, SUN_AVERTED] for b in zip(*(bounds(scene, name) for name in names), strict=True))
-    again = np.flatnonzero(stratum == SUN_AVERTED)
-    for k in range(1, _MAX_ATTITUDE_TRIES):
-        angle = frames.boresight_angle_deg(*(variables[name][again] for name in names))
-        again = again[angle < least]
-        if not len(again):
-            return
-        for j, name in enumerate(names):
-            u = keyed_random.keyed_uniform(scene.dataset.seed, samples[again], "plan", f"{name}/{attempt}.{k}")
-            variables[name][again] = lo[j] + u * (hi[j] - lo[j])
-    raise InputError(
-        f"geometry.sun_averted: its roll_deg and pitch_deg keep the Sun within {least:.1f} deg of the boresight; "
-        "widen them"
-    )
-
-
 def _pair(low: NDArray[np.float64], high: NDArray[np.float64], stratum: int) -> list[float]:
     """Return the bounds of one stratum for an error message."""
     return [float(low[stratum]), float(high[stratum])]
@@ -368,8 +239,8 @@ def _pairs(
     light, paired = samples.copy(), np.zeros(len(samples), dtype=bool)
     if not scene.plan.pair_strata:
         return light, paired
-    for name in _SUN:
-        low, high = bounds(scene, name)
+    for name in redraw.SUN:
+        low, high = redraw.bounds(scene, name)
         if low.max() > high.min():
             raise InputError(
                 f"plan.pair_strata = true: geometry.sun_facing.{name} = {_pair(low, high, SUN_FACING)} and "
@@ -389,224 +260,7 @@ def _pairs(
     return light, paired
 
 
-# --- fault matrix -------------------------------------------------------------------------------------------
-
-
-def _block(
-    scene: Scene,
-    classes: tuple[tuple[str, ...], frozenset[str]],
-    block: tuple[int, int],
-    shard: NDArray[np.int64],
-    split: NDArray[np.uint8],
-) -> tuple[NDArray[np.bool_], NDArray[np.uint8], NDArray[np.uint8]]:
-    """Return the fault matrix bool[n, fault], the strata uint8[n] and, if the camera aims, the aims uint8[n].
-
-    `classes` are the faults, and those of them that need the Sun. `block` is the number of the block and its first
-    sample.
-    """
-    n = len(shard)
-    faults, need_sun = classes
-    number, start = block
-    rng = keyed_random.rng(scene.dataset.seed, start, "plan", f"fault_matrix/{number}")
-    make = fault_matrix_per_class if scene.plan.mode == "per_class" else fault_matrix_per_sample
-    lo, hi = scene.plan.classes_per_sample
-    spec = MatrixSpec(
-        samples=n, faults=faults, fraction=scene.plan.faulty_fraction, sizes=(lo, hi), need_sun=need_sun
-    )
-    injected = make(spec, rng)
-    towards_sun = int(_with_any(injected, faults, need_sun).sum())
-    nominal = round(scene.plan.sun_facing_nominal_fraction * n)
-    if scene.is_aimed:
-        nominal = aims.samples_towards_sun(scene, n, towards_sun) - towards_sun
-    if towards_sun + nominal > n:
-        names = " or ".join(name for name in faults if name in need_sun)
-        raise InputError(
-            f"plan.sun_facing_nominal_fraction = {scene.plan.sun_facing_nominal_fraction:g}: with {names} in "
-            f"{towards_sun} of {n} samples it must be at most {(n - towards_sun) / n:g}"
-        )
-    variants = scene.dataset.variants_per_view
-    facing = variants * -(-(towards_sun + nominal) // variants)  # the samples of a view share its stratum
-    stratum = np.full(n, SUN_AVERTED, dtype=np.uint8)
-    stratum[:facing] = SUN_FACING
-    views = np.arange(n)[:, None] if variants == 1 else _views_of_rows(injected, stratum, variants, rng)
-    traits: NDArray[np.bool_] = np.any(_traits(injected, stratum)[views], axis=1)
-    first = facing // variants if scene.plan.order == "sun_first" else 0
-    places = [
-        start + _dealt(traits[start:end], shard[::variants][start:end], split[::variants][start:end], rng)
-        for start, end in ((0, first), (first, len(views)))
-        if end > start
-    ]
-    views = views[np.concatenate(places)]
-    order = views.ravel()
-    stratum = stratum[order]
-    aim = stratum[:0]
-    if scene.is_aimed:
-        aim = np.repeat(aims.deal(scene, stratum[::variants] == SUN_FACING, rng), variants)
-    return injected[order], stratum, aim
-
-
-def _traits(injected: NDArray[np.bool_], stratum: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Return what every split should have of each row, bool[n, trait]: its stratum, its classes, or none."""
-    return np.column_stack([stratum == SUN_FACING, injected, ~injected.any(axis=1)])
-
-
-def _in_order_of_traits(traits: NDArray[np.bool_], rng: np.random.Generator) -> NDArray[np.int64]:
-    """Return the rows sorted by their traits, and at random among equal ones, int64[n]."""
-    bits = np.uint64(1) << np.arange(traits.shape[1], dtype=np.uint64)[::-1]
-    kind = (traits * bits).sum(axis=1, dtype=np.uint64)
-    return np.lexsort((rng.random(len(traits)), kind))
-
-
-def _views_of_rows(
-    injected: NDArray[np.bool_], stratum: NDArray[np.uint8], variants: int, rng: np.random.Generator
-) -> NDArray[np.int64]:
-    """Return the rows of the fault matrix that share a view, int64[view, variant].
-
-    The samples of a view have one stratum, and faults as different as possible.
-    """
-    line = _in_order_of_traits(_traits(injected, stratum), rng)
-    views = [
-        line[stratum[line] == which].reshape(variants, -1).T  # neighbours in the line come into different views
-        for which in (SUN_FACING, SUN_AVERTED)
-    ]
-    return np.asarray(rng.permuted(np.concatenate(views), axis=1))
-
-
-def _with_any(matrix: NDArray[np.bool_], faults: Sequence[str], wanted: Collection[str]) -> NDArray[np.bool_]:
-    """Return which rows of a fault matrix bool[n, fault] hold one of the classes `wanted`, bool[n]."""
-    return np.asarray(matrix[:, [name in wanted for name in faults]].any(axis=1))
-
-
-@dataclass(frozen=True, kw_only=True)
-class MatrixSpec:
-    """Describe a fault matrix: how many samples have which faults.
-
-    Attributes
-    ----------
-    samples
-        Number of samples n.
-    faults
-        The classes, one for each column of the fault matrix.
-    fraction
-        Fraction p, in [0, 1], of the samples that have a class (`fault_matrix_per_class`), or that have at least
-        one class (`fault_matrix_per_sample`).
-    sizes
-        Least and greatest number of classes in a faulty sample; only `fault_matrix_per_sample` uses it.
-    need_sun
-        Classes that need the Sun in view; their samples come first.
-    """
-
-    samples: int
-    faults: tuple[str, ...]
-    fraction: float
-    sizes: tuple[int, int] = (1, 6)
-    need_sun: Collection[str] = ()
-
-
-def fault_matrix_per_class(spec: MatrixSpec, rng: np.random.Generator) -> NDArray[np.bool_]:
-    """Return bool[n, fault] with every class in exactly round(p·n) rows."""
-    n, count = spec.samples, round(spec.fraction * spec.samples)
-    matrix = np.zeros((n, len(spec.faults)), dtype=bool)
-    first = next((name for name in spec.faults if name in spec.need_sun), None)
-    for f, name in enumerate(spec.faults):
-        rows = np.arange(count) if name == first else rng.permutation(n)[:count]
-        matrix[rows, f] = True
-    return matrix[np.argsort(~_with_any(matrix, spec.faults, spec.need_sun), kind="stable")]
-
-
-def fault_matrix_per_sample(spec: MatrixSpec, rng: np.random.Generator) -> NDArray[np.bool_]:
-    """Return bool[n, fault] with exactly round(p·n) faulty rows, each with a non-empty subset of the classes.
-
-    Subset sizes are uniform in `sizes` (at most the number of classes). All subsets of one size have the same
-    probability, until some are changed so that the counts of any two classes differ by at most one.
-    """
-    n, classes = spec.samples, len(spec.faults)
-    matrix = np.zeros((n, classes), dtype=bool)
-    faulty = round(spec.fraction * n)
-    if classes == 0 or faulty == 0:
-        return matrix
-    lo, hi = (min(s, classes) for s in spec.sizes)
-    size = rng.integers(lo, hi, faulty, endpoint=True)
-    # the classes with the `size` smallest random keys are a random subset of that size
-    rank = np.argsort(np.argsort(rng.random((faulty, classes), dtype=np.float32), axis=1), axis=1)
-    rows = rank < size[:, None]
-    _level(rows, rng)
-    first = _with_any(rows, spec.faults, spec.need_sun)
-    towards_sun = int(first.sum())
-    matrix[:towards_sun] = rows[first]
-    others = towards_sun + rng.permutation(n - towards_sun)[: faulty - towards_sun]
-    matrix[others] = rows[~first]
-    return matrix
-
-
-def _level(rows: NDArray[np.bool_], rng: np.random.Generator) -> None:
-    """Exchange classes in random rows until the counts of any two classes differ by at most one; in place."""
-    classes = rows.shape[1]
-    count = rows.sum(axis=0)
-    each, extra = divmod(int(count.sum()), classes)
-    wanted = np.full(classes, each)
-    wanted[rng.permutation(classes)[:extra]] += 1
-    while (count != wanted).any():
-        most, least = int(np.argmax(count - wanted)), int(np.argmin(count - wanted))
-        number = min(count[most] - wanted[most], wanted[least] - count[least])
-        # There are enough rows with `most` and without `least`: at least as many as the difference of the two
-        # counts, which is at least excess + lack - 1, and so at least `number`.
-        chosen = rng.permutation(np.flatnonzero(rows[:, most] & ~rows[:, least]))[:number]
-        rows[chosen, most], rows[chosen, least] = False, True
-        count[most] -= number
-        count[least] += number
-
-
 # --- sites and splits ---------------------------------------------------------------------------------------
-
-
-def _dealt(
-    traits: NDArray[np.bool_],
-    shard: NDArray[np.int64],
-    split: NDArray[np.uint8],
-    rng: np.random.Generator,
-) -> NDArray[np.int64]:
-    """Return which row of bool[n, trait] each place of a block takes, int64[n].
-
-    A row is a row of the fault matrix, or those of a view together. The rows are sorted by their traits and
-    distributed over the shards, one row per shard and round. Then rows are exchanged between splits where a split
-    lacks a trait that the block has often enough.
-    """
-    n = len(shard)
-    line = _in_order_of_traits(traits, rng)
-    turn = np.arange(n) - np.searchsorted(shard, shard, side="left")
-    order = np.empty(n, dtype=np.int64)
-    order[np.lexsort((rng.random(n), turn))] = line
-    present = np.unique(split)
-    enough = traits.sum(axis=0) >= len(present)
-    for _ in range(_MAX_EXCHANGES):
-        pair = _exchange(traits[order], split, present, enough)
-        if pair is None:
-            break
-        order[list(pair)] = order[list(pair[::-1])]
-    return order
-
-
-def _exchange(
-    traits: NDArray[np.bool_], split: NDArray[np.uint8], present: NDArray[np.uint8], enough: NDArray[np.bool_]
-) -> tuple[int, int] | None:
-    """Return two samples whose exchange leaves fewer (split, trait) pairs empty, or None without such samples."""
-    count = np.stack([traits[split == s].sum(axis=0) for s in present])
-    for s, trait in np.argwhere((count == 0) & enough):
-        mine = np.flatnonzero(split == present[s])[:_ROWS_COMPARED]
-        theirs = np.flatnonzero((split != present[s]) & traits[:, trait])[:_ROWS_COMPARED]
-        gain = traits[theirs][None].astype(int) - traits[mine][:, None]  # what split s would gain
-        other = np.searchsorted(present, split[theirs])
-        after = [count[s] + gain, count[other][None] - gain]
-        before = [np.broadcast_to(count[s], gain.shape), np.broadcast_to(count[other][None], gain.shape)]
-        change = sum(
-            ((a[..., enough] == 0).sum(axis=-1) - (b[..., enough] == 0).sum(axis=-1))
-            for a, b in zip(after, before, strict=True)
-        )
-        a, b = np.unravel_index(np.argmin(change), change.shape)
-        if change[a, b] < 0:
-            return int(mine[a]), int(theirs[b])
-    return None
 
 
 def _shard_sites(scene: Scene, shards: int) -> NDArray[np.int32]:

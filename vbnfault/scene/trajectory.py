@@ -11,7 +11,7 @@ import csv
 import io
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -115,15 +115,11 @@ class Trajectory:
         """Return the table with each row `count` times, for samples that share a view: NAME/0, NAME/1, ..."""
         if count == 1:
             return self
-        return Trajectory(
-            source=self.source,
-            name=tuple(f"{name}/{k}" for name in self.name for k in range(count)),
-            julian_date=np.repeat(self.julian_date, count),
-            camera_position_T_m=np.repeat(self.camera_position_T_m, count, axis=0),
-            camera_from_T=np.repeat(self.camera_from_T, count, axis=0),
-            sun_direction_T=np.repeat(self.sun_direction_T, count, axis=0),
-            sun_distance_au=np.repeat(self.sun_distance_au, count),
-        )
+        names = tuple(f"{name}/{k}" for name in self.name for k in range(count))
+        arrays: dict[str, Any] = {
+            key: np.repeat(v, count, axis=0) for key, v in vars(self).items() if isinstance(v, np.ndarray)
+        }
+        return replace(self, name=names, **arrays)
 
     @property
     def boresight_T(self) -> F64:

@@ -47,6 +47,10 @@ class _Bounded(_Factor):
         nodes, weights = np.polynomial.legendre.leggauss(_NODES)
         return nodes, weights / 2
 
+    def nominal(self) -> float:
+        """Return the point of the unit interval at which a one-at-a-time design holds the factor: the middle."""
+        return 0.5
+
     @model_validator(mode="after")
     def _ordered(self) -> _Bounded:
         if not self.low < self.high:
@@ -70,10 +74,6 @@ class Uniform(_Bounded):
         """Return the points of the unit interval at which the values are taken."""
         return (np.asarray(values, dtype=np.float64) - self.low) / (self.high - self.low)
 
-    def nominal(self) -> float:
-        """Return the point of the unit interval at which a one-at-a-time design holds the factor: the middle."""
-        return 0.5
-
 
 class LogUniform(_Bounded):
     """Distribute the logarithm of a factor evenly between two bounds above 0."""
@@ -91,10 +91,6 @@ class LogUniform(_Bounded):
         """Return the points of the unit interval at which the values are taken."""
         ratio = np.log(np.asarray(values, dtype=np.float64) / self.low)
         return ratio / np.log(self.high / self.low)
-
-    def nominal(self) -> float:
-        """Return the point of the unit interval at which a one-at-a-time design holds the factor: the middle."""
-        return 0.5
 
 
 class TruncatedNormal(_Bounded):

@@ -44,7 +44,7 @@ from ..pipeline.resolve import resolve
 from ..pipeline.session import Session
 from ..pipeline.spec import Injection, SampleSpec
 from ..scene.config import Scene, configure_faults
-from ..world.assemble import base_camera
+from ..world.cameras import base_camera
 from . import chosen_fault, image_metrics
 from . import navigation_metrics as nav
 from .factors import Factors, Setting, StudyScene, base_scene, changed_scene
@@ -234,7 +234,7 @@ class SceneEvaluator:
             if not self._adding:
                 raise InputError(
                     f"metrics.names: {shown(name)} needs a fault that adds light, which the scene "
-                    f" {shown(self.spec.scene.base)} has not"
+                    f"{shown(self.spec.scene.base)} has not"
                 )
 
     # --- stages ---------------------------------------------------------------------------------------------------

@@ -43,6 +43,7 @@ from ..faults import Fault, from_dict, registry
 from ..lens import Prescription
 from ..lens.changes import Change
 from ..scene.config import Scene, parse_scene, read_scene
+from ..scene.instrument import OF_THE_DETECTOR
 from . import chosen_fault
 from .spec import StudySpec
 
@@ -66,10 +67,7 @@ _ENDINGS = {
     "_m": "m",
 }
 # Keys of [camera] that describe the detector of a camera without a sensor's file.
-_OF_THREE_COLOURS = (
-    *("full_well_e", "read_noise_e_rms", "dark_current_e_s", "adc_bits", "bias_dn"),
-    *("response", "quantum_efficiency_peak"),
-)
+_OF_THREE_COLOURS = tuple(key for key in OF_THE_DETECTOR if key not in ("pixel_pitch_um", "architectures"))
 # Keys of a sensor's file that are no property of its electronics, or that the renderer reads.
 _NOT_OF_A_DETECTOR = (
     *("name", "source", "sources", "effects", "architecture", "width_px", "height_px", "pixel_pitch_um"),
@@ -78,8 +76,8 @@ _NOT_OF_A_DETECTOR = (
 # Keys of [camera] that act behind the lens or on the exposure, so that the renderer does not read them.
 AFTER_RENDER = (
     *("exposure_s", "exposure_min_s", "exposure_max_s", "metering_level", "metering_percentile", "transmission"),
-    *("full_well_e", "read_noise_e_rms", "dark_current_e_s", "adc_bits", "bias_dn", "response"),
-    *("quantum_efficiency_peak", "detector_temperature_K"),
+    *_OF_THREE_COLOURS,
+    "detector_temperature_K",
 )
 _LENGTHS = ("fraction", "mm")
 _SUN_LIMITS = {"angle_deg": (0.0, 89.0), "distance_au": (0.02, 1000.0)}

@@ -23,7 +23,7 @@ from typing import Literal, TypeGuard
 import numpy as np
 from numpy.typing import NDArray
 
-from .spec import Metric
+from .spec import Metric, returned
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -103,10 +103,11 @@ _ALL: dict[str, tuple[Metric, Value]] = {}
 
 
 def _metric(unit: str, source: str = "", better: Literal["low", "high"] = "low") -> Callable[[Value], Value]:
-    """Return a decorator that adds a function to the metrics; its docstring is the metric's description."""
+    """Return a decorator that adds a function to the metrics; its docstring describes the metric."""
 
     def add(value: Value) -> Value:
-        name, description = value.__name__, " ".join((value.__doc__ or "").split())
+        name, words = value.__name__, returned(value)
+        description = words[0].upper() + words[1:]
         _ALL[name] = Metric(name=name, unit=unit, description=description, source=source, better=better), value
         return value
 
@@ -115,50 +116,52 @@ def _metric(unit: str, source: str = "", better: Literal["low", "high"] = "low")
 
 @_metric("electrons")
 def straylight_total_e(image: LitImage) -> float:
-    """Light that straylight adds, Σ V over the frame"""
+    """Return the light that straylight adds, Σ V over the frame."""
     return float(image.added_mean.sum(dtype=np.float64))
 
 
 @_metric("electrons")
 def straylight_peak_e(image: LitImage) -> float:
-    """Most light that straylight adds to a pixel, max V"""
+    """Return the most light that straylight adds to a pixel, max V."""
     return float(image.added_mean.max())
 
 
 @_metric("electrons", "Hullin et al. 2011")
 def ghost_total_e(image: LitImage) -> float:
-    """Light of all ghosts in the frame"""
+    """Return the light of all ghosts in the frame."""
     return image.parts_e.get("ghosts", float("nan"))
 
 
 @_metric("electrons")
 def ghost_peak_e(image: LitImage) -> float:
-    """Most light of ghosts in a pixel, max G"""
+    """Return the most light of ghosts in a pixel, max G."""
     return float(image.ghosts.max()) if _has_light(image.ghosts) else float("nan")
 
 
 @_metric("1", "EMVA 1288")
 def ghost_area(image: LitImage) -> float:
-    """Fraction of pixels to which ghosts alone add more than the noise without straylight, G > √(S₀ + D + r²)"""
+    """Return the fraction of pixels to which ghosts alone add more than the noise without straylight, G > √(S₀
+    + D + r²).
+    """
     return _above(image.ghosts, image) if _has_light(image.ghosts) else float("nan")
 
 
 @_metric("px")
 def ghost_offset_px(image: LitImage) -> float:
-    """Distance of the centre of brightness of all ghosts, Σ G r / Σ G, from the middle of the frame"""
+    """Return the distance of the centre of brightness of all ghosts, Σ G r / Σ G, from the middle of the frame."""
     return _moments(image.ghosts)[0] if _has_light(image.ghosts) else float("nan")
 
 
 @_metric("px")
 def ghost_spread_px(image: LitImage) -> float:
-    """Root mean square distance of the ghosts' light from its centre of brightness"""
+    """Return the root mean square distance of the ghosts' light from its centre of brightness."""
     return _moments(image.ghosts)[1] if _has_light(image.ghosts) else float("nan")
 
 
 @_metric("1")
 def ghost_difference(image: LitImage) -> float:
-    """Difference of the ghosts, pixel by pixel, from those of exact rays through the same lens,
-    Σ |G − G traced| / Σ G traced; 0 for the model traced, and up to 2
+    """Return the difference of the ghosts, pixel by pixel, from those of exact rays through the same lens, Σ |G
+    − G traced| / Σ G traced; 0 for the model traced, and up to 2.
     """
     ghosts, traced = image.ghosts, image.traced_ghosts
     if not (_has_light(ghosts) and _has_light(traced)):
@@ -168,27 +171,27 @@ def ghost_difference(image: LitImage) -> float:
 
 @_metric("electrons")
 def starburst_total_e(image: LitImage) -> float:
-    """Light in the frame that the stop diffracts"""
+    """Return the light in the frame that the stop diffracts."""
     return image.parts_e.get("starburst", float("nan"))
 
 
 @_metric("electrons", "Peterson 2004")
 def glare_total_e(image: LitImage) -> float:
-    """Light in the frame that surfaces scatter"""
+    """Return the light in the frame that surfaces scatter."""
     return image.parts_e.get("glare", float("nan"))
 
 
 @_metric("electrons", "ISO 9358:1994")
 def veil_median_e(image: LitImage) -> float:
-    """Veil: the median over the frame of V"""
+    """Return the veil: the median over the frame of V."""
     values = image.added_mean.ravel()
     return float(np.partition(values, len(values) // 2)[len(values) // 2])
 
 
 @_metric("1", "ISO 9358:1994")
 def contrast_loss(image: LitImage) -> float:
-    """Loss of contrast of the sunlit ground, the median over its pixels of V / (S + V): a modulation m of the
-    ground appears as m S / (S + V)
+    """Return the loss of contrast of the sunlit ground, the median over its pixels of V / (S + V): a modulation
+    m of the ground appears as m S / (S + V).
     """
     if not len(image.lit):
         return float("nan")
@@ -198,8 +201,8 @@ def contrast_loss(image: LitImage) -> float:
 
 @_metric("1", "ISO 9358:1994")
 def veiling_glare_index(image: LitImage) -> float:
-    """Light that straylight adds to the sunlit ground over all light there, Σ V / Σ (S + V): the standard's ratio
-    of the flux of veiling glare to the whole flux, for this scene in place of a uniform field
+    """Return the light that straylight adds to the sunlit ground over all light there, Σ V / Σ (S + V): the
+    standard's ratio of the flux of veiling glare to the whole flux, for this scene in place of a uniform field.
     """
     if not len(image.lit):
         return float("nan")
@@ -210,40 +213,44 @@ def veiling_glare_index(image: LitImage) -> float:
 
 @_metric("1")
 def straylight_over_signal(image: LitImage) -> float:
-    """Light that straylight adds over that of the scene without the Sun's direct image, Σ V / Σ (S − D☉)"""
+    """Return the light that straylight adds over that of the scene without the Sun's direct image, Σ V / Σ (S −
+    D☉).
+    """
     signal = float(image.kept.mean(axis=0).sum(dtype=np.float64)) - sun_direct_e(image)
     return straylight_total_e(image) / signal if signal > 0 else float("nan")
 
 
 @_metric("electrons", better="high")
 def sun_direct_e(image: LitImage) -> float:
-    """Light of the Sun's direct image that straylight leaves, Σ D☉; it is no part of V"""
+    """Return the light of the Sun's direct image that straylight leaves, Σ D☉; it is no part of V."""
     return 0.0 if image.direct is None else float(image.direct.mean(axis=0).sum(dtype=np.float64))
 
 
 @_metric("1")
 def pixels_above_1dn(image: LitImage) -> float:
-    """Fraction of pixels to which straylight adds 1 DN of the 8-bit image or more in a channel"""
+    """Return the fraction of pixels to which straylight adds 1 DN of the 8-bit image or more in a channel."""
     level = image.white_e / np.float32(255)
     return _fraction(image.added >= level[:, None, None])
 
 
 @_metric("1", "EMVA 1288")
 def pixels_above_noise(image: LitImage) -> float:
-    """Fraction of pixels to which straylight adds more than the noise without it, V > √(S₀ + D + r²)"""
+    """Return the fraction of pixels to which straylight adds more than the noise without it, V > √(S₀ + D + r²)."""
     return _above(image.added_mean, image)
 
 
 @_metric("1")
 def pixels_saturated(image: LitImage) -> float:
-    """Fraction of pixels of which a channel reaches the full well, S + V + D ≥ full well"""
+    """Return the fraction of pixels of which a channel reaches the full well, S + V + D ≥ full well."""
     dark = np.asarray(image.dark_e, dtype=np.float32)
     return _fraction(image.kept + image.added + dark >= np.float32(image.full_well_e))
 
 
 @_metric("1", "EMVA 1288", "high")
 def snr(image: LitImage) -> float:
-    """Signal-to-noise ratio of the sunlit ground, the median over its pixels of S / √(S + V + D + r²)"""
+    """Return the signal-to-noise ratio of the sunlit ground, the median over its pixels of S / √(S + V + D +
+    r²).
+    """
     if not len(image.lit):
         return float("nan")
     kept, added, rest = image.on_lit
@@ -252,7 +259,7 @@ def snr(image: LitImage) -> float:
 
 @_metric("1", "Gallon et al.")
 def mask_area(image: LitImage) -> float:
-    """Fraction of pixels whose expected 8-bit value changes by mask_level_dn or more in a channel"""
+    """Return the fraction of pixels whose expected 8-bit value changes by mask_level_dn or more in a channel."""
     white = image.white_e[:, None, None]
     after = np.minimum(image.kept + image.added, white)
     after -= np.minimum(image.clean, white)

@@ -23,7 +23,7 @@ from ..pipeline.development import Development, informs
 from ..pipeline.injection import draw_faults, fault_context
 from ..pipeline.spec import Draw, Injection, Pose, Rendering, SampleSpec, SceneExposure
 from ..scene import keyed_random
-from .spec import Metric
+from .spec import Metric, returned
 
 F64 = NDArray[np.float64]
 
@@ -235,9 +235,9 @@ def _is_free(spec: SampleSpec, positions: F64) -> bool:
 def _sun_visible(spec: SampleSpec, pose: Pose, positions: F64) -> F64:
     """Return the visible fraction of the Sun's disc at positions float64[n, 3] in L, float64[n]."""
     from .. import render
-    from ..world import assemble
+    from ..world import ephemeris
 
-    suns = [assemble.sunlight(spec.scene, pose.sun_L)] * len(positions)
+    suns = [ephemeris.sunlight(spec.scene, pose.sun_L)] * len(positions)
     axes = np.repeat(pose.L_from_C[None], len(positions), axis=0)
     return np.asarray(render.sun_visible_fraction(spec.terrain.surface, positions, suns, axes))
 
@@ -327,14 +327,14 @@ _METRICS: list[Metric] = []
 def _metric(
     unit: str, source: str, *, better: Literal["low", "high"] = "low", views: int = 1
 ) -> Callable[[Callable[[_Frames], float]], Callable[[_Frames], float]]:
-    """Return a decorator that adds a function to the metrics; its docstring is the metric's description.
+    """Return a decorator that adds a function to the metrics; its docstring describes the metric.
 
     `views`: how many views it needs.
     """
 
     def add(value: Callable[[_Frames], float]) -> Callable[[_Frames], float]:
-        name, description = value.__name__, " ".join((value.__doc__ or "").split())
-        _METRICS.append(Metric(name=name, unit=unit, description=description, source=source, better=better))
+        name = value.__name__
+        _METRICS.append(Metric(name=name, unit=unit, description=returned(value), source=source, better=better))
         _NEEDS[name], _COMPUTED[name] = views, value
         return value
 
@@ -343,69 +343,73 @@ def _metric(
 
 @_metric("px", _LIMB)
 def limb_error_px(of: _Frames) -> float:
-    """error of the lit limb along its normals, RMS of the edges' positions, image minus clean twin"""
+    """Return the error of the lit limb along its normals, RMS of the edges' positions, image minus clean twin."""
     first = of.first
     return navigation.limb_error(first.clean, first.image, first.body, sky=first.sky).rms_px
 
 
 @_metric("px", _CENTRE)
 def centroid_shift_px(of: _Frames) -> float:
-    """shift of the centre of brightness from the clean twin's"""
+    """Return the shift of the centre of brightness from the clean twin's."""
     return navigation.centroid_shift(of.first.clean, of.first.image).distance_px
 
 
 @_metric("1", _CORNERS, better="high")
 def corner_repeatability(of: _Frames) -> float:
-    """fraction of the clean twin's corners found again within 1.5 px"""
+    """Return the fraction of the clean twin's corners found again within 1.5 px."""
     return navigation.corner_repeatability(of.first.clean, of.first.image).fraction
 
 
 @_metric("1", _ORB, better="high")
 def orb_repeatability(of: _Frames) -> float:
-    """fraction of the clean twin's ORB features found again within 1.5 px of their level"""
+    """Return the fraction of the clean twin's ORB features found again within 1.5 px of their level."""
     return navigation.orb_repeatability(of.first.clean, of.first.image).fraction
 
 
 @_metric("1", _PRECISION, better="high", views=2)
 def match_precision(of: _Frames) -> float:
-    """fraction of the ORB matches of two views within 3 px of the true reprojection"""
+    """Return the fraction of the ORB matches of two views within 3 px of the true reprojection."""
     return navigation.match_precision(of.matches, *of.views)
 
 
 @_metric("1", _PRECISION, views=2)
 def matches_lost(of: _Frames) -> float:
-    """fraction of the right ORB matches of two clean twins that the faulted images lack"""
+    """Return the fraction of the right ORB matches of two clean twins that the faulted images lack."""
     return navigation.matches_lost(of.clean.matches, of.matches, *of.views)
 
 
 @_metric("deg", _FIVE_POINTS, views=2)
 def rotation_error_deg(of: _Frames) -> float:
-    """error of the rotation between two views, from their matches, faulted images minus clean twins"""
+    """Return the error of the rotation between two views, from their matches, faulted images minus clean twins."""
     return of.pose_errors[0]
 
 
 @_metric("deg", _FIVE_POINTS, views=2)
 def translation_error_deg(of: _Frames) -> float:
-    """error of the direction of translation between two views, faulted images minus clean twins"""
+    """Return the error of the direction of translation between two views, faulted images minus clean twins."""
     return of.pose_errors[1]
 
 
 @_metric("views", _TRACKS, better="high", views=VIEWS)
 def feature_lifetime_views(of: _Frames) -> float:
-    """mean number of consecutive views, of ten, in which corners are tracked within 3 px of the truth"""
+    """Return the mean number of consecutive views, of ten, in which corners are tracked within 3 px of the
+    truth.
+    """
     frames = of.frames[:VIEWS]
     return navigation.feature_lifetime([f.image for f in frames], [f.view for f in frames]).mean_views
 
 
 @_metric("1", _PRECISION, views=2)
 def match_precision_lost(of: _Frames) -> float:
-    """fraction of right ORB matches of two views, clean twins minus faulted images"""
+    """Return the fraction of right ORB matches of two views, clean twins minus faulted images."""
     return of.clean.precision - match_precision(of)
 
 
 @_metric("views", _TRACKS, views=VIEWS)
 def feature_lifetime_lost_views(of: _Frames) -> float:
-    """mean number of consecutive views, of ten, in which corners are tracked, clean twins minus faulted images"""
+    """Return the mean number of consecutive views, of ten, in which corners are tracked, clean twins minus
+    faulted images.
+    """
     return of.clean.lifetime_views - feature_lifetime_views(of)
 
 

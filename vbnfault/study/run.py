@@ -33,6 +33,7 @@ from ..dataset.identity import versions
 from ..dataset.lock import locked
 from ..dataset.processes import Pool
 from ..dataset.progress import Progress, duration_text
+from ..dataset.resume import differences
 from ..dataset.work import run_here
 from . import indices as indices_module
 from . import results
@@ -368,9 +369,14 @@ def _prepare_folder(path: Path, spec: StudySpec, identity: Mapping[str, Any]) ->
                 stored = json.loads(record.read_text(encoding="utf-8"))
             except ValueError:
                 raise InputError(f"{record}: not the record of a study; choose another --out") from None
-            different = _differences(stored, json.loads(json.dumps(identity)))
+            different = list(differences(stored, json.loads(json.dumps(identity))))
             if different:
-                raise InputError(f"{path}: holds another study: {different}; choose another --out")
+                named = [
+                    one._replace(key=one.key.removeprefix("study.")).text("there", "here")
+                    for one in different[:_MOST_DIFFERENCES]
+                ]
+                more = [f"and {len(different) - len(named)} more"] if len(different) > len(named) else []
+                raise InputError(f"{path}: holds another study: {', '.join(named + more)}; choose another --out")
         for partial_file in results.partial_files(path):
             whole_files.remove(partial_file)
         if not record.exists():
@@ -385,28 +391,6 @@ def _writing(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise whole_files.unwritable(error.filename or path, error) from None
-
-
-def _differences(stored: Any, now: Any) -> str:
-    """Return as text where two records differ, by dotted key."""
-    old, new = dict(_flat(stored)), dict(_flat(now))
-    keys = [key for key in {**old, **new} if old.get(key) != new.get(key)]
-    named = [
-        f"{key.removeprefix('study.')} = {shown(old[key]) if key in old else 'absent'} (now "
-        f"{shown(new[key]) if key in new else 'absent'})"
-        for key in keys[:_MOST_DIFFERENCES]
-    ]
-    more = [f"and {len(keys) - len(named)} more"] if len(keys) > len(named) else []
-    return ", ".join(named + more)
-
-
-def _flat(node: Any, above: str = "") -> Iterator[tuple[str, Any]]:
-    """Return the values of nested plain data by dotted key."""
-    if isinstance(node, dict | list):
-        for key, value in node.items() if isinstance(node, dict) else enumerate(node):
-            yield from _flat(value, f"{above}.{key}" if above else str(key))
-    else:
-        yield above, node
 
 
 # --- evaluations ----------------------------------------------------------------------------------------------

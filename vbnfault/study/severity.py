@@ -33,7 +33,7 @@ from ..faults import LEVELS, ModelLevels, SeverityTable, dataset_order, read_tab
 from ..lens import load_lens
 from ..scene import config
 from ..scene.instrument import CameraTable
-from ..world import assemble
+from ..world import cameras
 from . import navigation_metrics
 from .severity_views import TRIES, ModelUnderTest, SeverityJob, ViewGroup, ViewWorkers
 
@@ -431,7 +431,7 @@ def _detector(model: ModelUnderTest, camera: CameraTable) -> str:
     cls = model.type
     if cls.needs_mosaic and not camera.detector:
         return _MOSAIC
-    if cls.needs_ccd and camera.detector and assemble.mosaic_sensor(camera).architecture == "cmos":
+    if cls.needs_ccd and camera.detector and cameras.mosaic_sensor(camera).architecture == "cmos":
         return _MOSAIC
     return ""
 

@@ -49,6 +49,11 @@ class Metric:
     better: Literal["low", "high"] = "low"
 
 
+def returned(function: Callable[..., float]) -> str:
+    """Return what a function returns, by its docstring: the words between "Return the" and the full stop."""
+    return " ".join((function.__doc__ or "").split()).removeprefix("Return the ").removesuffix(".")
+
+
 @dataclass(frozen=True, kw_only=True)
 class Evaluation:
     """Describe one evaluation: a point of the design, at one view of the scene, with one seed and one model.

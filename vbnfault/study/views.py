@@ -16,11 +16,10 @@ from ..core.quantities import BODY, SunInView
 from ..core.sundisc import Pinhole, add_mean
 from ..faults import FaultContext
 from ..pipeline.development import Development
-from ..pipeline.exposure import meter
+from ..pipeline.exposure import add_stars, meter
 from ..pipeline.injection import fault_context
 from ..pipeline.rendering import render_view
 from ..pipeline.spec import Pose, Rendering, SampleSpec, SceneExposure, SceneLight
-from ..pipeline.stars import add_stars
 from . import navigation_metrics as nav
 
 F32 = NDArray[np.float32]

@@ -26,7 +26,7 @@ from ..body import Body, Site
 from ..core import frames
 from ..scene.config import Scene
 from ..scene.trajectory import FlownPose
-from . import assemble
+from . import ephemeris
 
 F64 = NDArray[np.float64]
 
@@ -91,7 +91,7 @@ def aimed_view(scene: Scene, body: Body, site: Site, aim: str, values: Mapping[s
             camera_position_T_m=camera_T_m,
             T_from_C=_pointed(site, target, values),
             sun_direction_T=frames.unit(sun_T),
-            sun_distance_au=assemble.sun_distance_au(scene),
+            sun_distance_au=ephemeris.sun_distance_au(scene),
         ),
         towards_site_T=towards_site,
         towards_ground_T=ground,

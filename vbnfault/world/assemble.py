@@ -1,45 +1,27 @@
-"""Build the objects that a scene file describes: Sun, ephemeris, ground, body, camera, spacecraft and stars."""
+"""Build the surroundings of the camera that a scene describes: ground, body, spacecraft and stars."""
 
 from __future__ import annotations
 
-import math
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import camera as cameras
-from ..body import Body, Site, Sites, ellipsoid, load_body, site_at
+from ..body import Body, Site, ellipsoid, load_body
 from ..camera import Camera
-from ..core import file_contents, frames, spectra, spice
+from ..core import spectra
 from ..core.errors import InputError, under_key
 from ..core.quantities import Radiance, Truth
-from ..detector import Detector, MosaicDetector, Sensor, ThreeColourDetector, amplified, binned, load_sensor
-from ..lens import (
-    Halo,
-    RealLens,
-    ThinLens,
-    closed_to,
-    coating,
-    load_lens,
-    paraxial_properties,
-    scaled_to_focal_length,
-)
 from ..reflectance import REFERENCE_NM, BandReflectance, radiance_factor
-from ..render.description import Sunlight, View
+from ..render.description import View
 from ..scene import bodies
 from ..scene.config import Scene
-from ..scene.instrument import THIN_LENS, CameraTable, PointSpreadTable
-from ..scene.keyed_random import rng
-from ..scene.surroundings import OrbitTable, PoseTable, SpiceTable, SunTable
+from ..scene.surroundings import OrbitTable, PoseTable
 from ..scene.target import EARTH, BodyTable
-from ..scene.trajectory import FlownPose
-from . import bright_bodies as far
 from . import sky
 from .coma import check_coma
-from .ground import looked_at
+from .ephemeris import sun_distance_au, wavelengths_nm
 from .spacecraft import HingePose, ModelPlacement, Spacecraft, SpacecraftMesh, default_spacecraft, load_spacecraft
 from .surface_map import load_albedo_map
 
@@ -61,145 +43,7 @@ _HIDING_RAYS = 16  # along each side of the frame that tell what the spacecraft 
 _MUCH_HIDDEN = 0.5  # fraction of the frame
 
 
-# --- Sun and ephemeris --------------------------------------------------------------------------------------
-
-
-@file_contents.cached_with_contents(maxsize=8)
-def _ephemeris(
-    sun: SunTable, body: BodyTable, orbit: OrbitTable | None, kernels: SpiceTable
-) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Return the Sun's position in J and T_from_J as plain numbers, which the cache can hold."""
-    date = sun.julian_date
-    own = frames.Rotation(
-        pole_ra_deg=body.pole_ra_deg,
-        pole_dec_deg=body.pole_dec_deg,
-        prime_meridian_deg=body.prime_meridian_deg,
-        period_h=body.rotation_period_h,
-        prime_meridian_deg_day2=body.prime_meridian_deg_day2,
-    ).J_from_T(date)
-    sun_J_au = -_orbit(orbit).position_J_au(date)
-    if kernels.kernels:
-        with under_key("spice.kernels"), spice.kernels(*kernels.kernels):
-            et_s = spice.et_s_from_julian_date(date)
-            sun_J_au = spice.sun_position_J_au(kernels.target, et_s)
-            if kernels.frame:
-                own = spice.J_from_T(kernels.frame, et_s)
-    return tuple(sun_J_au), tuple(own.T.ravel())
-
-
-def ephemeris(scene: Scene) -> tuple[F64, F64]:
-    """Return the Sun's position relative to the target in J, float64[3] in au, and T_from_J, float64[3, 3].
-
-    If the scene names SPICE kernels, the Sun's position comes from them, else from the two-body `[orbit]` (default:
-    that of 67P). T_from_J is the target's own attitude. It comes from the kernels if the scene names a frame in
-    them, else from the pole and period in `[body]`. Raises InputError for kernels that lack the data.
-    """
-    sun_J_au, own = _ephemeris(scene.sun, scene.body, scene.orbit, scene.spice)
-    return np.array(sun_J_au), np.array(own).reshape(3, 3)
-
-
-def _orbit(table: OrbitTable | None) -> frames.Orbit:
-    """Return the orbit of a scene's table, by default that of 67P."""
-    return frames.ORBIT_67P if table is None else frames.Orbit(**table.model_dump())
-
-
-def epoch_jd(scene: Scene, site: int, fraction: float) -> float:
-    """Return the TDB Julian date at the given fraction in [0, 1] of a site's time on the trajectory."""
-    start, end = scene.sun.julian_date, scene.spice.until_julian_date
-    return start if end is None else start + (end - start) * (site + fraction) / scene.dataset.sites
-
-
-@file_contents.cached_with_contents(maxsize=256)
-def _spacecraft_pose(table: SpiceTable, julian_date: float) -> spice.SpacecraftState:
-    """Return `spacecraft_pose` from the cache, or compute it."""
-    axes = None if table.camera_axes is None else np.array(table.camera_axes).reshape(3, 3)
-    with under_key("spice.kernels"), spice.kernels(*table.kernels):
-        et_s = spice.et_s_from_julian_date(julian_date)
-        return spice.pose_T(table.spacecraft, table.target, table.frame, table.camera_frame, et_s, axes)
-
-
-def spacecraft_pose(scene: Scene, julian_date: float) -> spice.SpacecraftState:
-    """Return the pose of the spacecraft's camera from SPICE. Raises InputError if kernels lack the data."""
-    return _spacecraft_pose(scene.spice, julian_date)
-
-
-def trajectory_sites(scene: Scene, body: Body) -> Sites:
-    """Return the sites of a scene on a spacecraft's trajectory.
-
-    A site is the ground at the centre of the image, half-way through the time of the site. If the camera looks past
-    the body, it is the ground nearest to the line of sight.
-    """
-
-    def site(index: int) -> Site:
-        pose = spacecraft_pose(scene, epoch_jd(scene, index, 0.5))
-        return site_at(body, index, looked_at(body, pose.camera_position_T_m, pose.T_from_C[:, 2]))
-
-    return Sites(scene.dataset.sites, site)
-
-
-def flown_pose(scene: Scene) -> FlownPose:
-    """Return camera and Sun in T from SPICE, at the scene's date. Raises InputError if kernels lack the data."""
-    spacecraft = spacecraft_pose(scene, scene.sun.julian_date)
-    sun_J_au, T_from_J = ephemeris(scene)
-    return FlownPose(
-        name=f"spice.spacecraft = {scene.spice.spacecraft!r}",
-        julian_date=scene.sun.julian_date,
-        camera_position_T_m=spacecraft.camera_position_T_m,
-        T_from_C=spacecraft.T_from_C,
-        sun_direction_T=T_from_J @ frames.unit(sun_J_au),
-        sun_distance_au=sun_distance_au(scene),
-    )
-
-
-def sun_distance_au(scene: Scene) -> float:
-    """Return the body's distance from the Sun: as given, or from the ephemeris at the Julian date."""
-    if scene.sun.distance_au is not None:
-        return scene.sun.distance_au
-    return float(np.linalg.norm(ephemeris(scene)[0]))
-
-
-def sunlight(scene: Scene, direction_L: F64) -> Sunlight:
-    """Return the sunlight of the scene from a direction in L."""
-    distance = sun_distance_au(scene)
-    return Sunlight(
-        direction_L=direction_L,
-        angular_radius_rad=spectra.sun_angular_radius_rad(distance),
-        irradiance_W_m2_nm=spectra.solar_band_irradiance_W_m2_nm(wavelengths_nm(scene), distance),
-        limb_darkening=spectra.limb_darkening(wavelengths_nm(scene)) if scene.sun.limb_darkening else None,
-    )
-
-
-def bright_bodies(scene: Scene) -> tuple[far.BrightBody, ...]:
-    """Return the bright bodies beside the target that `sky.bodies` lists, at the date of the scene."""
-    if not scene.sky.bodies:
-        return ()
-    sun_J_au, _ = ephemeris(scene)
-    return far.bright_bodies(scene.sky.bodies, scene.sun.julian_date, sun_J_au, sun_distance_au(scene))
-
-
-def target_attitude(scene: Scene, sun_T: F64) -> F64:
-    """Return T_from_J of the target under the commanded Sun: the attitude nearest to the body's own at the date."""
-    sun_J_au, own = ephemeris(scene)
-    return frames.T_from_J_commanded(own, frames.unit(sun_J_au), sun_T)
-
-
-def attitude_references(scene: Scene) -> tuple[str, str]:
-    """Return the references of attitudes ("sun", "nadir" or "centre"): Sun-facing stratum, Sun-averted stratum."""
-    if scene.is_flown or scene.is_aimed:  # no bounds of the attitude; it is stored relative to the Sun
-        return "sun", "sun"
-    facing, averted = scene.geometry.sun_facing, scene.geometry.sun_averted
-    assert facing is not None
-    assert averted is not None
-    return facing.reference, averted.reference
-
-
 # --- ground -------------------------------------------------------------------------------------------------
-
-
-def wavelengths_nm(scene: Scene) -> F64:
-    """Return the band nodes of the scene in nm, float64[band]."""
-    r = scene.render
-    return spectra.band_nodes_nm(r.band_min_nm, r.band_max_nm, r.bands)
 
 
 def ground_reflectance(scene: Scene) -> BandReflectance:
@@ -365,167 +209,7 @@ def _short(value: object) -> str:
     return ""
 
 
-# A dark part of the frame that is smaller than this is not worth a warning.
-_DARK_FRACTION = 1e-3
-
-# --- camera and spacecraft ----------------------------------------------------------------------------------
-
-
-def base_camera(scene: Scene, *, architecture: int = 0, readout_direction: int = 0, individual: int = 0) -> Camera:
-    """Return the scene's camera before an exposure is set. The integers are indices into its lists of options."""
-    c = scene.camera
-    direction = c.readout_directions[readout_direction]
-    if c.detector:
-        sensor = mosaic_sensor(c)
-        detector: Detector = _detector_of(scene, sensor, individual, direction)
-        pitch_um, which = sensor.pixel_pitch_um, sensor.architecture
-    else:
-        which = c.architectures[architecture]
-        detector = _three_colours(c, which)
-        pitch_um = detector.pixel_pitch_um
-    return Camera(
-        lens=real_lens(c, pitch_um) if c.lens else _thin_lens(c, pitch_um),
-        detector=detector,
-        architecture=which,
-        readout_direction=direction,
-        gain=c.gain,
-    )
-
-
-def _three_colours(c: CameraTable, architecture: str) -> ThreeColourDetector:
-    """Return the three-colour detector of a camera table; a CCD reads the sum of binned pixels once."""
-    pixels, readouts = c.binning**2, 1 if architecture != "cmos" else c.binning
-    return ThreeColourDetector(
-        width_px=c.width_px,
-        height_px=c.height_px,
-        pixel_pitch_um=c.pixel_pitch_um * c.binning,
-        full_well_e=c.full_well_e * pixels,
-        read_noise_e_rms=c.read_noise_e_rms * readouts,
-        dark_current_e_s=c.dark_current_e_s * pixels,
-        adc_bits=c.adc_bits,
-        bias_dn=c.bias_dn,
-        gain=c.gain,
-        response=c.response,
-        quantum_efficiency_peak=c.quantum_efficiency_peak,
-    )
-
-
-@file_contents.cached_with_contents(maxsize=4)
-def mosaic_sensor(c: CameraTable) -> Sensor:
-    """Return the sensor that a camera names, with the camera's temperature, binning and gain. Raises InputError."""
-    with under_key("camera.detector"):
-        sensor = amplified(binned(load_sensor(c.detector), c.binning), c.gain)
-    if c.detector_temperature_K is not None:
-        sensor = replace(sensor, temperature_K=c.detector_temperature_K)
-    return sensor
-
-
-def _detector_of(scene: Scene, sensor: Sensor, individual: int, direction: str) -> MosaicDetector:
-    """Return the detector of one device. Raises InputError if a channel receives no light of the scene's bands."""
-    # a mosaic detector is read along its columns only
-    towards = direction if direction in ("up", "down") else "up"
-    seed = int(rng(scene.dataset.seed, individual, "detector", "device").integers(2**31))
-    with under_key("camera.detector"):
-        made = MosaicDetector(
-            sensor=sensor,
-            seed=seed,
-            width_px=scene.camera.width_px,
-            height_px=scene.camera.height_px,
-            direction=towards,
-        )
-    for channel, row in zip(made.channels, made.electron_rate_weights(wavelengths_nm(scene)), strict=True):
-        if not row.any():
-            low, high = scene.render.band_min_nm, scene.render.band_max_nm
-            raise InputError(
-                f"render.band_min_nm = {low:g}, band_max_nm = {high:g}: the {channel} pixels of camera.detector = "
-                f"{scene.camera.detector!r} see no such light"
-            )
-    return made
-
-
-def _focus_distance_m(c: CameraTable) -> float:
-    """Return the focus distance in m, infinite by default."""
-    return float("inf") if c.focus_distance_m is None else c.focus_distance_m
-
-
-def _thin_lens(c: CameraTable, pixel_pitch_um: float) -> ThinLens:
-    """Return the thin lens of a camera table."""
-    return ThinLens(
-        focal_length_mm=cameras.focal_length_mm(c.fov_deg, c.width_px, pixel_pitch_um),
-        f_number=THIN_LENS["f_number"] if c.f_number is None else c.f_number,
-        transmission=THIN_LENS["transmission"] if c.transmission is None else c.transmission,
-        focus_distance_m=_focus_distance_m(c),
-        halo=_halo(c.point_spread),
-        pixel_rad=2 * float(np.tan(np.radians(c.fov_deg) / 2)) / c.width_px,
-    )
-
-
-def _halo(table: PointSpreadTable | None) -> Halo | None:
-    """Return the point spread of a thin lens, None without a table."""
-    if table is None:
-        return None
-    return Halo(
-        core_rad=1e-6 * table.core_urad,
-        halo_fraction=table.halo_fraction,
-        halo_rad=1e-6 * table.halo_urad,
-        halo_index=table.halo_index,
-        wing_fraction=table.wing_fraction,
-        wing_rad=1e-6 * table.wing_urad,
-        wing_index=table.wing_index,
-    )
-
-
-@file_contents.cached_with_contents(maxsize=4)
-def real_lens(c: CameraTable, pixel_pitch_um: float) -> RealLens:
-    """Return the prescription that a camera names, scaled to its focal length and stopped down to its f-number.
-
-    Raises InputError for a file that is not a lens, and for an f-number that the lens does not reach.
-    """
-    with under_key("camera.lens"):
-        prescription = load_lens(c.lens)
-    if c.lens_coating:
-        if c.lens_coating not in coating.NAMES:
-            known = ", ".join(coating.NAMES)
-            raise InputError(f"camera.lens_coating = {c.lens_coating!r}: must be one of {known}")
-        prescription = prescription.coated(c.lens_coating)
-    focal_length_mm = cameras.focal_length_mm(c.fov_deg, c.width_px, pixel_pitch_um)
-    if not math.isclose(focal_length_mm, paraxial_properties(prescription).efl_mm, rel_tol=1e-9):
-        prescription = scaled_to_focal_length(prescription, focal_length_mm)
-    if c.f_number is not None:
-        prescription = closed_to(prescription, c.f_number, "camera.f_number")
-    return RealLens(
-        prescription=prescription,
-        width_px=c.width_px,
-        height_px=c.height_px,
-        pixel_pitch_um=pixel_pitch_um,
-        focus=c.focus,
-        focus_distance_m=_focus_distance_m(c),
-    )
-
-
-def dark_corners(scene: Scene) -> str:
-    """Return one sentence if the frame is wider than the field of the scene's lens, or ""."""
-    lens = base_camera(scene).lens.real
-    if lens is None or 1 - lens.coverage.lit_fraction < _DARK_FRACTION:
-        return ""
-    field = lens.coverage
-    return (
-        f"camera.fov_deg = {scene.camera.fov_deg:g}: {lens.name} passes light up to {field.field_deg:.1f} deg from "
-        f"the axis, but the frame's corners lie at {field.corner_deg:.1f} deg, so {1 - field.lit_fraction:.1%} of "
-        "the frame is dark; lower fov_deg or choose a wider camera.lens"
-    )
-
-
-def scaled_lens(scene: Scene) -> str:
-    """Return one sentence if the scene's field of view scales its lens by more than 1 %, or ""."""
-    lens = base_camera(scene).lens.real
-    if lens is None or abs(lens.prescription.scale - 1) < 0.01:
-        return ""
-    return (
-        f"camera.fov_deg = {scene.camera.fov_deg:.4g}: scales {lens.name} by {lens.prescription.scale:.3g} to "
-        f"f = {lens.focal_length_mm:.4g} mm; its coatings, roughness and particles keep their size; without "
-        "fov_deg and focal_length_mm the lens stays as it is"
-    )
+# --- spacecraft ---------------------------------------------------------------------------------------------
 
 
 def spacecraft(scene: Scene) -> SpacecraftMesh | None:
@@ -610,19 +294,6 @@ def render_vehicle(scene: Scene, mesh: SpacecraftMesh) -> Vehicle:
 
 
 # --- stars --------------------------------------------------------------------------------------------------
-
-
-def with_stars(
-    scene: Scene,
-    radiance: Radiance,
-    camera: Camera,
-    J_from_C: F64,
-    open_sky: NDArray[np.bool_],
-    view: View | None = None,
-) -> Radiance:
-    """Return the radiance with the stars of `visible_stars` added; the parameters are the same."""
-    stars = visible_stars(scene, radiance, camera, J_from_C, open_sky, view)
-    return radiance if stars is None else stars.added_to(radiance)
 
 
 def visible_stars(

@@ -32,8 +32,7 @@ from ..core.quantities import BODY, Truth
 from ..reflectance import BandReflectance, radiance_factor
 from ..render.description import View
 from ..scene.coma import PhaseFunctionTable
-from .coma import Coma
-from .dust_phase import relative_phase
+from .coma import Coma, relative_phase
 
 F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]

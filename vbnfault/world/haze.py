@@ -354,9 +354,9 @@ class _SkyTable:
         across = [sine[:, None] * v for v in (np.cos(turns), np.sin(turns))]
         local = np.stack([*across, np.broadcast_to(cosine[:, None], across[0].shape)], axis=-1)
         directions = local.reshape(-1, 3) @ frame.axes_L
-        light = frame.coma.relative_light(
-            frame.camera_m, directions, np.full(len(directions), np.inf), frame.shadow
-        ).reshape(across[0].shape)
+        light = frame.coma.relative(frame.camera_m, directions, np.full(len(directions), np.inf), frame.shadow)[
+            0
+        ].reshape(across[0].shape)
         table = ndimage.spline_filter1d(light, order=3, axis=0, mode="mirror")
         table = ndimage.spline_filter1d(table, order=3, axis=1, mode="grid-wrap" if whole else "mirror")
         first = -half * step

@@ -14,7 +14,6 @@ light of both.
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -74,13 +73,10 @@ class StarCatalogue:
     def __len__(self) -> int:
         return len(self.magnitude_V)
 
-    def select(self, keep: NDArray[np.bool_] | slice) -> StarCatalogue:
-        """Return the stars that a mask bool[n] or a slice selects."""
-        return replace(self, **{name: getattr(self, name)[keep] for name in self.__dataclass_fields__})
-
     def brighter_than(self, magnitude_V: float) -> StarCatalogue:
         """Return the stars with V below `magnitude_V`."""
-        return self.select(slice(int(np.searchsorted(self.magnitude_V, magnitude_V))))
+        count = int(np.searchsorted(self.magnitude_V, magnitude_V))
+        return replace(self, **{name: values[:count] for name, values in vars(self).items()})
 
     def direction_J(self, julian_date: float = J2000_JD) -> F64:
         """Return unit vectors in J, float64[n, 3], moved along great circles from J2000.0 to a TDB Julian date."""
@@ -117,45 +113,6 @@ def load_catalogue() -> StarCatalogue:
         magnitude_V=columns["magnitude_V_hundredths"] / 100,
         colour_BV=columns["colour_BV_thousandths"] / 1000,
     )
-
-
-HIPPARCOS_EPOCH_YEAR = 1991.25
-TYPICAL_COLOUR_BV = 0.543  # median of the stars with V ≤ 7
-
-
-def pack_hipparcos(lines: Iterable[str], faintest_V: float = 7.0) -> dict[str, NDArray[np.generic]]:
-    """Return the columns of the packaged table from lines of `hip_main.dat` (CDS I/239), brightest first.
-
-    Positions are moved from J1991.25 to J2000.0. If Hipparcos has no astrometric solution (7 stars of V ≤ 7), the
-    sexagesimal position is used, without proper motion. If B−V is missing (13 stars), the median of the others is
-    used.
-    """
-    rows = [line.split("|") for line in lines]
-    rows = [row for row in rows if row[5].strip() and float(row[5]) <= faintest_V]
-
-    def number(row: list[str], column: int, otherwise: float) -> float:
-        return float(row[column]) if row[column].strip() else otherwise
-
-    def angle(sexagesimal: str) -> float:
-        degrees, minutes, seconds = (float(part) for part in sexagesimal.replace("-", " ").split())
-        return (-1.0 if "-" in sexagesimal else 1.0) * (degrees + minutes / 60 + seconds / 3600)
-
-    dec = np.array([number(row, 9, angle(row[4])) for row in rows])
-    ra = np.array([number(row, 8, 15 * angle(row[3])) for row in rows])
-    pm_ra, pm_dec = (np.array([number(row, column, 0.0) for row in rows]) for column in (12, 13))
-    magnitude = np.array([float(row[5]) for row in rows])
-    colour = np.array([number(row, 37, TYPICAL_COLOUR_BV) for row in rows])
-    years = 2000.0 - HIPPARCOS_EPOCH_YEAR
-    columns: dict[str, tuple[F64, type]] = {
-        "right_ascension_mas": ((ra * 3.6e6 + pm_ra * years / np.cos(np.radians(dec))) % 1.296e9, np.int32),
-        "declination_mas": (dec * 3.6e6 + pm_dec * years, np.int32),
-        "proper_motion_ra_mas_year": (pm_ra, np.int16),
-        "proper_motion_dec_mas_year": (pm_dec, np.int16),
-        "magnitude_V_hundredths": (100 * magnitude, np.int16),
-        "colour_BV_thousandths": (1000 * colour, np.int16),
-    }
-    order = np.argsort(magnitude, kind="stable")
-    return {name: np.rint(values[order]).astype(dtype) for name, (values, dtype) in columns.items()}
 
 
 def colour_temperature_K(colour_BV: F64 | float) -> F64:
