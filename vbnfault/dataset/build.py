@@ -9,6 +9,7 @@ interruptions and repairs.
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import sys
 import time
@@ -459,4 +460,4 @@ def _check_room(summary: Summary, spec: StoreSpec) -> None:
     if needed / 2 > free:
         raise VbnfaultError(f"{text}, but only {size_text(free)} are free there; choose another --out")
     if needed > free:
-        print(f"warning: {text}, and {size_text(free)} are free there: it may not fit", file=sys.stderr)
+        logging.getLogger("vbnfault").warning(f"{text}, and {size_text(free)} are free there: it may not fit")

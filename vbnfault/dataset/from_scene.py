@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 import os
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -161,7 +161,7 @@ def _prepared(
     contents.complete()
     if not options.dry_run:
         for sentence in plan.shortcomings(scene, session.plan):
-            print(f"warning: {sentence}", file=sys.stderr)
+            logging.getLogger("vbnfault").warning(sentence)
     build_plan = build.BuildPlan(
         spec=spec,
         site=session.plan.site,

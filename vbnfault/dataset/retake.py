@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import logging
 import os
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -176,7 +176,7 @@ def _planned(
     table = _retaken_plan(session.scene, attributes, session.faults)
     if not options.dry_run:
         for sentence in plan.shortcomings(scene, table):
-            print(f"warning: {sentence}", file=sys.stderr)
+            logging.getLogger("vbnfault").warning(sentence)
     return build.BuildPlan(
         spec=spec,
         site=table.site[numbers],
@@ -234,9 +234,8 @@ def _samples(opened: Store, out: store.Location, options: build.BuildOptions) ->
         wanted = np.concatenate([np.arange(first, last + 1) for first, last in ranges])
         samples = np.flatnonzero(np.isin(plan_numbers(opened.attributes), wanted))
     if len(samples) < opened.samples:
-        print(
-            f"note: {opened.path}: {len(samples)} of {opened.samples} samples are taken, those that were finished",
-            file=sys.stderr,
+        logging.getLogger("vbnfault").info(
+            f"{opened.path}: {len(samples)} of {opened.samples} samples are taken, those that were finished"
         )
     return samples
 

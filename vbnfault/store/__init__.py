@@ -37,7 +37,7 @@ from .check import (
 )
 from .codec import Encoded, SharedChunks, encode, mask_union
 from .counts import FaultCounts
-from .files import Location, files_of, located
+from .files import Files, Location, files_of, located
 from .group import MOST_DOCUMENT_BYTES, check_free, create, is_store, open_store, write_samples
 from .labelled import open_dataset
 from .layout import drawn_table, is_sealed, sealed
@@ -64,6 +64,7 @@ __all__ = [
     "Encoded",
     "FaultCounts",
     "FetchedSample",
+    "Files",
     "Location",
     "Member",
     "Planned",

@@ -230,7 +230,7 @@ class Bucket:
         import obstore
 
         with self._reading(folder):
-            entries = obstore.list_with_delimiter(self._objects, folder)["objects"]
+            entries = obstore.list_with_delimiter(self._objects, folder.rstrip("/"))["objects"]
         return {entry["path"].rsplit("/", 1)[-1]: entry["last_modified"] for entry in entries}
 
     def zarr(self) -> Any:

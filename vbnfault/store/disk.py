@@ -19,6 +19,7 @@ import stat
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from datetime import datetime
 from pathlib import Path
 from typing import TypeVar
 
@@ -397,6 +398,14 @@ class Disk:
     def exists(self, name: str) -> bool:
         """Return whether something has this name, also a broken link."""
         return os.path.lexists(self.path / name)
+
+    def modified(self, folder: str) -> dict[str, datetime]:
+        """Return by name when each file directly in a folder was written."""
+        written = {}
+        for name in self.names(folder):
+            with contextlib.suppress(OSError):
+                written[name] = datetime.fromtimestamp(os.lstat(self.path / folder / name).st_mtime)
+        return written
 
     def stamp(self, name: str) -> object:
         """Return inode and modification time, which change if a file is replaced; None if there is no file."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from datetime import datetime
 from pathlib import Path
 from typing import Any, Protocol
 from urllib.parse import unquote, urlsplit
@@ -79,6 +80,10 @@ class Files(Protocol):
 
     def exists(self, name: str) -> bool:
         """Return whether something has this name."""
+        ...
+
+    def modified(self, folder: str) -> dict[str, datetime]:
+        """Return by name when each file directly in a folder was written, by the clock of what stores it."""
         ...
 
     def stamp(self, name: str) -> object:

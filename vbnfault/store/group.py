@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
-import warnings
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -188,7 +188,7 @@ def open_store(path: str | os.PathLike[str] | Url | Store, mode: str = "r") -> S
         raise InputError(f"{path}: {_NO_STORE}") from error
     if mode == "r":
         for problem in root.damage:
-            warnings.warn(f"{path}: {problem}; the build command mends it", UserWarning, stacklevel=2)
+            logging.getLogger("vbnfault").warning(f"{path}: {problem}; the build command mends it")
     return store
 
 
