@@ -327,7 +327,7 @@ def test_modules_of_the_store_import_only_those_before_them() -> None:
         "bucket",
         "files",
     ]
-    order += ["layout", "opened", "group", "labelled", "shards", "metadata", "check"]
+    order += ["layout", "opened", "group", "shards", "metadata", "check"]
     inside = {module for module in sources() if module.split(".")[0] == "store"}
     assert inside == {"store", *(f"store.{name}" for name in order)}
     wrong = [

@@ -340,10 +340,10 @@ def test_paths_that_cannot_be_used_are_bad_input(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        ({"workers": 0}, "--workers 0: must be at least 1"),
-        ({"workers": 5000}, "--workers 5000: must be at most 1024"),
-        ({"threads": 0}, "--threads 0: must be at least 1"),
-        ({"recycle_shards": 0}, "recycle_shards = 0: must be at least 1"),
+        ({"workers": 0}, "workers = 0: must be a whole number from 1 to 1024"),
+        ({"workers": 5000}, "workers = 5000: must be a whole number from 1 to 1024"),
+        ({"threads": 0}, "threads = 0: must be a whole number from 1 to 1024"),
+        ({"recycle_shards": 0}, "recycle_shards = 0: must be a whole number of at least 1"),
         ({"workers": 2, "scheduler": "tcp://a:1"}, "--workers 2 and --scheduler tcp://a:1 exclude each other"),
     ],
 )

@@ -19,21 +19,6 @@ if TYPE_CHECKING:
     from .identity import is_exact, planned, scene_identity, store_spec
     from .merge import merge_stores, migrate_store
 
-__all__ = [
-    "BuildOptions",
-    "SessionFactory",
-    "build_scene",
-    "describe_scene",
-    "is_exact",
-    "merge_stores",
-    "migrate_store",
-    "missing_plugins",
-    "planned",
-    "scene_identity",
-    "store_spec",
-    "verify",
-]
-
 # public name → the module that defines it; it is loaded when the name is first used
 _HOMES = {
     "BuildOptions": "build",
@@ -49,6 +34,7 @@ _HOMES = {
     "store_spec": "identity",
     "verify": "checking",
 }
+__all__ = [*_HOMES]
 
 
 if not TYPE_CHECKING:  # a type checker that saw the function would accept every misspelled name

@@ -15,23 +15,23 @@ import sys
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, InstanceOf, WithJsonSchema
 
 from .. import store as store_module
 from ..core import environment, tables
 from ..core.errors import InputError, VbnfaultError, shown
-from ..core.interrupts import interruptible
+from ..core.interrupts import Interrupted, interruptible
 from ..store import FaultCounts, Location, Planned, Store, StoreSpec, Url, files_of, located
 from .dask import check_scheduler, run_on_dask
-from .errors import BuildFailed, Interrupted
 from .lock import locked, others_at_work, prepared_by_one
 from .processes import Pool
 from .progress import Progress, duration_text, size_text
 from .resume import blocks_of, check_same_scene, planned_blocks, with_versions_noted
-from .tasks import Run, SampleMaker, SampleWorkers, SessionFactory
+from .tasks import BuildFailed, Run, SampleMaker, SampleWorkers, SessionFactory
 from .versions import known
 from .work import run_here
 
@@ -48,10 +48,10 @@ __all__ = [
     "planned_blocks",
 ]
 
-_MOST_PROCESSES = 1024  # of workers and of threads: more than any machine has
+MOST_PROCESSES = 1024  # of workers and of threads: more than any machine has
 
 
-@dataclass(frozen=True, kw_only=True)
+@tables.table_class()
 class BuildOptions:
     """Hold the options of how a build does its work. No option changes a stored value.
 
@@ -84,44 +84,31 @@ class BuildOptions:
         If a value is outside its range, or if two options exclude each other.
     """
 
-    workers: int = 1
-    threads: int | None = None
+    workers: Annotated[int, Field(ge=1, le=MOST_PROCESSES)] = 1
+    threads: Annotated[int, Field(ge=1, le=MOST_PROCESSES)] | None = None
     scheduler: str | None = None
     overwrite: bool = False
     accept_versions: bool = False
     dry_run: bool = False
     progress: bool = True
-    shard_range: range | None = None
-    recycle_shards: int = 32
+    shard_range: Annotated[InstanceOf[range], WithJsonSchema({"title": "a range"})] | None = None
+    recycle_shards: Annotated[int, Field(ge=1)] = 32
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "workers", _checked("workers", self.workers))
-        if self.threads is not None:
-            object.__setattr__(self, "threads", _checked("threads", self.threads))
-        if (number := tables.whole(self.recycle_shards)) is None or number < 1:
-            raise InputError(
-                f"recycle_shards = {shown(self.recycle_shards)}: must be at least 1, and a whole number"
-            )
-        for key in ("overwrite", "accept_versions", "dry_run"):
-            if not isinstance(value := getattr(self, key), bool | np.bool_):
-                raise InputError(f"{key} = {shown(value)}: must be True or False")
-        if not isinstance(self.scheduler, str | None):
-            raise InputError(f"scheduler = {shown(self.scheduler)}: must be an address such as tcp://host:8786")
         if self.scheduler is not None and self.workers > 1:
-            raise InputError(
+            raise ValueError(
                 f"--workers {self.workers} and --scheduler {self.scheduler} exclude each other: the cluster has its"
                 " own workers; give one of them"
             )
-        if self.shard_range is not None:
-            part = self.shard_range
-            if not isinstance(part, range) or part.step != 1:
-                raise InputError(f"shard_range = {shown(part)}: must be a range of steps of 1, such as range(0, 4)")
-            if not 0 <= part.start < part.stop:
-                raise InputError(
-                    f"--shard-range {part.start}:{part.stop}: must be A:B, whole numbers with 0 <= A < B"
-                )
-            if self.overwrite:
-                raise InputError("--shard-range and --overwrite exclude each other: delete the store first")
+        part = self.shard_range
+        if part is None:
+            return
+        if part.step != 1:
+            raise ValueError(f"shard_range = {part}: must be a range of steps of 1, such as range(0, 4)")
+        if not 0 <= part.start < part.stop:
+            raise ValueError(f"--shard-range {part.start}:{part.stop}: must be A:B, whole numbers with 0 <= A < B")
+        if self.overwrite:
+            raise ValueError("--shard-range and --overwrite exclude each other: delete the store first")
 
     @classmethod
     def of(cls, options: BuildOptions | None, keywords: Mapping[str, Any]) -> BuildOptions:
@@ -131,7 +118,7 @@ class BuildOptions:
         """
         if not isinstance(options, cls | None):
             raise InputError(f"options = {shown(options)}: must be BuildOptions")
-        return replace(options or cls(), **keywords)
+        return cls(**{**vars(options or cls()), **keywords})
 
     def shards_of(self, count: int) -> range:
         """Return the shards to make of a store of `count` shards. Raises InputError if it has no such shards."""
@@ -142,16 +129,6 @@ class BuildOptions:
                 f"0 <= A < B <= {count}"
             )
         return part
-
-
-def _checked(option: str, value: int) -> int:
-    """Return an option's value. Raises InputError unless it is a whole number from 1 to `_MOST_PROCESSES`."""
-    number = tables.whole(value)
-    if number is None or number < 1:
-        raise InputError(f"--{option} {shown(value)}: must be at least 1, and a whole number")
-    if number > _MOST_PROCESSES:
-        raise InputError(f"--{option} {shown(value)}: must be at most {_MOST_PROCESSES}")
-    return number
 
 
 @dataclass(frozen=True, kw_only=True)

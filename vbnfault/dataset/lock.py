@@ -5,8 +5,8 @@ ranges are disjoint. Each command first takes the lock of what it writes, then l
 overlap: so of two that begin together, at least one sees the other.
 
 The lock is a locked file beside the store, `.NAME.lock`, or `.NAME.shards-A-B.lock` for the shards A to B - 1. So
-it exists before the store does, and it stays when the store is replaced. The operating system releases the lock when
-the process ends. In an object store, and where the file system has no locks, `claims` takes its place.
+it exists before the store does, and it stays when the store is replaced. The operating system releases the lock
+when the process ends. In an object store, and where the file system has no locks, `claims` takes its place.
 """
 
 from __future__ import annotations

@@ -13,7 +13,6 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
-import re
 import shutil
 import stat
 import uuid
@@ -24,7 +23,8 @@ from pathlib import Path
 from typing import TypeVar
 
 from ..core.errors import InputError, VbnfaultError
-from ..core.whole_files import kind_of
+from ..core.whole_files import flush, flush_folder, kind_of, rename
+from ..core.whole_files import remove as remove_whole
 
 PARTIAL = ".partial"
 # Number of parallel flushes. Measured on ext4, the 42 files and 90 folders of a shard take 45-600 ms one after the
@@ -33,7 +33,6 @@ _FLUSHES = 8
 _OPEN_AT_ONCE = 32  # files: a process may have few
 _MOST_COPIED_BYTES = 1 << 32  # all layers of a shard have less
 T = TypeVar("T")
-_UNSUPPORTED = (errno.EINVAL, errno.ENOTSUP)  # errors of file systems that cannot flush a folder
 
 
 class Misplaced(OSError):
@@ -216,26 +215,6 @@ def write(root: Path, files: Iterable[tuple[str, bytes | Path]]) -> None:
         raise
 
 
-def write_with(target: Path, make: Callable[[Path], object]) -> None:
-    """Replace one file durably by what `make` writes to a temporary path beside it; the folder must exist.
-
-    Unlike `write`, no content has to be in memory. Raises OSError if the file cannot be written.
-    """
-    partial = target.with_name(f"{target.name}.{uuid.uuid4().hex}{PARTIAL}")
-    try:
-        make(partial)
-        file = os.open(partial, os.O_RDWR | getattr(os, "O_BINARY", 0))
-        try:
-            _flush(file)
-        finally:
-            os.close(file)
-        rename(partial, target)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            os.unlink(partial)
-        raise
-
-
 def _at_once(flush: Callable[[T], None], items: Iterable[T]) -> None:
     """Flush files or folders in parallel: a journaling file system commits once for all that wait."""
     with ThreadPoolExecutor(_FLUSHES) as pool:
@@ -245,7 +224,7 @@ def _at_once(flush: Callable[[T], None], items: Iterable[T]) -> None:
 
 def _flush_and_close(opened: list[int]) -> None:
     """Flush the open files of a list to the device, close them, and empty the list."""
-    _at_once(_flush, opened)
+    _at_once(flush, opened)
     while opened:
         os.close(opened.pop())
 
@@ -294,26 +273,6 @@ def _make_way(target: Path) -> None:
         shutil.rmtree(target)
 
 
-def _flush(file: int) -> None:
-    """Flush an open file or folder to the device; ignore file systems that cannot."""
-    try:
-        os.fsync(file)
-    except OSError as error:
-        if error.errno not in _UNSUPPORTED:
-            raise
-
-
-def flush_folder(folder: Path) -> None:
-    """Flush the entries of a folder to the device: files made, renamed or removed in it."""
-    if os.name == "nt":  # Windows cannot open folders
-        return
-    file = os.open(folder, os.O_RDONLY)
-    try:
-        _flush(file)
-    finally:
-        os.close(file)
-
-
 def remove(root: Path, files: Iterable[str]) -> None:
     """Remove files below `root` durably, as one batch; files that do not exist are left out."""
     folders: dict[Path, None] = {}
@@ -322,12 +281,6 @@ def remove(root: Path, files: Iterable[str]) -> None:
             os.unlink(root / name)
             folders[(root / name).parent] = None
     _at_once(flush_folder, folders)
-
-
-def rename(source: Path, target: Path) -> None:
-    """Rename a file or folder within one parent folder, durably."""
-    os.replace(source, target)
-    flush_folder(target.parent)
 
 
 def remove_partials(folder: str | Path) -> None:
@@ -452,13 +405,32 @@ class Disk:
         return "" if above.is_dir() else f"no store can be created here: {above} is a file, not a folder"
 
     def create(self, files: Iterable[tuple[str, bytes]], *, old: bool) -> None:
-        """Make a store of these files, in place of an `old` one, under a temporary name, and rename it."""
+        """Make a store of these files, in place of an `old` one, under a temporary name, and rename it.
+
+        Whoever makes a store holds its lock, so what has the temporary names was left by a killed command.
+        """
         target = self.path.absolute()
         target.parent.mkdir(parents=True, exist_ok=True)
-        _remove_abandoned(target)
-        with _hidden_folder(target) as hidden:
+        hidden, retired = (target.with_name(f".{target.name}.{kind}{PARTIAL}") for kind in ("new", "old"))
+        try:
+            for left in (hidden, retired):  # by a killed command
+                remove_whole(left)
+            hidden.mkdir()
             write(hidden, files)
-            _replace(hidden, target, old=old)
+            if old:
+                rename(target, retired)
+            elif target.is_dir():
+                target.rmdir()
+            try:
+                rename(hidden, target)
+            except OSError:
+                if old and not target.exists():
+                    rename(retired, target)
+                raise
+        finally:
+            for left in (hidden, retired):
+                with contextlib.suppress(OSError):
+                    remove_whole(left)
 
     def remove_leftovers(self) -> None:
         """Remove the temporary files of killed processes."""
@@ -473,89 +445,3 @@ class Disk:
                 continue
             return usage.free if usage.total else None  # some mounts report a size of 0
         return None
-
-
-def _replace(hidden: Path, target: Path, *, old: bool) -> None:
-    """Rename a new store to its final name, durably. An `old` store is removed, or restored if renaming fails."""
-    if not old:
-        if target.is_dir():
-            target.rmdir()
-        rename(hidden, target)
-        return
-    retired = _hidden_name(target)
-    rename(target, retired)
-    try:
-        rename(hidden, target)
-    except OSError:
-        if not target.exists():
-            rename(retired, target)
-        raise
-    with contextlib.suppress(OSError):
-        shutil.rmtree(retired)
-
-
-# --- folders in which a store is created before it has its name --------------------------------------------
-#
-# A process that works in such a folder holds a lock on it, which ends with the process: a folder that can be locked
-# is abandoned. If the file system has no locks, an abandoned folder cannot be recognised, and none is removed.
-
-
-def _hidden_name(target: Path) -> Path:
-    """Return a new, unique temporary name beside `target`."""
-    return target.with_name(f".{target.name}.{uuid.uuid4().hex}{PARTIAL}")
-
-
-@contextlib.contextmanager
-def _hidden_folder(target: Path) -> Iterator[Path]:
-    """Make a new, locked folder beside `target`; remove it at the end unless it was renamed."""
-    while True:
-        folder = _hidden_name(target)
-        os.mkdir(folder)
-        lock = _lock_folder(folder, wait=True)
-        if folder.is_dir():  # otherwise another process removed it as abandoned before it was locked
-            break
-        _unlock_folder(lock)
-    try:
-        yield folder
-    finally:
-        with contextlib.suppress(OSError):
-            shutil.rmtree(folder)
-        _unlock_folder(lock)
-
-
-def _remove_abandoned(target: Path) -> None:
-    """Remove the temporary folders of killed processes that were creating a store of this name."""
-    own = re.compile(rf"\.{re.escape(target.name)}\.[0-9a-f]{{32}}{re.escape(PARTIAL)}")
-    for name in names(target.parent):
-        folder = target.with_name(name)
-        if own.fullmatch(name) and folder.is_dir() and not folder.is_symlink():
-            lock = _lock_folder(folder, wait=False)
-            if lock is not None:
-                with contextlib.suppress(OSError):
-                    shutil.rmtree(folder)
-                _unlock_folder(lock)
-
-
-def _lock_folder(folder: Path, *, wait: bool) -> int | None:
-    """Lock a folder and return a handle for `_unlock_folder`.
-
-    None if another process holds the lock (and not `wait`), or if the file system has no locks.
-    """
-    try:
-        import fcntl
-
-        lock = os.open(folder, os.O_RDONLY)
-    except (ImportError, OSError):
-        return None
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-    except OSError:
-        os.close(lock)
-        return None
-    return lock
-
-
-def _unlock_folder(lock: int | None) -> None:
-    """Release the lock that `_lock_folder` returned, if any."""
-    if lock is not None:
-        os.close(lock)
