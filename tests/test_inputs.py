@@ -602,7 +602,7 @@ def test_a_number_of_threads_that_is_none_is_refused(text: str, monkeypatch: pyt
     from vbnfault.store import codec
 
     monkeypatch.setenv("VBNFAULT_THREADS", text)
-    with pytest.raises(InputError, match=r"VBNFAULT_THREADS = .*: must be a whole number from 0 to 4096"):
+    with pytest.raises(InputError, match=r"VBNFAULT_THREADS = .*: must be a whole number from 0 to 1024"):
         codec.threads()
 
 

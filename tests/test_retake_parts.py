@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vbnfault import render
+from vbnfault import render, store
 from vbnfault.core.errors import InputError
 from vbnfault.dataset import retake
 from vbnfault.pipeline import retaken
@@ -192,7 +192,6 @@ def test_a_lens_must_have_the_scale_and_the_guard_band_of_the_store(
 
 @pytest.mark.parametrize("key", retake._OPTICS)
 def test_any_other_optics_make_another_aperture(finished_store: Any, key: str) -> None:
-    from vbnfault import store
 
     opened = store.open_store(finished_store)
     attributes = {**opened.attributes, "scene": {"camera": {"lens": "a", "f_number": 4.0}}}
@@ -268,11 +267,10 @@ def test_each_stored_sample_is_taken_as_often_as_the_variants_say(
     ],
 )
 def test_numbers_of_samples_are_written_as_ranges(numbers: list[int], ranges: list[list[int]]) -> None:
-    assert retake._ranges(np.array(numbers)) == ranges
+    assert store.runs(numbers) == ranges
 
 
 def test_the_checksum_of_the_old_store_is_that_of_the_samples_taken(finished_store: Any) -> None:
-    from vbnfault import store
 
     opened = store.open_store(finished_store)  # shards of 4 samples
     chosen = ([0, 1, 5], [0, 1, 6], [0, 5], [0, 1, 5, 9])

@@ -214,7 +214,7 @@ def test_a_disk_that_fails_at_any_operation_loses_nothing(tmp_path: Path, comman
 def test_short_writes_are_continued(
     tmp_path: Path, template: tuple[Path, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(disk, "os", damage.FailingSystem(short=True))
+    damage.replace_system(monkeypatch, damage.FailingSystem(short=True))
     store = st.create(tmp_path / "s.zarr", spec(), SAMPLES)
     st.write_samples(store, [sample(i) for i in range(SAMPLES)])
     monkeypatch.undo()
@@ -235,7 +235,7 @@ def test_data_are_on_the_device_before_done_is(store: Path, monkeypatch: pytest.
             if name == "replace":
                 calls.append((name, str(arguments[1])))
 
-    monkeypatch.setattr(disk, "os", Noted())
+    damage.replace_system(monkeypatch, Noted())
     st.write_samples(store, [sample(2), sample(3)])
     done = str(store / "done" / "c" / "1")
     renamed = [path for name, path in calls if name == "replace"]
@@ -376,7 +376,7 @@ def test_a_reader_in_the_middle_of_a_change_of_the_attributes_sees_no_damage(
 
 
 def test_create_removes_only_what_its_own_killed_predecessors_left(tmp_path: Path) -> None:
-    """Names with wildcards match no others, and a link with the name of a leftover is removed, not what it names."""
+    """Names with wildcards match no others; a link with the name of a leftover goes, not what it names."""
     name = "s[1]*?.zarr"
     others = [tmp_path / f".s1xy.zarr.{kind}.partial" for kind in ("new", "old")]
     for folder_ in (*others, tmp_path / f".{name}.new.partial"):
@@ -402,7 +402,7 @@ def test_a_store_of_a_million_empty_samples_costs_no_file_a_shard(
     def operations(path: Path, samples: int) -> int:
         system = damage.FailingSystem()
         with monkeypatch.context() as patch:
-            patch.setattr(disk, "os", system)
+            damage.replace_system(patch, system)
             store = st.create(path, spec(), samples)
             assert st.recover(path).finished() == 0
             assert st.verify(store) == [f"samples 0-{samples - 1} are not built yet"]

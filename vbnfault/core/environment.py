@@ -10,8 +10,9 @@ from pathlib import Path
 from .errors import InputError, shown
 from .resources import PACKAGE
 
-# The most threads that an environment variable or option may ask for: more than any machine has.
-MOST_THREADS = 4096
+# The most threads or processes that an environment variable or option may ask for: more than any machine has.
+MOST_THREADS = 1024
+MOST_SAMPLES = 10_000_000  # of a dataset
 
 
 def whole_number(name: str, high: int) -> int:

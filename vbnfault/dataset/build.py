@@ -48,8 +48,6 @@ __all__ = [
     "planned_blocks",
 ]
 
-MOST_PROCESSES = 1024  # of workers and of threads: more than any machine has
-
 
 @tables.table_class()
 class BuildOptions:
@@ -84,8 +82,8 @@ class BuildOptions:
         If a value is outside its range, or if two options exclude each other.
     """
 
-    workers: Annotated[int, Field(ge=1, le=MOST_PROCESSES)] = 1
-    threads: Annotated[int, Field(ge=1, le=MOST_PROCESSES)] | None = None
+    workers: Annotated[int, Field(ge=1, le=environment.MOST_THREADS)] = 1
+    threads: Annotated[int, Field(ge=1, le=environment.MOST_THREADS)] | None = None
     scheduler: str | None = None
     overwrite: bool = False
     accept_versions: bool = False

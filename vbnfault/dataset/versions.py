@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
+from ..store import runs
+
 # Root attribute: a list of tables, each with `versions` and the `samples` made with them, as ranges [first, last].
 # All other samples were made with the versions in the root attribute `versions`.
 VERSIONS_OF_SAMPLES = "versions_of_samples"
@@ -40,7 +42,7 @@ def made_now(
         if made is None:
             entries.append((dict(now), made := set()))
         made.update(samples)
-    return [{"versions": versions, "samples": _ranges(made)} for versions, made in entries if made]
+    return [{"versions": versions, "samples": runs(made)} for versions, made in entries if made]
 
 
 def joined(
@@ -64,7 +66,7 @@ def joined(
             if of_entry is None:
                 made.append((entry["versions"], of_entry := set()))
             of_entry.update(_samples(entry) & set(samples))
-    return [{"versions": versions, "samples": _ranges(samples)} for versions, samples in made if samples]
+    return [{"versions": versions, "samples": runs(samples)} for versions, samples in made if samples]
 
 
 def _entries(attributes: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -75,14 +77,3 @@ def _entries(attributes: Mapping[str, Any]) -> list[dict[str, Any]]:
 def _samples(entry: Mapping[str, Any]) -> set[int]:
     """Return the samples in the ranges of a table."""
     return {i for first, last in entry["samples"] for i in range(first, last + 1)}
-
-
-def _ranges(samples: Iterable[int]) -> list[list[int]]:
-    """Return samples as ascending ranges [first, last]."""
-    ranges: list[list[int]] = []
-    for i in sorted(samples):
-        if ranges and i == ranges[-1][1] + 1:
-            ranges[-1][1] = i
-        else:
-            ranges.append([i, i])
-    return ranges

@@ -31,6 +31,7 @@ from .check import (
     examine,
     examine_shard,
     problem_samples,
+    runs,
     spans,
     unplanned_samples,
     verify,

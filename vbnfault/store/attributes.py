@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields
 from typing import Any
 
+from ..core.environment import MOST_SAMPLES
 from ..core.errors import InputError, shown, without_middle
 
 # Dotted keys of the root attributes that are tables wherever they are present; * stands for every key of a table.
@@ -53,8 +54,7 @@ _RULES: dict[str, tuple[Callable[[Any], bool], str]] = {
         f"be 2 numbers from 1 to {_MOST_RENDERED}",
     ),
 }
-# The most samples of a store, and the most flags that they have together, one for each sample and class.
-MOST_SAMPLES = 10_000_000
+# The most flags that the samples have together, one for each sample and class.
 _MOST_FLAGS = 2**28
 # Fields of `StoreSpec` that become names of arrays, of folders and of files of an export.
 _NAMES = ("faults", "soft_layers")

@@ -215,15 +215,20 @@ def _layers(
     return problems, layers
 
 
-def spans(indices: Iterable[int]) -> str:
-    """Return sorted indices as ranges: `3-7, 9` for 3, 4, 5, 6, 7, 9."""
-    runs: list[list[int]] = []
+def runs(indices: Iterable[int]) -> list[list[int]]:
+    """Return indices as ascending ranges [first, last]."""
+    ranges: list[list[int]] = []
     for i in sorted(indices):
-        if runs and i == runs[-1][1] + 1:
-            runs[-1][1] = i
+        if ranges and i == ranges[-1][1] + 1:
+            ranges[-1][1] = i
         else:
-            runs.append([i, i])
-    return ", ".join(str(a) if a == b else f"{a}-{b}" for a, b in runs)
+            ranges.append([i, i])
+    return ranges
+
+
+def spans(indices: Iterable[int]) -> str:
+    """Return indices as ranges: `3-7, 9` for 3, 4, 5, 6, 7, 9."""
+    return ", ".join(str(a) if a == b else f"{a}-{b}" for a, b in runs(indices))
 
 
 def _not_built(samples: list[int]) -> Iterator[str]:
