@@ -40,7 +40,7 @@ class Misplaced(OSError):
 
 
 @contextlib.contextmanager
-def explained(path: Path, doing: str) -> Iterator[None]:
+def explained(path: object, doing: str) -> Iterator[None]:
     """Turn an OSError in a `with` block into a VbnfaultError or InputError with one sentence for the user."""
     try:
         yield
@@ -300,18 +300,30 @@ def remove_partials(folder: str | Path) -> None:
 
 
 class Disk:
-    """Read and write the files of a store in a folder; see `files.Files` for the methods."""
+    """Read and write the files of a store in a folder; their names are relative to it and separated by `/`."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self._folder = str(path)
 
     def read(self, name: str, most_bytes: int) -> bytes:
-        """Return the content of a file, see `read`."""
+        """Return the content of a file of at most so many bytes.
+
+        Raises
+        ------
+        FileNotFoundError
+            There is no such file.
+        OSError
+            The file is damaged: it cannot be read, is larger, or a link stands in its place or above it.
+        InputError
+            This user may not read it.
+        VbnfaultError
+            The object store cannot be reached.
+        """
         return read(self._inside(name), most_bytes)
 
     def read_each(self, files: Sequence[tuple[str, int]]) -> Iterator[bytes | OSError]:
-        """Yield the content of each file, given by its name and its most bytes, or why it cannot be read."""
+        """Yield the content of each file, given by its name and its most bytes, or the OSError of `read`."""
         for name, most_bytes in files:
             try:
                 yield self.read(name, most_bytes)
@@ -338,22 +350,22 @@ class Disk:
     def read_parts(
         self, name: str, tail: int, choose: Callable[[bytes], Sequence[tuple[int, int]]]
     ) -> list[tuple[int, bytes]]:
-        """Return parts of a file, see `read_parts`."""
+        """Return parts of one version of a file, each with its start; `choose` gets the last `tail` bytes."""
         return read_parts(self._inside(name), tail, choose)
 
     def names(self, folder: str) -> list[str]:
-        """Return the names in a folder; none where it, or a folder above it, is a link."""
+        """Return the names in a folder; an empty list if there is no such folder."""
         try:
             return names(Path(self._inside(f"{folder}/").rstrip("/")))
         except OSError:
             return []
 
     def exists(self, name: str) -> bool:
-        """Return whether something has this name, also a broken link."""
+        """Return whether something has this name."""
         return os.path.lexists(self.path / name)
 
     def modified(self, folder: str) -> dict[str, datetime]:
-        """Return by name when each file directly in a folder was written."""
+        """Return by name when each file directly in a folder was written, by the clock of what stores it."""
         written = {}
         for name in self.names(folder):
             with contextlib.suppress(OSError):
@@ -361,7 +373,7 @@ class Disk:
         return written
 
     def stamp(self, name: str) -> object:
-        """Return inode and modification time, which change if a file is replaced; None if there is no file."""
+        """Return what changes if a file is replaced; None if there is no file."""
         try:
             status = os.stat(self.path / name)
         except OSError:
@@ -369,19 +381,22 @@ class Disk:
         return status.st_ino, status.st_mtime_ns
 
     def zarr(self) -> Path:
-        """Return what zarr and xarray open."""
+        """Return what zarr and xarray open in order to read the store."""
         return self.path
 
     def failure(self, error: Exception, name: str) -> VbnfaultError | None:
-        """Return the error for a failure of zarr that is no damage."""
+        """Return the error for a failure while zarr reads an array that is no damage; None for any other."""
         return denied(error, self.path / name) if isinstance(error, PermissionError) else None
 
     def write(self, files: Iterable[tuple[str, bytes | Path]]) -> None:
-        """Replace files durably, see `write`."""
+        """Replace files durably, as one batch; each is the old or the complete new one at any moment.
+
+        The contents are bytes, or what `copied` returns. Raises OSError if a file cannot be written.
+        """
         write(self.path, files)
 
     def remove(self, files: Iterable[str]) -> None:
-        """Remove files durably; what lies behind a link to a folder stays."""
+        """Remove files durably; names that do not exist are left out."""
 
         def within() -> Iterator[str]:
             for name in files:
@@ -392,11 +407,11 @@ class Disk:
         remove(self.path, within())
 
     def copied(self, name: str, most_bytes: int, *, link: bool) -> bytes | Path:
-        """Return a file as `write` of another store takes it."""
+        """Return a file as `write` of another store takes it. `link`: where possible, no byte is copied."""
         return Path(self._inside(name)) if link else self.read(name, most_bytes)
 
     def why_occupied(self, own: Iterable[str]) -> str:
-        """Return why no store can be created here, as a clause; what a killed creation has left is beside it."""
+        """Return why no store can be created here, as a clause, or an empty text; `own`: names of a new store."""
         if self.path.is_symlink():
             return "is a link, in whose place nothing is created; name another --out, or what the link names"
         if self.path.exists() and (not self.path.is_dir() or any(self.path.iterdir())):
@@ -405,9 +420,9 @@ class Disk:
         return "" if above.is_dir() else f"no store can be created here: {above} is a file, not a folder"
 
     def create(self, files: Iterable[tuple[str, bytes]], *, old: bool) -> None:
-        """Make a store of these files, in place of an `old` one, under a temporary name, and rename it.
+        """Make a store of these files, the root last, in place of an `old` store; it appears when it is whole.
 
-        Whoever makes a store holds its lock, so what has the temporary names was left by a killed command.
+        Raises OSError if that is impossible.
         """
         target = self.path.absolute()
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -433,11 +448,11 @@ class Disk:
                     remove_whole(left)
 
     def remove_leftovers(self) -> None:
-        """Remove the temporary files of killed processes."""
+        """Remove what killed processes have left. No other process may write meanwhile."""
         remove_partials(self.path)
 
     def free_bytes(self) -> int | None:
-        """Return the free space in bytes; None if the system does not report it."""
+        """Return the free space in bytes; None if it is not known or not limited."""
         for folder in (self.path, *self.path.absolute().parents):
             try:
                 usage = shutil.disk_usage(folder)
