@@ -322,7 +322,6 @@ def test_modules_of_the_store_import_only_those_before_them() -> None:
         "attributes",
         "schema",
         "codec",
-        "counts",
         "disk",
         "bucket",
         "files",

@@ -30,9 +30,8 @@ from .dask import check_scheduler, run_on_dask
 from .lock import locked, others_at_work, prepared_by_one
 from .processes import Pool
 from .progress import Progress, duration_text, size_text
-from .resume import blocks_of, check_same_scene, planned_blocks, with_versions_noted
+from .resume import blocks_of, check_same_scene, known_versions, planned_blocks, with_versions_noted
 from .tasks import BuildFailed, Run, SampleMaker, SampleWorkers, SessionFactory
-from .versions import known
 from .work import run_here
 
 __all__ = [
@@ -394,7 +393,7 @@ def _locked_store(plan: BuildPlan, path: Location, options: BuildOptions, stack:
             return _prepared_store(plan, path, options)
         store = store_module.open_store(path, "r+")
         versions = plan.spec.attributes.get("versions", {})
-        if store.samples < len(plan.site) or versions not in known(store.attributes):
+        if store.samples < len(plan.site) or versions not in known_versions(store.attributes):
             raise VbnfaultError(
                 f"{path}: another command is writing shards of it, so no samples or versions can be added now; "
                 "wait until it ends"

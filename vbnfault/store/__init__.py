@@ -21,6 +21,7 @@ scalars (everything else). These rules protect a store against kills, power loss
 from .arrays import EFFECT_RULE, LAYERS, MASK_RULES, REQUIRED_LAYERS, SCALARS, SEMANTIC, Array, Member
 from .bucket import OWN, Bucket, Url
 from .check import (
+    FaultCounts,
     Planned,
     Problem,
     Report,
@@ -37,7 +38,6 @@ from .check import (
     verify,
 )
 from .codec import Encoded, SharedChunks, encode, mask_union
-from .counts import FaultCounts
 from .files import Files, Location, files_of, located
 from .group import MOST_DOCUMENT_BYTES, check_free, create, is_store, open_dataset, open_store, write_samples
 from .layout import drawn_table, is_sealed, sealed
