@@ -25,6 +25,7 @@ from vbnfault.core.resources import packaged
 from vbnfault.core.spectra import Bands
 from vbnfault.detector import ThreeColourDetector
 from vbnfault.faults import FaultContext, registry
+from vbnfault.faults.straylight_lens import channel_bands
 from vbnfault.lens import load_lens, scaled_to_field
 from vbnfault.lens.coating import NAMES
 from vbnfault.lens.imaging import RealLens
@@ -78,8 +79,9 @@ def ghosts(lens: Prescription, sun_deg: float, bands: int) -> F64:
         sun_angular_radius_rad=SUN_RAD,
     )
     fault = registry()["straylight"]["traced"]()
-    source = fault.sunlight(fault.draw_state(np.random.default_rng(0)), context)
-    return np.asarray(source.rates * total(source.light.ghost_model(), sun_deg)) / PIXEL_MM2
+    source = fault.sun_in_lens(fault.draw_state(context, np.random.default_rng(0)), context)
+    rates = channel_bands(context)[1]
+    return np.asarray(rates * total(source.of_ghosts.model, sun_deg)) / PIXEL_MM2
 
 
 def main() -> None:

@@ -17,8 +17,8 @@ import argparse
 import numpy as np
 
 from vbnfault.lens import Prescription, load_lens
-from vbnfault.lens.rays import ghost
-from vbnfault.lens.straylight.paraxial import along, pairs, transmittance
+from vbnfault.lens.rays import ghost, transmittance
+from vbnfault.lens.straylight.paraxial import along, pairs
 
 _MOST = 8  # ghosts, those with most light
 

@@ -32,7 +32,7 @@ from vbnfault.pipeline.record import to_sample
 from vbnfault.pipeline.rendering import render_view
 from vbnfault.pipeline.resolve import resolve
 from vbnfault.pipeline.spec import Frame, SampleSpec
-from vbnfault.render import cells, sampling
+from vbnfault.render import light, sampling
 from vbnfault.scene import config
 
 P = ParamSpec("P")
@@ -85,20 +85,20 @@ def stages(
 def count_traced() -> Callable[[], float]:
     """Count the samples of all wavefronts; return the function that returns the count and resets it."""
     traced = 0
-    of_pixels, of_cells = sampling.Strata.__init__, cells.CellStrata.__init__
+    of_pixels, of_cells = sampling.Strata.__init__, light.CellStrata.__init__
 
     def pixels_counted(self: sampling.Strata, pixels: sampling.Pixels, samples: int, *more: Any) -> None:
         nonlocal traced
         traced += pixels.count * samples
         of_pixels(self, pixels, samples, *more)
 
-    def cells_counted(self: cells.CellStrata, listed: cells.Cells, samples: int, *more: Any) -> None:
+    def cells_counted(self: light.CellStrata, listed: light.Cells, samples: int, *more: Any) -> None:
         nonlocal traced
         traced += len(listed.pixel) * samples
         of_cells(self, listed, samples, *more)
 
     sampling.Strata.__init__ = pixels_counted  # type: ignore[method-assign]
-    cells.CellStrata.__init__ = cells_counted  # type: ignore[method-assign]
+    light.CellStrata.__init__ = cells_counted  # type: ignore[method-assign]
 
     def taken() -> float:
         nonlocal traced

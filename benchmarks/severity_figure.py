@@ -14,14 +14,15 @@ from PIL import Image, ImageDraw, ImageFont
 
 from vbnfault.faults import LEVELS, read_table, registry
 from vbnfault.study.severity import ModelUnderTest
-from vbnfault.study.severity_views import SequenceView, ViewGroup, sequences, session_of
+from vbnfault.study.severity_views import ViewGroup, faulted, sequences, session_of
+from vbnfault.study.views import CleanView
 
 _TILE_PX, _GAP_PX, _LABEL_PX, _HEAD_PX = 112, 4, 126, 20
 _GREYS = 40  # of the file: fewer greys make it smaller
 _INK, _PAPER = 20, 255
 
 
-def _view(scene: str, seed: int, tries: int, detector: str, facing_sun: bool) -> SequenceView:
+def _view(scene: str, seed: int, tries: int, detector: str, facing_sun: bool) -> CleanView:
     """Return the first of some views whose ground is brightest."""
     overrides = {
         "camera.width_px": 256,
@@ -35,7 +36,7 @@ def _view(scene: str, seed: int, tries: int, detector: str, facing_sun: bool) ->
         scene=scene, overrides=overrides, lens=0, facing_sun=facing_sun, site=0, first=0, count=tries, models=()
     )
     views = [first for first, _ in sequences(group, "matches_lost", session_of(group))]
-    return max(views, key=lambda view: float(np.median(_tile(view.clean))))
+    return max(views, key=lambda view: float(np.median(_tile(view.frame.clean))))
 
 
 def _tile(image: np.ndarray) -> Image.Image:
@@ -56,7 +57,7 @@ def main() -> None:
     given = parser.parse_args()
     given.out.parent.mkdir(parents=True, exist_ok=True)
     table = read_table(given.table)
-    views: dict[tuple[str, bool], SequenceView] = {}
+    views: dict[tuple[str, bool], CleanView] = {}
     rows = []
     for fault, models in table.levels.items():
         name = next((name for name in registry()[fault] if name in models), "")
@@ -75,7 +76,7 @@ def main() -> None:
                 images.append(("no such level", None))
                 continue
             value = model.severity.at_width(value, width_px, given_for_px=table.width_px)
-            images.append((f"{value:.3g}", view.image(model.at(value)[0])))
+            images.append((f"{value:.3g}", faulted(view, model.at(value)[0]).image))
         rows.append((fault, levels.key, images))
     per_block = -(-len(rows) // given.blocks)
     block_px = _LABEL_PX + LEVELS * (_TILE_PX + _GAP_PX) + 4 * _GAP_PX

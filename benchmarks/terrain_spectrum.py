@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vbnfault.body import EMBEDDED, Patch, PatchSpec, build_patch, choose_sites, load_body
-from vbnfault.body.roughness import deviogram, mean_edge_m, model_roughness
-from vbnfault.body.shape import vertex_normals
+from vbnfault.body.geometry import mean_edge_m, vertex_normals
+from vbnfault.body.roughness import deviogram, model_roughness
 
 TERRAIN_M = np.geomspace(0.4, 40.0, 11)
 
@@ -45,7 +45,7 @@ def main() -> None:
     arguments = parser.parse_args()
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
     body = load_body(arguments.shape)
-    edge, law = mean_edge_m(body.vertices_m, body.faces), model_roughness(body)
+    edge, law = mean_edge_m(body.vertices_m, body.faces), model_roughness(body.vertices_m, body.faces)
     coarse = edge * np.geomspace(1.0, 5.0, 7)
     model = deviogram(body.vertices_m, vertex_normals(body.vertices_m, body.faces), coarse)
     fine = np.array(

@@ -17,7 +17,7 @@ import psutil
 
 from vbnfault import render
 from vbnfault.body import EMBEDDED, PatchSpec, choose_sites, load_body
-from vbnfault.body.cache import cached_patch
+from vbnfault.body.patch import cached_patch
 from vbnfault.core.array_files import FOLDER_VARIABLE
 
 

@@ -8,7 +8,7 @@ it, L A T / f². Each part integrates, over sources at the angle θ, the irradia
 centre:
 
 - veil: v A T cos θ / (π f²), which integrates to v;
-- scatter: `lens.straylight.scatter.point_source_transmittance`, with roughness and particles;
+- scatter: `lens.straylight.scatter.veiling_glare`, with roughness and particles;
 - ghosts: apart from losses, radiance is constant along a path. So a ghost contributes L T_g Ω, where Ω is the solid
   angle of its beam as seen from the centre of the sensor. The paraxial beam ends at r = ±r_max, where its slope
   is r / M01.
@@ -23,11 +23,12 @@ import argparse
 import numpy as np
 
 from vbnfault.core import resources
+from vbnfault.core.spectra import Bands
 from vbnfault.lens import Prescription, load_lens, paraxial_properties
 from vbnfault.lens.glass import D_NM
-from vbnfault.lens.rays import ghost
-from vbnfault.lens.straylight.paraxial import along, axial_transmittance, pairs, transmittance
-from vbnfault.lens.straylight.scatter import ROUGHNESS_NM, Cleanliness, point_source_transmittance
+from vbnfault.lens.rays import axial_transmittance, ghost, transmittance
+from vbnfault.lens.straylight.paraxial import along, pairs
+from vbnfault.lens.straylight.scatter import ROUGHNESS_NM, Cleanliness, veiling_glare
 from vbnfault.lens.straylight.settings import VEIL_FRACTION
 
 SPOT_DEG = 2.0
@@ -49,12 +50,15 @@ def index_of(
     theta = np.radians(ANGLES_DEG)
     rings = 2 * np.pi * np.sin(theta)
     source = np.cos(theta) * field * veil_fraction / np.pi
-    scattered = point_source_transmittance(
-        lens,
-        ANGLES_DEG,
-        wavelength_nm=wavelength_nm,
-        cleanliness=Cleanliness(roughness_nm=roughness_nm, level=cleanliness_level),
-    )[0]
+    cleanliness = Cleanliness(roughness_nm=roughness_nm, level=cleanliness_level)
+    of_sources = [
+        veiling_glare(lens, Bands.lines(wavelength_nm), sun_deg=angle, cleanliness=cleanliness)
+        for angle in ANGLES_DEG
+    ]
+    # of a source at an angle, the middle of the sensor is this sine away
+    scattered = np.array(
+        [np.interp(np.sin(a), g.offset, g.irradiance[0]) for a, g in zip(theta, of_sources, strict=True)]
+    )
     # the integrals begin at the rim of the spot, which is black
     return {
         "veil": float(np.trapezoid(source * rings, theta) / field),

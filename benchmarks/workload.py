@@ -30,9 +30,8 @@ from vbnfault.pipeline.resolve import resolve
 from vbnfault.pipeline.spec import Frame, Pose, Rendering, SampleSpec, SceneLight, Terrain
 from vbnfault.reflectance.hapke import hapke_at
 from vbnfault.render.description import RenderInput
-from vbnfault.render.emitter import SunDisc
 from vbnfault.render.runtime import dr, mi
-from vbnfault.render.sampling import Optics, Pixels, Strata
+from vbnfault.render.sampling import Optics, Pixels, Strata, SunDisc
 from vbnfault.scene import config, plan
 
 SCENE = "paper_example"  # for its six faults; the view is defined below

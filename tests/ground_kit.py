@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from vbnfault.body import Body, Patch
+from vbnfault.body.geometry import vertex_normals
 from vbnfault.body.roughness import deviogram, model_roughness
-from vbnfault.body.shape import vertex_normals
 
 
 def ground_of(patch: Patch) -> tuple[np.ndarray, np.ndarray]:
@@ -28,5 +28,5 @@ def deviation_over_law(body: Body, patches: Sequence[Patch], baselines_m: Sequen
             near = np.flatnonzero(distance < 20.0 + 6.0 * baseline)[:: 1 if baseline < 8 else 4]
             row.append(deviogram(points[near], normals[near], np.array([baseline]), windows=40)[0])
         rows.append(row)
-    law = model_roughness(body).deviation_at(np.array(baselines_m))
+    law = model_roughness(body.vertices_m, body.faces).deviation_at(np.array(baselines_m))
     return np.asarray(np.sqrt(np.mean(np.square(rows), axis=0)) / law)

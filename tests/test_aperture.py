@@ -18,6 +18,7 @@ from vbnfault import dataset
 from vbnfault.cli import app
 from vbnfault.core import resources, spectra
 from vbnfault.core.errors import InputError
+from vbnfault.core.spectra import Bands
 from vbnfault.faults import FaultContext, from_dict
 from vbnfault.lens import (
     Prescription,
@@ -29,12 +30,13 @@ from vbnfault.lens import (
     scaled_to_focal_length,
     stopped_down,
 )
+from vbnfault.lens.footprint import Footprint
 from vbnfault.lens.glass import D_NM
 from vbnfault.lens.imaging import point_spreads
 from vbnfault.lens.prescription_file import to_table
 from vbnfault.lens.rays import trace
 from vbnfault.lens.straylight.paraxial import paraxial_ghosts
-from vbnfault.lens.straylight.scatter import Cleanliness, veiling_glare
+from vbnfault.lens.straylight.scatter import Cleanliness, GlareLayout, veiling_glare
 from vbnfault.lens.straylight.starburst import starburst
 from vbnfault.scene import config
 from vbnfault.world import assemble
@@ -142,7 +144,7 @@ def test_beams_faults_and_other_lenses_follow_the_stop() -> None:
         assert where.frame.prescription("", "as_prescribed") is lens.prescription
         # a fault's lens of its own is closed as far as the camera's
         assert where.frame.real_lens("tessar_50_f2p8").f_number == pytest.approx(lens.f_number, rel=1e-5)
-    on_front = [where.frame.beams("").on_row(0).area_mm2[0] for where in seen]
+    on_front = [Footprint.on_row(where.frame.beams(""), 0).area_mm2[0] for where in seen]
     # on the vertex's plane it is exactly 16; the front's curvature takes a percent of the wide beam at most
     assert on_front[0] / on_front[1] == pytest.approx(16, rel=0.01)
     # a grain that the narrow beam may not hold darkens the wide one a sixteenth as much
@@ -258,14 +260,15 @@ def test_scaling_keeps_films_roughness_and_grains_and_lengthens_paths_in_glass()
     assert taken(lens) / taken(clear[0]) == pytest.approx(0.9 ** (glass_mm / 10), rel=1e-9)
     # in clear glass, roughness of 2 nm and particles of a level scatter the same share, over the same angles
     glare = [
-        veiling_glare(
-            v, sun_deg=10.0, wavelength_nm=np.array([D_NM]), cleanliness=Cleanliness(roughness_nm=2.0, level=300.0)
-        )
+        veiling_glare(v, Bands.lines(D_NM), sun_deg=10.0, cleanliness=Cleanliness(roughness_nm=2.0, level=300.0))
         for v in clear
     ]
     shape, pitch = (32, 32), 1.0
     at = [(f.efl_mm * math.tan(math.radians(10)), 0.0) for f in figures]
-    images = [g.image(xy, shape, pitch * scale) for g, xy, scale in zip(glare, at, (1.0, factor), strict=True)]
+    images = [
+        g.table[:, GlareLayout(g.efl_mm, xy, shape, pitch * scale).steps]
+        for g, xy, scale in zip(glare, at, (1.0, factor), strict=True)
+    ]
     # irradiance over the Sun's: of a lens f-number for f-number alike, at places in focal lengths alike
     np.testing.assert_allclose(images[1], images[0], rtol=2e-3)
     # grains: as many µm at either scale

@@ -50,14 +50,12 @@ def imported_for_type_checkers(package: ModuleType) -> dict[str, str]:
     return homes
 
 
-@pytest.mark.parametrize("name", ["vbnfault", "vbnfault.dataset", "vbnfault.render", "vbnfault.study"])
+@pytest.mark.parametrize("name", ["vbnfault", "vbnfault.dataset", "vbnfault.study"])
 def test_every_public_name_resolves_and_is_listed(name: str) -> None:
     package = importlib.import_module(name)
     homes = package._HOMES
     assert imported_for_type_checkers(package) == homes | ({"study": "study.run"} if name == "vbnfault" else {})
-    assert set(package.__all__) - set(homes) == {"vbnfault": {"__version__"}, "vbnfault.render": {"self_test"}}.get(
-        name, set()
-    )
+    assert set(package.__all__) - set(homes) == ({"__version__"} if name == "vbnfault" else set())
     assert set(homes) <= set(package.__all__)
     for public in package.__all__:
         assert getattr(package, public) is vars(package)[public] is not None
@@ -284,8 +282,8 @@ def test_a_flare_refuses_what_the_physics_does_not_take(setting: dict[str, Any],
 def test_the_field_helpers_make_a_fault() -> None:
     import dataclasses
 
+    from vbnfault.core.registry import undoing_registrations
     from vbnfault.faults import from_dict
-    from vbnfault.faults.models import undoing_registrations
 
     with undoing_registrations(always=True):
 

@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 from vbnfault.body import Body, ellipsoid
-from vbnfault.body.shape import signed_volume, vertex_normals
+from vbnfault.body.geometry import signed_volume, vertex_normals
 from vbnfault.core.errors import InputError
 from vbnfault.reflectance import BandReflectance, radiance_factor, registry
 from vbnfault.scene import bodies, config
@@ -196,8 +196,8 @@ def shape_flux(body: Body, model: BandReflectance, phase_deg: float, turns: int 
 
     Camera and Sun lie in the plane of the equator.
     """
-    from vbnfault.render.mesh import mesh_scene
     from vbnfault.render.runtime import mi
+    from vbnfault.render.vehicle import mesh_scene
 
     def vectors(array: Array) -> Any:
         return mi.Vector3f(*(mi.Float(np.ascontiguousarray(c, dtype=np.float32)) for c in array.T))

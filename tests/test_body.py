@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import sys
 import warnings
 from pathlib import Path
 
@@ -11,10 +12,13 @@ import pytest
 import trimesh
 
 from vbnfault.body import Body, check_mesh, choose_sites, embedded_nucleus, load_body, load_shape, local_level
+from vbnfault.body.geometry import face_normals_areas, signed_volume
 from vbnfault.body.noise import gradient_noise
-from vbnfault.body.nucleus import made_nucleus
-from vbnfault.body.shape import face_normals_areas, signed_volume
 from vbnfault.core.errors import InputError
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+
+import embedded_nucleus as embedded_nucleus_maker
 
 REAL_SHAPE = Path(__file__).parents[2] / "shared/data/shapes/67p_18k.obj"
 CUBE = """v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv 0 0 1\nv 1 0 1\nv 1 1 1\nv 0 1 1
@@ -90,16 +94,6 @@ def test_bad_files_are_refused_in_one_sentence(tmp_path: Path, text: str, name: 
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
     assert str(caught.value).endswith(".")
-
-
-def test_missing_file_folder_and_unit(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="not found"):
-        load_shape(tmp_path / "nowhere.obj")
-    (tmp_path / "folder.obj").mkdir()
-    with pytest.raises(InputError, match="not a file"):
-        load_shape(tmp_path / "folder.obj")
-    with pytest.raises(InputError, match="unit must be one of"):
-        load_shape(write(tmp_path, CUBE), "miles")  # type: ignore[arg-type]
 
 
 def test_open_mesh_is_refused_with_the_count_of_edges() -> None:
@@ -302,18 +296,11 @@ def _section_area(mesh: trimesh.Trimesh, origin: object, axis: np.ndarray) -> fl
     return float(0.5 * np.sum(turned * (np.cross(a, b) @ axis)))
 
 
-def test_nucleus_is_the_same_every_time() -> None:
-    """The nucleus that is computed equals the one that the process keeps and the one that is read from disk."""
-    made = made_nucleus()
-    kept = embedded_nucleus()
-    embedded_nucleus.cache_clear()
-    read = embedded_nucleus()
-    assert read[0] is not kept[0]
-    for again in (kept, read):
-        for a, b in zip(made, again, strict=True):
-            np.testing.assert_array_equal(a, b)
-            assert a.dtype == b.dtype
-            assert not b.flags.writeable
+def test_nucleus_is_what_its_maker_makes() -> None:
+    vertices, faces = embedded_nucleus()
+    made_vertices, made_faces = embedded_nucleus_maker.made_nucleus()
+    np.testing.assert_allclose(made_vertices, vertices, atol=1e-6)  # other processors round otherwise
+    np.testing.assert_array_equal(made_faces, faces)
 
 
 def test_noise_is_a_function_of_place() -> None:
@@ -341,10 +328,6 @@ def test_body_defaults_hash_and_bounds() -> None:
     assert len(body.content_hash) == 64
     moved = Body(name="moved", vertices_m=body.vertices_m + 1e-9, faces=body.faces)
     assert moved.content_hash != body.content_hash
-    with pytest.raises(InputError, match="density_kg_m3"):
-        load_body(density_kg_m3=-1.0)
-    with pytest.raises(InputError, match="rotation_period_s"):
-        load_body(rotation_period_s=float("nan"))
 
 
 def test_centre_of_mass_of_a_moved_wedge() -> None:
@@ -433,16 +416,6 @@ def test_a_site_is_drawn_when_it_is_asked_for(monkeypatch: pytest.MonkeyPatch) -
     assert [s.index for s in sites[3:6]] == [3, 4, 5]
     with pytest.raises(IndexError):
         sites[10_000]
-
-
-def test_site_bounds() -> None:
-    body = load_body()
-    assert len(choose_sites(body, 0, seed=0)) == 0
-    for arguments, key in (((-1, 0), "sites"), ((1, -1), "seed")):
-        with pytest.raises(InputError, match=key):
-            choose_sites(body, *arguments)
-    with pytest.raises(InputError, match="max_slope_deg"):
-        choose_sites(body, 1, 0, max_slope_deg=120.0)
 
 
 @pytest.mark.parametrize(

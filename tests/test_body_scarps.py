@@ -8,9 +8,10 @@ import trimesh
 from conftest import small_scene
 
 from vbnfault.body import Body, PatchSpec, build_patch, site_at
-from vbnfault.body.octaves import Octaves
+from vbnfault.body.fields import Octaves
+from vbnfault.body.geometry import mean_edge_m
 from vbnfault.body.relief import _unevenness
-from vbnfault.body.roughness import Roughness, mean_edge_m
+from vbnfault.body.roughness import Roughness
 from vbnfault.body.scarps import Form, form, gathered
 from vbnfault.pipeline import Session
 from vbnfault.pipeline import session as sessions

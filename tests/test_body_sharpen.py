@@ -9,9 +9,8 @@ import pytest
 
 import vbnfault
 from vbnfault.body import ellipsoid, load_body
-from vbnfault.body.roughness import deviogram, mean_edge_m
-from vbnfault.body.shape import vertex_normals
-from vbnfault.body.sharpen import sharpened
+from vbnfault.body.geometry import mean_edge_m, vertex_normals
+from vbnfault.body.roughness import deviogram, sharpened
 from vbnfault.dataset.identity import scene_identity
 
 SPHERE, FACES = ellipsoid((1000.0, 1000.0, 1000.0), 0.0)

@@ -31,9 +31,10 @@ from vbnfault import store as st
 from vbnfault.core import toml_files
 from vbnfault.core.errors import InputError, VbnfaultError
 from vbnfault.core.quantities import Sample
+from vbnfault.core.registry import undoing_registrations
 from vbnfault.dataset import BuildOptions, build_scene, dask
 from vbnfault.dataset import build as bd
-from vbnfault.faults import models, plugins
+from vbnfault.faults import plugins
 from vbnfault.scene.config import load_scene
 from vbnfault.study import results
 from vbnfault.study.run import run_study
@@ -398,7 +399,7 @@ def test_a_plug_in_reaches_the_workers_of_a_cluster(processes: Any, tmp_path: Pa
         "metrics": {"names": ["centroid_shift_px"]},
     }
     address = processes.scheduler_address
-    with models.undoing_registrations(always=True):
+    with undoing_registrations(always=True):
         digests = [
             build_scene(load_scene(scene), tmp_path / f"{name}.zarr", BuildOptions(**given, progress=False)).digest
             for name, given in (("there", {"scheduler": address}), ("here", {}))
@@ -411,7 +412,7 @@ def test_a_plug_in_reaches_the_workers_of_a_cluster(processes: Any, tmp_path: Pa
         assert made[0] == made[1]
         shifts = results.read_table(tmp_path / "study here")["centroid_shift_px"].to_numpy()
         assert len(set(shifts)) == 3  # the level was read
-        plugins.forget_all()
+        plugins.loaded.clear()
 
 
 def test_a_scheduler_is_told_from_a_worker() -> None:

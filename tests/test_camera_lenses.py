@@ -12,7 +12,7 @@ from vbnfault.core.errors import VbnfaultError
 from vbnfault.core.spectra import Bands
 from vbnfault.lens import RealLens, load_lens, paraxial_properties, scaled_to_field
 from vbnfault.lens.straylight.settings import SensorGrid, SunSource
-from vbnfault.lens.straylight.total import SunlightInLens
+from vbnfault.lens.straylight.total import SunInLens
 
 LENSES = ("nikkor_28_f2p8", "nikkor_35_f2p8")
 SENSOR_MM = 5.632  # 1024 pixels of 5.5 µm
@@ -58,13 +58,13 @@ def test_the_sensor_raises_ghosts_near_the_axis(name: str) -> None:
     near = np.hypot(at, at[:, None]) < 4
     light = []
     for reflectance in (0.0, 0.05, 0.1):
-        found = SunlightInLens.of(
-            replace(lens, sensor_reflectance=reflectance),
+        found = SunInLens(
+            lens=replace(lens, sensor_reflectance=reflectance),
             bands=Bands.lines(450.0, 650.0),
             sensor=SensorGrid(shape=(32, 32), pitch_mm=SENSOR_MM / 32),
             sun=SunSource(angle_deg=3.0, radius_rad=4.65e-3),
-        ).total()
-        light.append(float(found.ghosts[:, near].sum()))
+        ).straylight()
+        light.append(float(found.ghosts.planes[:, near].sum()))
     # of two reflections one is the sensor's: linear in its reflectance; brighter ghosts are drawn with more rays,
     # and a spot of half a pixel may move across the circle's edge (3 % met)
     assert light[2] - light[0] == pytest.approx(2 * (light[1] - light[0]), rel=0.06)

@@ -12,7 +12,7 @@ from vbnfault.camera import Camera
 from vbnfault.core.quantities import Radiance
 from vbnfault.detector import Detector, MosaicDetector, ThreeColourDetector
 from vbnfault.lens import Lens, RealLens, ThinLens, load_lens
-from vbnfault.lens.footprint import ImageFrame
+from vbnfault.lens.image_frame import ImageFrame
 
 SIZE = 48
 

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from vbnfault import Fault, FaultContext, Interval, bounds
-from vbnfault.faults.models import register, undoing_registrations
+from vbnfault.core.registry import undoing_registrations
+from vbnfault.faults.models import register
 from vbnfault.testing import check_fault
 
 with undoing_registrations(always=True):  # other tests must not meet this fault

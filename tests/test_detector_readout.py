@@ -13,18 +13,6 @@ from scipy import stats
 from vbnfault.core.errors import InputError
 from vbnfault.detector.converter import convert, transitions_dn
 from vbnfault.detector.nodes import node_of, transmission_order
-from vbnfault.detector.raw_damage import (
-    corrupted_packets,
-    dead_lines,
-    duplicated_lines,
-    lost_lines,
-    lost_node,
-    lost_packets,
-    packet_count,
-    saturated_lines,
-    shifted_lines,
-    stick_bits,
-)
 from vbnfault.detector.readout import (
     ReadoutIndividual,
     ReadoutNoise,
@@ -44,10 +32,6 @@ def flat(value: float, shape: tuple[int, int] = (40, 50)) -> np.ndarray:
 
 def draw(seed: int, shape: tuple[int, int] = (40, 50)) -> ReadoutNoise:
     return ReadoutNoise.draw(shape, np.random.default_rng([seed, 1]), np.random.default_rng([seed, 2]))
-
-
-def random_raw(shape: tuple[int, int] = (12, 10), seed: int = 1) -> np.ndarray:
-    return np.random.default_rng(seed).integers(1, 4096, shape).astype(np.uint16)
 
 
 # ------------------------------------------------------------------------------------- exact degenerate cases
@@ -322,14 +306,6 @@ def test_stuck_bits_by_hand() -> None:
     spec = ReadoutSpec(bits=4, bias_dn=0, stuck_bits=((0, 1), (3, 0)))
     # 0000 0101 1000 1101 1111 0011 → bit 0 set, bit 3 cleared
     np.testing.assert_array_equal(convert(levels, spec), [[1, 5, 1, 5, 7, 3]])
-    damaged = stick_bits(levels.astype(np.uint16), ((0, 1), (3, 0)), bits=4)
-    np.testing.assert_array_equal(damaged.raw, [[1, 5, 1, 5, 7, 3]])
-    np.testing.assert_array_equal(damaged.changed, [[True, False, True, True, True, False]])
-    assert damaged.region.all()
-    half = np.array([[True, True, True, False, False, False]])
-    damaged = stick_bits(levels.astype(np.uint16), ((0, 1), (3, 0)), bits=4, where=half)
-    np.testing.assert_array_equal(damaged.raw, [[1, 5, 1, 13, 15, 3]])
-    np.testing.assert_array_equal(damaged.region, half)
 
 
 def test_missing_codes_never_come_and_the_code_below_takes_their_range() -> None:
@@ -368,121 +344,6 @@ def test_conversion_by_transitions_is_the_plain_search(rms: float) -> None:
     np.testing.assert_array_equal(convert(levels, spec, transitions), expected)
 
 
-# ------------------------------------------------------------------------------------------------ line faults
-
-
-def test_dead_and_saturated_lines() -> None:
-    raw = random_raw()
-    raw[3, 4] = 0
-    got = dead_lines(raw, [4, 9])
-    expected = raw.copy()
-    expected[:, [4, 9]] = 0
-    np.testing.assert_array_equal(got.raw, expected)
-    np.testing.assert_array_equal(got.region.any(axis=0), np.isin(np.arange(10), [4, 9]))
-    np.testing.assert_array_equal(got.changed, got.raw != raw)
-    assert got.region[3, 4]
-    assert not got.changed[3, 4]  # it was 0 before
-    got = saturated_lines(raw, [0], "row")
-    assert (got.raw[0] == 4095).all()
-    np.testing.assert_array_equal(got.raw[1:], raw[1:])
-    assert raw[3, 4] == 0  # the argument stays
-
-
-def test_duplicated_lines_repeat_the_last_before_them() -> None:
-    raw = random_raw()
-    got = duplicated_lines(raw, [0, 3, 4, 8])
-    expected = raw.copy()
-    expected[3] = expected[4] = raw[2]
-    expected[8] = raw[7]
-    np.testing.assert_array_equal(got.raw, expected)
-    got = duplicated_lines(raw, [5], "column")
-    np.testing.assert_array_equal(got.raw[:, 5], raw[:, 4])
-
-
-def test_shifted_lines_move_along_themselves() -> None:
-    raw = random_raw()
-    got = shifted_lines(raw, [2], "row", 3, fill_dn=64)
-    np.testing.assert_array_equal(got.raw[2], [64, 64, 64, *raw[2, :7]])
-    np.testing.assert_array_equal(np.delete(got.raw, 2, 0), np.delete(raw, 2, 0))
-    got = shifted_lines(raw, [2], "column", -2, fill_dn=None)
-    np.testing.assert_array_equal(got.raw[:, 2], [*raw[2:, 2], *raw[:2, 2]])
-    assert (shifted_lines(raw, [2], "row", 99).raw[2] == 0).all()
-    assert not shifted_lines(raw, [2], "row", 0).changed.any()
-
-
-def test_a_lost_node_takes_its_whole_share() -> None:
-    raw = random_raw()
-    got = lost_node(raw, 4, 1, 64)
-    np.testing.assert_array_equal(got.raw[:6, 5:], 64)
-    np.testing.assert_array_equal(got.region, node_of(raw.shape, 4) == 1)
-    np.testing.assert_array_equal(got.raw[~got.region], raw[~got.region])
-    assert got.region.sum() == 30
-
-
-# ---------------------------------------------------------------------------------------------- lost packets
-
-
-def test_lost_packets_are_runs_of_pixels() -> None:
-    raw = random_raw((4, 10))
-    assert packet_count(raw.shape, 7) == 6
-    got = lost_packets(raw, [0, 2, 5], 7)
-    expected = raw.ravel().copy()
-    expected[:7] = expected[14:21] = expected[35:] = 0
-    np.testing.assert_array_equal(got.raw.ravel(), expected)
-    np.testing.assert_array_equal(got.changed, got.region)  # nothing was 0
-    assert got.region.sum() == 7 + 7 + 5
-    previous = lost_packets(raw, [0, 2, 3, 5], 7, "previous")
-    expected = raw.ravel().copy()
-    expected[:7] = 0
-    expected[14:21] = expected[21:28] = raw.ravel()[7:14]
-    expected[35:] = raw.ravel()[28:33]
-    np.testing.assert_array_equal(previous.raw.ravel(), expected)
-    assert not lost_packets(raw, [], 7).region.any()
-
-
-def test_lost_packets_of_four_nodes_hit_all_quadrants() -> None:
-    raw = random_raw((8, 12))
-    order = transmission_order(raw.shape, 4)
-    got = lost_packets(raw, [1], 8, order=order)
-    hit = np.zeros(raw.size, bool)
-    hit[order[8:16]] = True
-    np.testing.assert_array_equal(got.region.ravel(), hit)
-    np.testing.assert_array_equal(got.raw.ravel(), np.where(hit, 0, raw.ravel()))
-    assert set(node_of(raw.shape, 4)[got.region].tolist()) == {0, 1, 2, 3}
-
-
-def test_bits_flip_at_the_stated_rate_in_the_stated_packets() -> None:
-    raw = random_raw((200, 200))
-    got = corrupted_packets(raw, range(0, 400, 2), 100, 0.01, np.random.default_rng(1))
-    region = np.repeat(np.arange(400) % 2 == 0, 100).reshape(200, 200)
-    np.testing.assert_array_equal(got.region, region)
-    np.testing.assert_array_equal(got.raw[~region], raw[~region])
-    flips = got.raw ^ raw
-    assert flips.max() < 4096
-    per_bit = [((flips >> b) & 1).sum() for b in range(12)]
-    # binomial in each bit, 4 σ, of 20,000 pixels
-    np.testing.assert_allclose(per_bit, 200, atol=4 * math.sqrt(200))
-    np.testing.assert_array_equal(got.changed, flips > 0)
-    assert not corrupted_packets(raw, [1], 100, 0.0, np.random.default_rng(1)).changed.any()
-    inverted = corrupted_packets(raw, [1], 100, 1.0, np.random.default_rng(1))
-    np.testing.assert_array_equal(inverted.raw[0, 100:], 4095 - raw[0, 100:])
-
-
-def test_corruption_takes_as_many_variates_whatever_the_picture_and_the_rate() -> None:
-    generators = [np.random.default_rng(1) for _ in range(3)]
-    for rng, rate, value in zip(generators, (0.0, 0.5, 1.0), (0, 7, 4095), strict=True):
-        corrupted_packets(np.full((9, 9), value, np.uint16), [0, 3, 8], 10, rate, rng)
-    assert len({rng.random() for rng in generators}) == 1
-
-
-def test_lost_lines() -> None:
-    raw = random_raw()
-    got = lost_lines(raw, [0, 5, 6], fill="previous")
-    np.testing.assert_array_equal(got.raw[[0, 5, 6]], [np.zeros(10), raw[4], raw[4]])
-    np.testing.assert_array_equal(got.raw[[1, 2, 3, 4, 7]], raw[[1, 2, 3, 4, 7]])
-    assert (lost_lines(raw, [5], "column").raw[:, 5] == 0).all()
-
-
 # ----------------------------------------------------------------------------------------------------- errors
 
 
@@ -512,23 +373,12 @@ def test_a_bad_spec_is_told_in_a_sentence(values: dict, sentence: str) -> None:
 
 
 def test_bad_arguments_are_told_in_a_sentence() -> None:
-    raw = random_raw()
     for bad, sentence in (
         (lambda: read_out(np.zeros((4, 4, 3), np.float32), IDEAL), r"must be \[y, x\]"),
         (lambda: read_out(flat(0), IDEAL, draw(1, (4, 4))), r"read has shape \(4, 4\)"),
         (lambda: read_out(flat(0), IDEAL, None, ReadoutIndividual(row_e=np.zeros(3, np.float32))), "row_e"),
         (lambda: convert(flat(0), IDEAL, np.zeros(9, np.float32)), "transitions_dn"),
         (lambda: node_of((4, 4), 3), "nodes is 3"),
-        (lambda: dead_lines(raw, [10]), "lines holds 10, but must be in 0 to 9"),
-        (lambda: dead_lines(raw.astype(float), [1]), "must be uint16"),
-        (lambda: dead_lines(raw, [1], "diagonal"), "axis is 'diagonal'"),
-        (lambda: dead_lines(raw, [1], level_dn=-1), "level_dn is -1"),
-        (lambda: lost_node(raw, 2, 2), "node holds 2"),
-        (lambda: lost_packets(raw, [99], 10), "packets holds 99"),
-        (lambda: lost_packets(raw, [1], 0), "packet_px is 0"),
-        (lambda: lost_packets(raw, [1], 10, "mean"), "fill is 'mean'"),
-        (lambda: lost_packets(raw, [1], 10, order=np.arange(3)), "order has shape"),
-        (lambda: corrupted_packets(raw, [1], 10, 1.5, np.random.default_rng(1)), "bit_error_rate is 1.5"),
     ):
         with pytest.raises(InputError, match=sentence):
             bad()

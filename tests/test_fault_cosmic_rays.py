@@ -13,7 +13,7 @@ from test_faults_kit import flat_electrons, make, make_context, noisy, rng, with
 
 from vbnfault.core.quantities import Charge
 from vbnfault.detector.cosmic import stopping_power_MeV_cm2_g
-from vbnfault.detector.poisson import poisson_above_0
+from vbnfault.detector.noise import poisson_above_0
 from vbnfault.faults import FaultContext
 
 

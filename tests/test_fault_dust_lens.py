@@ -20,7 +20,9 @@ from vbnfault.core.errors import InputError
 from vbnfault.detector import ThreeColourDetector
 from vbnfault.faults import FaultContext, dust_lens
 from vbnfault.lens import RealLens, ThinLens, load_lens, paraxial_properties, scaled_to_field, stopped_down
-from vbnfault.lens.footprint import ImageFrame, beams, disc_overlap
+from vbnfault.lens.beams import beams
+from vbnfault.lens.footprint import Footprint, disc_overlap
+from vbnfault.lens.image_frame import ImageFrame
 from vbnfault.lens.rays import real_pupil_diameter_mm, trace
 
 F64 = NDArray[np.float64]
@@ -247,7 +249,7 @@ def test_footprints_are_brighter_where_rays_crowd(
     lens = real_context(name).camera.lens
     assert isinstance(lens, RealLens)
     known = beams(lens.prescription, 0.75, lens.sensor_mm)
-    table = known.on_row(surface) if surface >= 0 else known.above_sensor(0.65)
+    table = Footprint.on_row(known, surface) if surface >= 0 else Footprint.above_sensor(known, 0.65)
     footprints = table.towards(np.full((1, 1), slope), np.zeros((1, 1)))
     size = float(np.sqrt(footprints.area_mm2[0, 0] / np.pi))
     x, a = float(footprints.centre_mm[0, 0]) + off * size, radius * size
@@ -279,7 +281,7 @@ def test_between_the_places_where_it_is_told(monkeypatch: pytest.MonkeyPatch) ->
 def test_beams_are_those_of_the_imaging_lens() -> None:
     lens = real_context("nikkor_28_f2p8").camera.lens
     assert isinstance(lens, RealLens)
-    found = beams(lens.prescription, 0.8, lens.sensor_mm).on_row(0)
+    found = Footprint.on_row(beams(lens.prescription, 0.8, lens.sensor_mm), 0)
     area = found.area_mm2[0]
     assert 2 * np.sqrt(area / np.pi) == pytest.approx(lens.focal_length_mm / lens.f_number, rel=1e-3)
     # E/E(0) is the beam's area times cos⁴ and the stretch of distortion: without the latter's derivative, at small

@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 from conftest import ALL_FAULTS
 from test_faults_kit import make, make_context, noisy, noisy_electrons, with_mosaic
+from vbnfault.detector.compiled import with_luminance
 
 from vbnfault.core.errors import InputError
 from vbnfault.core.quantities import LUMINANCE, RGBI
-from vbnfault.detector.display import with_luminance
+from vbnfault.core.registry import undoing_registrations
 from vbnfault.detector.mosaic import pattern
 from vbnfault.faults import (
     MOSAIC_STEPS,
@@ -29,7 +30,6 @@ from vbnfault.faults import (
     physical_order,
     registry,
 )
-from vbnfault.faults.models import undoing_registrations
 from vbnfault.faults.planes import scale_by_intensity
 from vbnfault.testing import check_fault
 
@@ -354,7 +354,6 @@ def test_limits_of_straylight_are_those_of_scatter(model: str) -> None:
     fields = registry()["straylight"][model].__dataclass_fields__
     for key, physics in (
         ("roughness_nm", lambda value: scatter.Harvey.of_roughness(roughness_nm=value, index_step=0.5).b0),
-        ("cleanliness_level", particles.obscured_fraction),
         ("cleanliness_level", lambda value: particles.particle_scatter_fraction(value, 550.0)),
     ):
         low, high = fields[key].metadata["limits"]
@@ -375,44 +374,13 @@ def test_a_plane_of_no_light_past_the_rims_is_no_light(name: str) -> None:
     fault: Fault = make(name)
     params, light = fault.draw(context, np.random.default_rng(1)), noisy_electrons(context)
     none = dataclasses.replace(light, past_rims=np.zeros_like(light.array)).scaled(1.0)
-    assert (none.past_rims, none.rim_rows) == (None, None)
+    assert none.past_rims is None
     np.testing.assert_array_equal(act(fault, none, params, context).array, act(fault, light, params, context).array)
 
 
-def test_light_past_the_rims_in_few_rows_is_scaled_again() -> None:
+def test_light_past_the_rims_is_scaled_again() -> None:
     light = noisy_electrons(make_context(64))
     past = np.zeros_like(light.array)
     past[30:32] = 8.0
     both = dataclasses.replace(light, past_rims=past)
     np.testing.assert_array_equal(both.scaled(2.0).scaled(4.0).merged.array, both.scaled(8.0).merged.array)
-
-
-@pytest.mark.parametrize("name", OPTICAL_TEXTURES)
-def test_a_few_rows_with_the_sun_take_few_rows_of_work(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The Sun's disc does not make a fault act on a second plane, but on few rows beside the whole frame."""
-    context = make_context(128, sun=(50.0, 40.0))
-    fault: Fault = make(name)
-    params = fault.draw(context, np.random.default_rng(1))
-    light = noisy_electrons(context)
-    past = np.zeros_like(light.array)
-    past[40:42, 50:53] = 1e6
-    in_planes = dataclasses.replace(light, past_rims=past)
-    few = in_planes.scaled(1.0)
-    rows: list[int] = []
-    for hook in ("apply", "apply_to_rows"):
-        of_class = getattr(type(fault), hook)
-
-        def counted(self: Any, quantity: Any, *more: Any, of_class: Any = of_class) -> Any:
-            rows.append(len(quantity.array))
-            return of_class(self, quantity, *more)
-
-        monkeypatch.setattr(type(fault), hook, counted)
-    after = act(fault, few, params, context)
-    nested = 2 if name in ("vignetting", "optics_degradation") else 1  # one hook is made of the other
-    assert rows.count(128) == (2 if name == "vignetting" else 1)
-    assert sum(rows) - 128 * rows.count(128) <= nested * (2 + 4 * (fault.reach_rows(params) or 0))
-    assert after.rim_rows is not None
-    assert after.past_rims is None
-    expected = act(fault, in_planes, params, context)
-    np.testing.assert_array_equal(after.merged.array, expected.merged.array)
-    np.testing.assert_array_equal(after.in_planes.past_rims, expected.past_rims)

@@ -21,10 +21,9 @@ from vbnfault.body import (
     site_at,
 )
 from vbnfault.body.boulders import GroundMesh, _favour
-from vbnfault.body.fields import PLANES_STD, Points
-from vbnfault.body.octaves import Octaves
+from vbnfault.body.fields import PLANES_STD, Octaves, Points
+from vbnfault.body.geometry import vertex_normals
 from vbnfault.body.roughness import Roughness
-from vbnfault.body.shape import vertex_normals
 from vbnfault.core.errors import InputError
 from vbnfault.scene.config import load_scene
 
@@ -235,5 +234,3 @@ def test_keys_of_the_scene() -> None:
     for key, value in (("dust_slope_deg", [40.0, 20.0]), ("apron", 0.0), ("border_m", 0.0), ("strata", -1.0)):
         with pytest.raises(InputError, match=key):
             load_scene("quickstart", {f"patch.fractured.{key}": value})
-    with pytest.raises(InputError, match="joints"):
-        Fractured(joints=5.0)

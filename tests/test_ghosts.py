@@ -170,21 +170,6 @@ def test_one_side_tells_of_the_other() -> None:
         assert len(np.unique(half.radius.numpy() <= 1)) == 2
 
 
-def test_a_recorded_path_is_the_path() -> None:
-    lens = load_lens("tessar_50_f2p8")
-    made = Tracer(lens, np.array([D_NM]), routes_=[()])
-    for box, angle in (((0.0, 0.0, 5.0, 6.0), 0.02), ((1.0, 0.0, 4.0, 3.0), 0.1)):
-        rays = bundle(0, box, [np.sin(angle), 0.0, np.cos(angle)])
-        for centred in (False, True):
-            # the second time it is replayed
-            one, _, other = (made.trace(rays, 24, centred=centred, light=h, halved=h) for h in (True, False, False))
-            kept = one.radius.numpy() <= 1
-            assert kept.sum() > 100
-            for name in ("x_mm", "y_mm", "radius"):
-                a, b = (getattr(spots, name).numpy()[kept] for spots in (one, other))
-                np.testing.assert_allclose(a, b, rtol=2e-5, atol=2e-5)
-
-
 # --- the table of ghosts ----------------------------------------------------------------------------------------
 
 

@@ -10,8 +10,8 @@ import pytest
 import trimesh
 
 from vbnfault.body import Body, load_body
+from vbnfault.body.geometry import face_normals_areas
 from vbnfault.body.gravity import GRAVITATIONAL_CONSTANT, PolyhedronGravity
-from vbnfault.body.shape import face_normals_areas
 
 REAL_SHAPE = Path(__file__).parents[2] / "shared/data/shapes/67p_18k.obj"
 DENSITY = 537.8

@@ -20,7 +20,7 @@ from vbnfault.lens.straylight.bundles import Rays, Tracer
 from vbnfault.lens.straylight.irradiance import ParaxialTracer
 from vbnfault.lens.straylight.scatter import Cleanliness, hood_transmission
 from vbnfault.lens.straylight.settings import SensorGrid, StraylightSettings, SunSource
-from vbnfault.lens.straylight.total import SunlightInLens
+from vbnfault.lens.straylight.total import SunInLens
 
 try:
     llvm.find()
@@ -87,9 +87,9 @@ def test_ghosts_of_rays_past_the_hood(hooded: Prescription) -> None:
     def light(lens: Prescription, slope: float) -> tuple[float, float, float]:
         sun = SunSource(angle_deg=float(np.degrees(np.arctan(slope))), radius_rad=2e-3)
         settings = StraylightSettings(cleanliness=Cleanliness(roughness_nm=1.0, level=100))
-        of = SunlightInLens.of(lens, bands=Bands.lines(550.0), sensor=sensor, sun=sun, settings=settings)
-        total = of.total()
-        return tuple(float(v.sum()) for v in (total.ghosts, total.glare, total.veil))  # type: ignore[return-value]
+        of = SunInLens(lens=lens, bands=Bands.lines(550.0), sensor=sensor, sun=sun, settings=settings)
+        parts = of.straylight().parts()
+        return tuple(float(parts[name].sum()) for name in ("ghosts", "glare", "veil"))  # type: ignore[return-value]
 
     within, plain = light(hooded, 0.9 * full), light(bare, 0.9 * full)
     assert within == pytest.approx(plain, rel=1e-6)

@@ -23,8 +23,8 @@ from vbnfault.lens import (
     RealLens,
     ThinLens,
 )
-from vbnfault.lens.footprint import DEFAULT_LENS
 from vbnfault.lens.glass import D_NM
+from vbnfault.lens.image_frame import DEFAULT_LENS
 from vbnfault.pipeline.record import to_sample
 from vbnfault.pipeline.spec import SceneExposure, SceneLight
 from vbnfault.pipeline.stars import _rate_with

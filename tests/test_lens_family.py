@@ -11,7 +11,7 @@ from test_lens import PUBLISHED
 
 from vbnfault.core.errors import InputError
 from vbnfault.lens import load_lens, paraxial_properties
-from vbnfault.lens.family import relative
+from vbnfault.lens.adapt import relative
 from vbnfault.lens.prescription_file import to_table, write_lens
 
 

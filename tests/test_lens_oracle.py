@@ -19,8 +19,8 @@ from vbnfault.core.spectra import Bands
 from vbnfault.lens import Prescription, load_lens, paraxial_properties, parse_lens
 from vbnfault.lens.coating import mean_reflectance
 from vbnfault.lens.glass import C_NM, D_NM, F_NM, from_abbe
-from vbnfault.lens.rays import ghost, trace
-from vbnfault.lens.straylight.paraxial import paraxial_ghosts, transmittance
+from vbnfault.lens.rays import ghost, trace, transmittance
+from vbnfault.lens.straylight.paraxial import paraxial_ghosts
 
 if TYPE_CHECKING:
     import sequential_oracle as oracle

@@ -18,7 +18,7 @@ from vbnfault.pipeline.exposure import exposure_s, foreseen_exposure_s, meter
 from vbnfault.pipeline.rendering import describe, render_view
 from vbnfault.pipeline.resolve import resolve
 from vbnfault.reflectance.hapke import hapke_at
-from vbnfault.render import cells as cell_module
+from vbnfault.render import light as cell_module
 from vbnfault.render.description import RenderInput
 from vbnfault.render.sampling import Pixels, Strata, limb_sets
 from vbnfault.scene import config

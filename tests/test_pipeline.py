@@ -212,7 +212,7 @@ def test_worn_coatings_raise_the_ghosts_of_the_same_picture_alone() -> None:
 def test_light_is_traced_once_for_each_state_of_the_coatings(monkeypatch: pytest.MonkeyPatch) -> None:
     """Straylight depends on the coatings' loss; the shadows of dust do not, so they are computed once."""
     from vbnfault.faults import dust_lens
-    from vbnfault.lens.straylight.total import SunlightInLens
+    from vbnfault.lens.straylight.total import SunInLens
 
     calls: Counter[str] = Counter()
 
@@ -225,7 +225,7 @@ def test_light_is_traced_once_for_each_state_of_the_coatings(monkeypatch: pytest
 
         monkeypatch.setattr(module, name, count)
 
-    counted(SunlightInLens, "in_channels")
+    counted(SunInLens, "straylight")
     counted(dust_lens, "_shadows")
     faults = {
         "straylight": {"model": "paraxial"},
@@ -248,7 +248,7 @@ def test_light_is_traced_once_for_each_state_of_the_coatings(monkeypatch: pytest
             whole.append(dict(calls))
     # with the worn coatings, and with whole ones where the degradation is left out
     assert whole
-    assert all(count == {"in_channels": 2, "_shadows": 1} for count in whole), whole
+    assert all(count == {"straylight": 2, "_shadows": 1} for count in whole), whole
 
 
 def test_a_redrawn_fault_leaves_the_draws_and_results_of_the_others(monkeypatch: pytest.MonkeyPatch) -> None:

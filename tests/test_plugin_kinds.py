@@ -17,7 +17,6 @@ from test_plugins import GLINT, nothing_stays_loaded, plugin, run, scene_file
 from vbnfault import dataset, faults, pipeline, reflectance, testing
 from vbnfault.core.errors import InputError
 from vbnfault.detector import effects
-from vbnfault.faults import models
 from vbnfault.scene import config
 
 __all__ = ["nothing_stays_loaded"]  # a fixture of each test here
@@ -159,7 +158,7 @@ def defined(kind: str) -> Any:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_two_files_that_define_one_name_are_refused_together_only(tmp_path: Path, kind: str) -> None:
+def test_two_files_that_define_one_name_are_refused(tmp_path: Path, kind: str) -> None:
     text, name = KINDS[kind]
     if kind == "effect":
         plugin(tmp_path, GROUND, "my_a.py")
@@ -173,16 +172,11 @@ def test_two_files_that_define_one_name_are_refused_together_only(tmp_path: Path
         config.load_scene(both)
     assert "\n" not in str(caught.value)
 
-    def load(*names: str) -> Any:
-        config.load_scene(scene_file(tmp_path, *names, faults=""))
-        return defined(kind)
-
-    first, second = load("my_a.py"), load("my_b.py")  # each alone, and the scene in use decides
-    assert first != second
-    assert load("my_a.py") == first
-    with pytest.raises(InputError, match=sentence):  # also where both have been loaded before
-        load("my_a.py", "my_b.py")
-    assert load("my_b.py") == second
+    config.load_scene(scene_file(tmp_path, "my_a.py", faults=""))
+    first = defined(kind)
+    with pytest.raises(InputError, match=sentence):  # a process keeps what it has loaded
+        config.load_scene(scene_file(tmp_path, "my_b.py", faults=""))
+    assert defined(kind) == first
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -228,8 +222,7 @@ def test_one_file_is_one_definition_however_it_is_loaded(
     imported = sys.modules[name]
     load()
     if kind == "fault":
-        assert models.is_registered(imported.Glint)
-        assert models.registry()["glint"]["square"] is imported.Glint
+        testing.check_fault(imported.Glint, examples=1)
     if kind == "effect":
         testing.check_effect(imported.Pedestal, examples=1)
     load()

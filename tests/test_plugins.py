@@ -14,8 +14,8 @@ from conftest import small_scene
 
 from vbnfault import dataset, faults, pipeline, store
 from vbnfault.core.errors import InputError
-from vbnfault.detector import effects
-from vbnfault.faults import models, plugins
+from vbnfault.core.registry import undoing_registrations
+from vbnfault.faults import plugins
 from vbnfault.scene import config
 
 GLINT = '''
@@ -57,9 +57,9 @@ class Glint(Fault):
 def nothing_stays_loaded() -> Iterator[None]:
     """Forget the plug-ins of a test, and its modules."""
     modules = set(sys.modules)
-    with models.undoing_registrations(always=True):
+    with undoing_registrations(always=True):
         yield
-        plugins.forget_all()
+        plugins.loaded.clear()
     for name in set(sys.modules) - modules:
         if name.startswith(("my_", "vbnfault_plugin_")):
             del sys.modules[name]
@@ -288,48 +288,6 @@ def test_a_plug_in_of_another_scene_has_to_be_named(tmp_path: Path) -> None:
     pipeline.configure_faults(scene)
     with pytest.raises(InputError, match=r"faults.glint.model = 'square': comes from the plug-in my_glint.py"):
         pipeline.configure_faults(scene.model_copy(update={"plugins": ()}))
-    # two scenes may define the same class; the one that is used last holds
-    (tmp_path / "b").mkdir()
-    plugin(tmp_path / "b", GLINT.replace('"square"', '"disc"'), "my_other.py")
-    other = config.load_scene(scene_file(tmp_path / "b", "my_other.py"))
-    assert pipeline.configure_faults(other)["glint"].model == "disc"
-    assert pipeline.configure_faults(scene)["glint"].model == "square"
-    both = config.Scene.model_validate(scene.model_dump() | {"plugins": scene.plugins + other.plugins})
-    with pytest.raises(InputError, match=r"my_other.py': fault model glint/disc: default = True, but glint/square"):
-        pipeline.configure_faults(both)
-
-
-@pytest.mark.parametrize("kind", ["fault", "effect"])
-def test_a_plug_in_of_another_scene_has_no_place_in_the_order(tmp_path: Path, kind: str) -> None:
-    """What a scene may name by `after`, and what it is refused for, do not depend on scenes loaded before it."""
-    text, own, root = {"fault": (GLINT, "glint", "straylight"), "effect": (EFFECT, "afterglow", "dark_current")}[
-        kind
-    ]
-
-    def write(name: str, after: str, known: str | None = None) -> None:
-        changed = text.replace(f'"{own}"', f'"{name}"').replace(f'"{root}"', f'"{after}"')
-        plugin(tmp_path, changed if known is None else f"# {name} is {known}\n", f"my_{name}.py")
-
-    def load(*names: str) -> None:
-        config.load_scene(scene_file(tmp_path, *(f"my_{name}.py" for name in names), faults=""))
-
-    def order() -> list[str]:
-        known = faults.physical_order(faults.registry()) if kind == "fault" else effects.order()
-        return [name for name in known if name in ("one", "two", "three")]
-
-    write("one", root)
-    write("two", "one")
-    write("three", "one")
-    load("one", "two")
-    assert order() == ["one", "two"]
-    with pytest.raises(InputError, match=r"my_three.py': .* three: after = 'one': there is none of this name"):
-        load("three")  # a fresh process knows no `one`
-    load("two", "one")
-    write("one", root, known="gone")
-    load("one")  # `two` of the earlier scene comes after nothing now, which is not this scene's fault
-    assert order() == []
-    with pytest.raises(InputError, match=r"two: after = 'one': there is none of this name"):
-        load("one", "two")
 
 
 # --- broken plug-ins ----------------------------------------------------------------------------------------

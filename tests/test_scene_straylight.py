@@ -20,18 +20,18 @@ from vbnfault.core.quantities import Electrons, Radiance
 from vbnfault.core.spectra import Bands
 from vbnfault.faults import FaultContext, from_dict
 from vbnfault.lens import ThinLens, load_lens, paraxial_properties
-from vbnfault.lens.halo import Halo
 from vbnfault.lens.prescription import Prescription
 from vbnfault.lens.straylight import ghost_response
 from vbnfault.lens.straylight.bundles import Tracer
 from vbnfault.lens.straylight.ghosts import boxes, lit_cells, traced_ghosts
 from vbnfault.lens.straylight.paraxial import paraxial_ghosts
 from vbnfault.lens.straylight.scatter import Cleanliness
-from vbnfault.lens.straylight.scene import PointSources, RenderGrid, SceneInLens, lit_fraction, surrounding_grids
-from vbnfault.lens.straylight.scene_diffraction import POINT_SPREAD_PX, starburst_of_source, wing_fraction
+from vbnfault.lens.straylight.scene import PointSources, RenderGrid, SceneInLens, surrounding_grids
+from vbnfault.lens.straylight.scene_convolution import POINT_SPREAD_PX, starburst_of_source, wing_fraction
 from vbnfault.lens.straylight.settings import Baffle, DirectPath, SensorGrid, StraylightSettings, SunSource
 from vbnfault.lens.straylight.starburst import StarburstFrame
-from vbnfault.lens.straylight.total import SunlightInLens
+from vbnfault.lens.straylight.total import SunInLens
+from vbnfault.lens.thin import Halo
 from vbnfault.pipeline.record import to_sample
 from vbnfault.scene import config
 
@@ -137,16 +137,16 @@ def scattered_of_every_pixel(
         sun = SunSource(
             angle_deg=float(np.degrees(np.arctan(np.hypot(x, y)))), azimuth_deg=float(np.degrees(np.arctan2(y, x)))
         )
-        light = SunlightInLens.of(
-            scene.lens,
+        light = SunInLens(
+            lens=scene.lens,
             bands=scene.bands,
             sensor=scene.sensor,
             sun=sun,
             settings=scene.settings,
             path=DirectPath(transmittance=scene.passed, admitted_mm2=1.0),
-        )
-        glare += irradiance[:, None, None] * light.glare()[0]
-        veil += irradiance[:, None, None] * light.veil()[0]
+        ).straylight()
+        glare += irradiance[:, None, None] * light.parts()["glare"]
+        veil += irradiance[:, None, None] * light.parts()["veil"]
     return glare, veil
 
 
@@ -190,11 +190,11 @@ def wings_of(scene: SceneInLens, points: list[tuple[float, float, F64]], width_p
             radius_rad=float(np.pi**-0.5 * width_px / scene.render.focal_px),
         )
         path = DirectPath(transmittance=scene.passed, admitted_mm2=1.0)
-        light = SunlightInLens.of(scene.lens, bands=scene.bands, sensor=scene.sensor, sun=sun, path=path)
+        light = SunInLens(lens=scene.lens, bands=scene.bands, sensor=scene.sensor, sun=sun, path=path).straylight()
         shorter = 1 / np.sqrt(1 + x * x + y * y)
         away = np.hypot(side * cosine - x * shorter, side[:, None] * cosine - y * shorter)
         fade = np.clip((away * efl_mm / pitch - POINT_SPREAD_PX + 1) / 2, 0, 1)
-        expected += irradiance[0] * light.starburst()[0][0] * fade
+        expected += irradiance[0] * light.starburst.planes[0] * fade
     return expected
 
 
@@ -230,7 +230,7 @@ def test_the_stop_diffracts_light_of_points() -> None:
     assert np.abs(both - apart).sum() < 0.01 * apart.sum()  # where each of them is cut off at 0, the sum is not
     tube = Baffle(length_mm=18.0, radius_mm=8.0)
     behind_tube = replace(scene, settings=replace(scene.settings, baffle=tube))
-    (lit,) = lit_fraction(scene.lens, tube, np.array([np.hypot(0.3, 0.2)]))
+    (lit,) = tube.lit_fraction(scene.lens, np.array([np.hypot(0.3, 0.2)]))
     assert 0.1 < lit < 0.9
     np.testing.assert_allclose(behind_tube.starburst([(one, light)], np.eye(1))[0], lit * made, rtol=1e-5)
 
@@ -530,7 +530,7 @@ def scene_lost(where: FaultContext, lens: Path, **keys: Any) -> F64:
     """The fraction of the image that becomes straylight, with diffraction unless `keys` say otherwise."""
     given = {"model": "traced", "lens": str(lens), "sources": "scene", "scene_diffraction": True, **keys}
     fault = from_dict("straylight", given, source="test.toml")
-    return np.asarray(fault.scene_lost(fault.draw_state(np.random.default_rng(3)), where))
+    return np.asarray(fault.scene_lost(fault.draw_state(where, np.random.default_rng(3)), where))
 
 
 def test_the_scenes_diffraction_is_off_unless_asked_for(singlet_file: Path) -> None:
@@ -539,9 +539,9 @@ def test_the_scenes_diffraction_is_off_unless_asked_for(singlet_file: Path) -> N
     plain = injected(where, grey, singlet_file, sources="scene")[0]
     wings, fault = injected(where, grey, singlet_file, sources="scene", scene_diffraction=True)
     assert "scene_diffraction" not in injected(where, grey, singlet_file, sources="scene")[1].draw_state(
-        np.random.default_rng(3)
+        where, np.random.default_rng(3)
     )
-    assert fault.draw_state(np.random.default_rng(3))["scene_diffraction"] is True
+    assert fault.draw_state(where, np.random.default_rng(3))["scene_diffraction"] is True
     assert wings.mean() > plain.mean()  # the lit disc is far brighter than the grey image
     assert (wings > 0.9 * plain).all()  # which loses some percent at most
     lost = scene_lost(where, singlet_file)

@@ -19,10 +19,9 @@ import vbnfault
 from vbnfault.cli import app
 from vbnfault.cli.options import overrides as read_overrides
 from vbnfault.core.errors import InputError, VbnfaultError
-from vbnfault.core.registry import DeclarationError
+from vbnfault.core.registry import DeclarationError, undoing_registrations
 from vbnfault.dataset.progress import Progress
 from vbnfault.faults import Fault, Levels, Severity, SeverityTable, from_dict, number, read_table, registry
-from vbnfault.faults.models import undoing_registrations
 from vbnfault.lens.thin import cos4_map
 from vbnfault.study import severity, severity_views
 from vbnfault.study.severity import Criterion, levels_of

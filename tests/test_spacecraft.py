@@ -224,46 +224,25 @@ def test_wrong_files(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("settings", "says"),
     [
-        ({"unit": "km"}, "unit must be one of m, cm, mm; got 'km'"),
         ({"materials": {"wng": 0.5}}, "spacecraft material 'wng': no such name; the vehicle has bus, cells, "),
         (
             {"materials": {"wing": "chrome"}},
             "spacecraft material 'wing' = 'chrome': must be a grey value 0 to 1, a",
         ),
-        ({"materials": {"wing": 1.5}}, "spacecraft material 'wing' = 1.5: a grey value must be 0 to 1"),
-        ({"materials": {"wing": True}}, "a grey value must be 0 to 1"),
-        ({"default_material": float("nan")}, "spacecraft material 'default' = nan"),
-        ({"materials": {"wing": {"value": [1]}}}, "needs the keys wavelength_nm and value, got value"),
-        ({"materials": {"wing": {"wavelength_nm": [400, 500], "value": [0.1]}}}, "lists of equal length"),
-        (
-            {"materials": {"wing": {"wavelength_nm": [500, 400], "value": [0.1, 0.2]}}},
-            "must be above 0 and increase",
-        ),
-        ({"materials": {"wing": {"wavelength_nm": [400], "value": [1.2]}}}, r"value = \[1.2\]: must be 0 to 1"),
-        ({"materials": {"wing": {"wavelength_nm": ["red"], "value": [1]}}}, "must be lists of numbers"),
         (
             {"poses": {"leg": HingePose(hinge_B_m=(0, 0, 0), axis_B=(1, 0, 0))}},
             "spacecraft pose 'leg': no such name; the vehicle has bus, panel, wing, wing/panel, wing/yoke, yoke",
         ),
-        ({"placement": ModelPlacement(yaw_deg=float("inf"))}, "placement has numbers that are not finite"),
-        (
-            {"placement": ModelPlacement(translation_B_m=(0, 0, float("nan")))},
-            "placement has numbers that are not finite",
-        ),
     ],
 )
 def test_refused_settings(obj: Path, settings: dict[str, Any], says: str) -> None:
-    with np.errstate(invalid="ignore"), pytest.raises(InputError, match=says):
+    with pytest.raises(InputError, match=says):
         load_spacecraft(obj, **settings)
 
 
 def test_refused_poses() -> None:
     with pytest.raises(InputError, match=r"axis = \[0, 0, 0\]"):
         HingePose(hinge_B_m=(0, 0, 0), axis_B=(0, 0, 0))
-    with pytest.raises(InputError, match="finite numbers"):
-        HingePose(hinge_B_m=(0, 0, 0), axis_B=(0, 0, 1), angle_deg=float("nan"))
-    with pytest.raises(InputError, match="finite numbers"):
-        HingePose(hinge_B_m=(0, 0), axis_B=(0, 0, 1))  # type: ignore[arg-type]
 
 
 # ------------------------------------------------------------------------------------ poses
@@ -353,16 +332,29 @@ def test_merged_mesh(obj: Path) -> None:
 # ------------------------------------------------------------------------------------ the default vehicle
 
 
-POSES: list[dict[str, float]] = [
-    {},
-    {"solar_array_deg": -90},
-    {"solar_array_deg": 37, "antenna_deg": -40, "leg_fold_deg": 100},
-]
+LEGS = {
+    f"leg_{at}": 1.0 if "front" in at else -1.0 for at in ("front_left", "front_right", "back_left", "back_right")
+}
+
+
+def posed(**angles_deg: float) -> Spacecraft:
+    """The default vehicle with joints turned, by the beginnings of their names; front and hind legs fold apart."""
+    rest = spacecraft.default_spacecraft()
+    turns = {
+        name: replace(hinge, angle_deg=LEGS.get(name, 1.0) * angle)
+        for start, angle in angles_deg.items()
+        for name, hinge in rest.hinges.items()
+        if name.startswith(start)
+    }
+    return rest.posed(turns)
+
+
+POSES: list[dict[str, float]] = [{}, {"solar": -90}, {"solar": 37, "antenna": -40, "leg": 100}]
 
 
 @pytest.mark.parametrize("angles", POSES)
 def test_default_parts_are_closed(angles: dict[str, float]) -> None:
-    for part in spacecraft.default_spacecraft(**angles).parts:
+    for part in posed(**angles).parts:
         mesh = trimesh.Trimesh(part.vertices_B_m, part.faces, process=False)
         assert mesh.is_watertight, part.name
         assert mesh.is_winding_consistent, part.name
@@ -372,7 +364,7 @@ def test_default_parts_are_closed(angles: dict[str, float]) -> None:
 
 @pytest.mark.parametrize("angles", POSES)
 def test_default_keeps_clear_of_the_pupil(angles: dict[str, float]) -> None:
-    mesh = spacecraft.default_spacecraft(**angles).merged()
+    mesh = posed(**angles).merged()
     near = np.linalg.norm(mesh.vertices_B_m, axis=1) < 0.3
     assert (mesh.vertices_B_m[near, 2] < -0.009).all()  # the barrel alone, behind
     assert mesh.blocked_fraction(65.0, 32) < 0.03
@@ -395,7 +387,7 @@ def test_what_the_camera_sees_of_the_default_vehicle() -> None:
 
 def test_default_poses() -> None:
     def normal(angle_deg: float) -> np.ndarray:
-        parts = {p.name: p for p in spacecraft.default_spacecraft(solar_array_deg=angle_deg).parts}
+        parts = {p.name: p for p in posed(solar=angle_deg).parts}
         cells, panel = (parts[f"solar_array_left/{n}"].vertices_B_m.mean(axis=0) for n in ("cells", "panel"))
         return (cells - panel) / np.linalg.norm(cells - panel)
 
@@ -403,7 +395,7 @@ def test_default_poses() -> None:
     np.testing.assert_allclose(normal(-90), [0, 0, 1], atol=1e-9)
 
     def pads(angle_deg: float) -> dict[str, np.ndarray]:
-        parts = spacecraft.default_spacecraft(leg_fold_deg=angle_deg).parts
+        parts = posed(leg=angle_deg).parts
         return {p.name: p.vertices_B_m.mean(axis=0) for p in parts if p.name.endswith("footpad")}
 
     deployed, folded = pads(0), pads(90)

@@ -30,7 +30,7 @@ from vbnfault.lens import (
 from vbnfault.lens.coating import mean_reflectance
 from vbnfault.lens.straylight.scatter import Cleanliness
 from vbnfault.lens.straylight.settings import DirectPath, GhostSettings, SensorGrid, StraylightSettings, SunSource
-from vbnfault.lens.straylight.total import SunlightInLens
+from vbnfault.lens.straylight.total import SunInLens, SunStraylight
 from vbnfault.output import flare_images
 
 try:
@@ -64,6 +64,13 @@ ABSORBING: dict[str, Any] = {
 def flux(layer: NDArray[Any], pitch_mm: float) -> F64:
     """Of every band, over the frame, mm²."""
     return np.asarray(layer.sum(axis=(1, 2), dtype=np.float64) * pitch_mm**2)
+
+
+def beyond_mm2(light: SunStraylight) -> F64:
+    """What leaves the frame; the veil falls as cos⁴, whose integral over the plane is π f²."""
+    layout = light.layout
+    veil = np.pi * layout.efl_mm**2 - layout.cos4.sum(dtype=np.float64) * layout.pitch_mm**2
+    return np.asarray(light.starburst.beyond_mm2 + light.glare_beyond_mm2 + light.veil * veil)
 
 
 # --- the direct image --------------------------------------------------------------------------------------------
@@ -149,8 +156,8 @@ def test_starburst_glare_and_veil_come_from_the_direct_light(sun_deg: float) -> 
     admitted = np.pi / 4 * optics.entrance_pupil_diameter_mm**2 * np.cos(np.radians(sun_deg)) * transmitted(lens)
     books = []
     for size in (SIZE, 9 * SIZE):
-        light = SunlightInLens.of(
-            lens,
+        light = SunInLens(
+            lens=lens,
             bands=Bands.lines(*NODES),
             sensor=SensorGrid(shape=(size, size), pitch_mm=pitch),
             sun=SunSource(angle_deg=sun_deg, azimuth_deg=20.0, radius_rad=spectra.sun_angular_radius_rad(1.0)),
@@ -158,20 +165,20 @@ def test_starburst_glare_and_veil_come_from_the_direct_light(sun_deg: float) -> 
                 ghosts=GhostSettings(model="paraxial"), cleanliness=Cleanliness(level=300.0), veil_fraction=0.02
             ),
         )
-        found = light.total()
-        clear = light.clear_light(RATES)
-        planes, left_of_it = light.in_channels(RATES, clear, light.glare_samples(), exposure_s=0.5)
+        found = light.straylight()
+        parts, in_channels = found.parts(), light.straylight(RATES)
         # 4e-6: each value is a sum of 4 parts, rounded to 6e-8 some ten times
-        expected = 0.5 * RATES[:, None, None] * found.total.astype(np.float64)
-        np.testing.assert_allclose(planes, expected, rtol=4e-6)
-        np.testing.assert_allclose(left_of_it, found.direct_fraction, rtol=1e-6)
-        strayed = sum(flux(layer, pitch) for layer in (found.starburst, found.glare, found.veil))
-        books.append((strayed, found.beyond_mm2, found.direct_fraction))
+        expected = 0.5 * RATES[:, None, None] * sum(layer.astype(np.float64) for layer in parts.values())
+        np.testing.assert_allclose(in_channels.total(0.5), expected, rtol=4e-6)
+        np.testing.assert_allclose(in_channels.direct_fraction, found.direct_fraction, rtol=1e-6)
+        for name, of_part in in_channels.flux_mm2.items():
+            np.testing.assert_allclose(of_part, RATES * flux(parts[name], pitch), rtol=1e-5)
+        strayed = sum(flux(parts[name], pitch) for name in ("starburst", "glare", "veil"))
+        beyond = beyond_mm2(found)
+        books.append((strayed, beyond, found.direct_fraction))
         # 1e-6: sums of float32
-        np.testing.assert_allclose(
-            found.direct_fraction * admitted + strayed + found.beyond_mm2, admitted, rtol=1e-5
-        )
-        assert (flux(found.ghosts, pitch) < admitted * (1 / transmitted(lens) - 1)).all()
+        np.testing.assert_allclose(found.direct_fraction * admitted + strayed + beyond, admitted, rtol=1e-5)
+        assert (flux(parts["ghosts"], pitch) < admitted * (1 / transmitted(lens) - 1)).all()
     (near, beyond, left), (wide, farther, left_again) = books
     assert (beyond > 2 * farther).all()
     np.testing.assert_allclose(near + beyond, wide + farther, atol=1e-3 * admitted.min())
@@ -249,8 +256,8 @@ def test_a_frame_with_all_straylight_holds_what_enters(camera: str, sun_deg: flo
     assert where.sun_xy_px is not None
     nm = spectra.fine_nodes_nm(NODES)
     sensed = where.camera.detector.electron_rates(nm) * spectra.solar_irradiance_W_m2_nm(nm)
-    found = SunlightInLens.of(
-        lens,
+    found = SunInLens(
+        lens=lens,
         bands=Bands.of(nm, sensed),
         sensor=SensorGrid(shape=where.shape, pitch_mm=pitch_mm),
         sun=SunSource(
@@ -264,10 +271,10 @@ def test_a_frame_with_all_straylight_holds_what_enters(camera: str, sun_deg: flo
             admitted_mm2=float(area[0] * np.cos(np.radians(sun_deg))),
             beam_fraction=float(area[0] / area[1]),
         ),
-    ).total()
+    ).straylight()
     to_e = np.trapezoid(sensed, nm, axis=1) * where.camera.exposure_s / pitch_mm**2
-    gone = to_e * found.beyond_mm2
-    ghosts = to_e * flux(found.ghosts, pitch_mm)
+    gone = to_e * beyond_mm2(found)
+    ghosts = to_e * found.ghosts.flux_mm2
     total = after.past_rims.sum(axis=(0, 1), dtype=np.float64) + gone - scene_e * (1 - kept) * caught
     paid = ghosts if camera == "real" else 0 * ghosts
     np.testing.assert_allclose(total - paid, sun_e, rtol=1e-3)
@@ -388,7 +395,7 @@ def test_the_sun_in_a_build_is_vignetted_once() -> None:
     admitted = weights.sum(axis=1) * area * cosine * context.camera.exposure_s
     development = Development(exposure=exposure, context=context, rng=spec.rng)
     draws = draw_faults(spec, development, ["vignetting"], {}, attempt=0)
-    plain, dimmed = (development.signal(draws, names).in_planes for names in ([], ["vignetting"]))
+    plain, dimmed = (development.signal(draws, names) for names in ([], ["vignetting"]))
     assert plain.past_rims is not None
     assert dimmed.past_rims is not None
     # the disc's image is exact in total; float32 sums

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from vbnfault.lens import RealLens, load_lens, parse_lens, scaled_to_field
-from vbnfault.lens.footprint import ImageFrame
+from vbnfault.lens.image_frame import ImageFrame
 from vbnfault.lens.streaks import Streaks, drawn, inside, pupil_support
 
 F64 = NDArray[np.float64]

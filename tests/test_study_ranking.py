@@ -157,9 +157,9 @@ def test_a_view_is_rendered_once_for_all_faults_and_a_fault_that_cannot_act_has_
     assert all(np.isnan(cost) for cost in costs["straylight"].values())  # the camera looks away from the Sun
     for value in values[1:]:
         assert costs[value]["centroid_shift_px"] > 0, value
-    scene_of = made.factors.scene_of(5, "", (("fault", "broken_lines"),))
-    assert scene_of.faults == {"broken_lines": {"model": "texture", "count": [9, 9]}}  # the scene's own bounds
-    assert made.factors.scene_of(5, "", ()).faults == {}
+    chosen = made.scene_of(5, "", (("fault", "broken_lines"),))
+    assert chosen.scene.faults == {"broken_lines": {"model": "texture", "count": [9, 9]}}  # the scene's own bounds
+    assert made.scene_of(5, "", ()).scene.faults == {}
 
 
 def test_a_key_of_any_chosen_fault_is_read(tmp_path: Path) -> None:

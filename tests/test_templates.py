@@ -14,10 +14,10 @@ from typer.testing import CliRunner
 from vbnfault import cli, dataset, store
 from vbnfault.core.errors import InputError
 from vbnfault.core.quantities import Electrons
+from vbnfault.core.registry import undoing_registrations
 from vbnfault.detector import MosaicDetector, load_sensor
 from vbnfault.detector.chain import Device
 from vbnfault.faults import plugins
-from vbnfault.faults.models import undoing_registrations
 from vbnfault.lens import load_lens, paraxial_properties
 from vbnfault.output import template_files
 from vbnfault.output.template_files import write_template
@@ -88,7 +88,7 @@ def undone() -> Iterator[None]:
     """What a plug-in has registered is gone after the test."""
     with undoing_registrations(always=True):
         yield
-        plugins.forget_all()
+        plugins.loaded.clear()
 
 
 @pytest.mark.usefixtures("undone")

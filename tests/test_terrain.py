@@ -12,9 +12,8 @@ from ground_kit import deviation_over_law, ground_of
 
 from vbnfault.body import Body, Patch, PatchSpec, Site, build_patch, choose_sites, load_body, relief, site_at
 from vbnfault.body.fields import GRADIENT_STD, Points
-from vbnfault.body.patch import _roughness
-from vbnfault.body.roughness import Roughness, deviogram, mean_edge_m, model_roughness
-from vbnfault.body.shape import vertex_normals
+from vbnfault.body.geometry import mean_edge_m, vertex_normals
+from vbnfault.body.roughness import Roughness, deviogram, model_roughness
 from vbnfault.core import llvm
 
 FINE = {"seed": 7, "facet_m": 0.5, "radius_m": 40.0, "min_boulder_m": 0.8, "max_triangles": 400_000}
@@ -104,12 +103,12 @@ def test_deviogram_of_a_known_surface() -> None:
 
 
 def test_model_law_is_anchored_on_the_model(body: Body) -> None:
-    law, edge = model_roughness(body), mean_edge_m(body.vertices_m, body.faces)
+    law, edge = model_roughness(body.vertices_m, body.faces), mean_edge_m(body.vertices_m, body.faces)
     assert 1.0 < law.baseline_m / edge < 2.0
     assert 0.5 <= law.hurst <= 1.0
     at = deviogram(body.vertices_m, vertex_normals(body.vertices_m, body.faces), np.array([law.baseline_m]))[0]
     assert law.deviation_m == pytest.approx(at, rel=1e-9)
-    assert _roughness(body)[0] == law
+    assert body.roughness == law
     assert float(Roughness(deviation_m=2.0, baseline_m=8.0, hurst=0.5).deviation_at(2.0)) == pytest.approx(1.0)
 
 

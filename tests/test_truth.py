@@ -20,9 +20,8 @@ from vbnfault.core import frames
 from vbnfault.detector import ThreeColourDetector
 from vbnfault.lens import RealLens, load_lens, scaled_to_field
 from vbnfault.lens.aperture import stopped_down
-from vbnfault.lens.distortion import fitted
 from vbnfault.lens.glass import D_NM
-from vbnfault.lens.mapping import chief_heights_mm
+from vbnfault.lens.mapping import chief_heights_mm, fitted
 from vbnfault.lens.prescription import Prescription
 from vbnfault.scene import config
 

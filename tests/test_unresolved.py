@@ -16,8 +16,7 @@ from test_render import scene as render_scene
 
 from vbnfault import pipeline, render
 from vbnfault.body import ellipsoid
-from vbnfault.core.fine_light import splat
-from vbnfault.core.quantities import BODY
+from vbnfault.core.quantities import BODY, splat
 from vbnfault.render.description import RenderInput, View
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))

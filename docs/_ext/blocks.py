@@ -187,21 +187,21 @@ def _accept(block: Block) -> None:
 @contextlib.contextmanager
 def _own_modules(folder: Path) -> Iterator[None]:
     """Let Python import the modules that a page writes; forget them, and the classes that they registered."""
-    from vbnfault.core import registry
-    from vbnfault.faults import models, plugins
+    from vbnfault.core.registry import undoing_registrations
+    from vbnfault.faults import plugins, registry
 
-    models.registry()
+    registry()
     before = set(sys.modules)
     sys.path.insert(0, str(folder))
     try:
-        yield
+        with undoing_registrations(always=True):
+            yield
     finally:
         sys.path.remove(str(folder))
-        plugins.forget_all()
+        plugins.loaded.clear()
         for name in set(sys.modules) - before:
             origin = getattr(sys.modules[name], "__file__", None) or ""
             if origin.startswith(str(folder)):
-                registry.forget(name)
                 del sys.modules[name]
 
 

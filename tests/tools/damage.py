@@ -44,7 +44,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from synthetic import fake_sample, make_spec
 
 from vbnfault import store as st
-from vbnfault.body import Body, cache, choose_sites
+from vbnfault.body import Body, choose_sites
+from vbnfault.body import patch as cache
 from vbnfault.body.patch import build_patch
 from vbnfault.body.spec import PatchSpec
 from vbnfault.core import whole_files

@@ -12,9 +12,9 @@ from scipy.spatial import cKDTree
 
 from ..core.llvm import backend
 from .fields import GRADIENT_STD, Points
+from .geometry import Float64, Int32, face_centres, face_normals_areas
 from .noise import noise_key
 from .refine import split
-from .shape import Float64, Int32, face_centres, face_normals_areas
 from .spec import INDEX, PER_KM2, PatchSpec
 
 REFERENCE_M = 7.0

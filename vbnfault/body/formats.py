@@ -11,7 +11,7 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from typing import Literal
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from ..core import spice
 from ..core.errors import InputError
+from ..core.meshes import fans, joined, read_obj
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
@@ -77,8 +78,8 @@ def read_shape(path: Path, data: bytes) -> RawShape:
     data = _without_comments(data)
     if not data.translate(_FORTRAN).strip():
         raise InputError(f"{source}: line 1: expected vertices and facets, found nothing.")
-    if re.match(rb"\s*[A-Za-z]", data):
-        return RawShape(*read_vertex_facet_letters(data, source))
+    if re.search(rb"(?m)^[ \t]*v[ \t]", data):  # lines `v x y z` and `f a b c`, as in the PDS's radar shapes
+        return RawShape(*joined(read_obj(_clean(data), source, may_count_from_0=True)))
     if path.suffix.lower() == ".icq" or _is_icq(data):
         return RawShape(*read_icq(data, source))
     return RawShape(*read_plate_table(data, source))
@@ -129,40 +130,6 @@ def read_plate_table(data: bytes, source: str) -> Mesh:
     return mesh
 
 
-def read_vertex_facet_letters(data: bytes, source: str) -> Mesh:
-    """Read lines `v x y z` and `f a b c`, as in the PDS's radar shapes and early models of Eros.
-
-    Vertex numbers are counted from 1, or from 0 if a 0 occurs. Polygons are split into fans. The reader ignores
-    anything after the coordinates or after a slash, and the other statements of an OBJ file.
-
-    Raises
-    ------
-    InputError
-        With the line: other text, too few numbers, numbers out of range.
-    """
-    vertex_rows = re.findall(rb"(?m)^[ \t]*v[ \t]+([^\r\n]*)", data)
-    face_rows = re.findall(rb"(?m)^[ \t]*f[ \t]+([^\r\n]*)", data)
-    other = re.search(rb"(?m)^[ \t]*(?!(?:v|f|vn|vt|g|o|s|usemtl|mtllib)(?:[ \t]|[\r\n]|\Z))[^\s]", data)
-    if other:
-        raise _not_a_statement(data, other.start(), source)
-    end = _line(data, len(data.rstrip()))
-    if not vertex_rows or not face_rows:
-        missing = "f a b c" if vertex_rows else "v x y z"
-        raise InputError(f"{source}: line {end}: expected lines {missing!r}, found none before the end.")
-    if any(b"/" in row for row in face_rows[:1]):
-        face_rows = [re.sub(rb"/\S*", b"", row) for row in face_rows]
-    vertices = _rows(vertex_rows, "v x y z", source, lambda row: _letter_line(data, b"v", row))
-    polygons = _rows(face_rows, "f a b c", source, lambda row: _letter_line(data, b"f", row))
-    corners = polygons.shape[1]
-    fan = np.array([(0, k, k + 1) for k in range(1, corners - 1)])
-    return _from_one(
-        vertices[:, :3],
-        polygons[:, fan].reshape(-1, 3),
-        source,
-        lambda row: _letter_line(data, b"f", row // (corners - 2)),
-    )
-
-
 def read_icq(data: bytes, source: str) -> Mesh:
     """Read Gaskell's implicitly connected quadrilaterals: Q, then 6(Q + 1)² vertices on the faces of a cube.
 
@@ -193,43 +160,6 @@ def read_icq(data: bytes, source: str) -> Mesh:
     if np.sum(corners[:, 0] * np.cross(corners[:, 1], corners[:, 2])) < 0:  # six times the signed volume
         faces = faces[:, ::-1]
     return vertices, faces.astype(np.int64)
-
-
-def read_vrml(data: bytes, source: str) -> Mesh:
-    """Read all IndexedFaceSets of a VRML 1 or 2 file; polygons are split into fans.
-
-    Named coordinates (DEF) may be used again (USE).
-
-    Raises
-    ------
-    InputError
-        With the line: a transform is not the identity or geometry is used again, which would change the shape
-        silently; or a list is not closed, holds anything but numbers, or names points that do not exist.
-    """
-    if not re.match(rb"\s*#VRML", data):
-        raise InputError(
-            f"{source}: line 1: expected '#VRML V1.0 ascii' or '#VRML V2.0 utf8', found {_shown(data)}."
-        )
-    # Strings and comments are overwritten with blanks, not removed, so that line numbers stay correct.
-    text = re.sub(rb'"(?:\\.|[^"\\])*(?:"|\Z)|#[^\r\n]*', lambda m: re.sub(rb"[^\r\n]", b" ", m[0]), data)
-    vertices: list[Float64] = []
-    faces: list[Int64] = []
-    base = 0
-    for points, index in _FaceSetScanner(text, source).face_sets():
-        coordinates = _list_numbers(text, points, source)
-        if len(coordinates) % 3 or len(coordinates) == 0:
-            raise InputError(
-                f"{source}: line {_line(text, points.start())}: expected points of three coordinates, "
-                f"found {len(coordinates)} numbers."
-            )
-        triangles = _fans(_list_numbers(text, index, source), len(coordinates) // 3, text, index, source)
-        vertices.append(coordinates.reshape(-1, 3))
-        faces.append(triangles + base)
-        base += len(coordinates) // 3
-    if not faces:
-        end = _line(data, len(data.rstrip()))
-        raise InputError(f"{source}: line {end}: expected an IndexedFaceSet, found none before the end.")
-    return np.concatenate(vertices), np.concatenate(faces)
 
 
 # --- numbers and lines ---------------------------------------------------------------------------------------
@@ -469,190 +399,129 @@ def _icq_triangles(vertices: Float64, grid: Int64) -> Int64:
     )
 
 
-# --- v and f lines -------------------------------------------------------------------------------------------
-
-
-def _not_a_statement(data: bytes, offset: int, source: str) -> InputError:
-    """Return the error for a line that is neither a vertex nor a facet."""
-    given = _shown(data[offset : offset + 80])
-    return InputError(f"{source}: line {_line(data, offset)}: expected 'v x y z' or 'f a b c', found {given}.")
-
-
-def _letter_line(data: bytes, letter: bytes, row: int) -> int:
-    """Return the line of the statement with this letter and row number."""
-    for count, match in enumerate(re.finditer(rb"(?m)^[ \t]*" + letter + rb"[ \t]+", data)):
-        if count == row:
-            return _line(data, match.end())
-    return _line(data, len(data))
-
-
-def _rows(rows: list[bytes], form: str, source: str, line: Lines) -> Float64:
-    """Return rows of numbers, float64[n, width]; all are as wide as the first (at least 3 numbers)."""
-    # A NaN marks the end of every row. Without it, a short row followed by a long one would pass.
-    marked = _parsed(b" nan\n".join([*rows, b""]))
-    width = len(_clean(rows[0]).split())
-    if (
-        marked is not None
-        and width >= 3
-        and len(marked) == len(rows) * (width + 1)
-        and np.isnan(marked.reshape(-1, width + 1)[:, width]).all()
-        and np.isfinite(values := marked.reshape(-1, width + 1)[:, :width]).all()
-    ):
-        return np.ascontiguousarray(values)
-    _numbers(b"\n".join(rows), source, lambda at: line(at - 1))
-    for row, text in enumerate(rows):
-        numbers = len(_clean(text).split())
-        if numbers < 3 or numbers != width:
-            raise InputError(
-                f"{source}: line {line(row)}: expected {form!r} with {max(width, 3)} numbers, found {numbers}."
-            )
-    raise InputError(f"{source}: line {line(0)}: expected {form!r}, found {_shown(rows[0])}.")
-
-
 # --- VRML ----------------------------------------------------------------------------------------------------
 
-_TOKEN = re.compile(rb"\[[^\[\]{}]*\]|[\[\]{}]|[^\s,\[\]{}]+")
+_NUMBERS = rb"\[([^\[\]{}]*)\]"
+_OPEN_LIST = re.compile(rb"\b(point|coordIndex)\s*\[[^\[\]{}]*+(?!\])")
+_STATEMENT = re.compile(
+    rb"\bIndexed(?P<kind>Face|Line)Set\b"
+    rb"|(?:\bDEF\s+(?P<name>[^\s{}]+)\s+)?\bCoordinate3?\s*\{\s*point\s*"
+    + _NUMBERS.replace(b"(", b"(?P<points>")
+    + rb"|\bcoordIndex\s*"
+    + _NUMBERS.replace(b"(", b"(?P<index>")
+    + rb"|(?P<before>\S*)\s+USE\s+(?P<used>[^\s{}\[\],]+)"
+    rb"|\b(?P<field>translation|rotation|scale|scaleFactor|matrix)\s+(?P<values>(?:" + _NUMBER + rb"[\s,]*){3,16})"
+)
+_MAY_BE_USED = (b"appearance", b"material", b"texture", b"textureTransform", b"normal", b"color", b"texCoord")
 _IDENTITY = {
-    b"translation": (0.0, 0.0, 0.0),
-    b"center": None,  # without effect, since rotation and scale must be the identity
-    b"scale": (1.0, 1.0, 1.0),
-    b"scaleFactor": (1.0, 1.0, 1.0),
-    b"scaleOrientation": None,
-    b"matrix": tuple(np.eye(4).ravel()),
+    b"translation": (0, 0, 0),
+    b"scale": (1, 1, 1),
+    b"scaleFactor": (1, 1, 1),
+    b"matrix": (*np.eye(4).ravel(),),
 }
-_TRANSFORMS = (b"Transform", b"Translation", b"Rotation", b"Scale", b"MatrixTransform")
 Match = re.Match[bytes]
 
 
-@dataclass
-class _Node:
-    """Hold a VRML node while its braces are open."""
+def read_vrml(data: bytes, source: str) -> Mesh:
+    """Read all IndexedFaceSets of a VRML 1 or 2 file; polygons are split into fans.
 
-    kind: bytes
-    name: bytes | None
-    start: int
-    points: Match | None = None
-    index: Match | None = None
-    has_faces: bool = False
-    values: dict[bytes, list[float]] = field(default_factory=dict)
+    Named coordinates (DEF) may be used again (USE).
 
-
-class _FaceSetScanner:
-    """Read a VRML text token by token and find its IndexedFaceSets."""
-
-    def __init__(self, text: bytes, source: str) -> None:
-        self.text, self.source = text, source
-        self.open_nodes = [_Node(b"", None, 0)]  # the outermost one is the file
-        self.points_of_name: dict[bytes, Match | None] = {}
-        self.names_with_faces: set[bytes] = set()
-        self.last_points: Match | None = None  # in VRML 1, the last Coordinate3 applies to what follows
-        self.before = [b"", b"", b""]  # the last three tokens
-        self.field = b""
-
-    def face_sets(self) -> Iterator[tuple[Match, Match]]:
-        """Yield the lists of points and of indices of every IndexedFaceSet, in order."""
-        for match in _TOKEN.finditer(self.text):
-            token = match[0]
-            if token == b"{":
-                name = self.before[-2] if self.before[-3] == b"DEF" else None
-                self.open_nodes.append(_Node(self.before[-1], name, match.start()))
-                self.field = b""
-            elif token == b"}":
-                node = self._closed_node(match)
-                if node.points is not None and node.index is not None and node.kind == b"IndexedFaceSet":
-                    yield node.points, node.index
-            elif token.startswith(b"["):
-                self._read_list(match)
-            else:
-                self._read_word(match)
-            self.before = [*self.before[1:], token]
-        if len(self.open_nodes) > 1:
-            node = self.open_nodes[-1]
-            kind, line = node.kind.decode("ascii", "replace"), _line(self.text, node.start)
-            raise self._error(len(self.text.rstrip()), f"'}}' for {kind!r} of line {line}", "the end")
-
-    def _error(self, offset: int, expected: str, given: str) -> InputError:
-        """Return the error at a byte offset."""
-        return InputError(f"{self.source}: line {_line(self.text, offset)}: expected {expected}, found {given}.")
-
-    def _closed_node(self, match: Match) -> _Node:
-        """Close the innermost node and return it; note what its parent and later references need of it."""
-        if len(self.open_nodes) == 1:
-            raise self._error(match.start(), "a node", "'}' that closes none")
-        node, parent = self.open_nodes.pop(), self.open_nodes[-1]
-        if node.kind in (b"Coordinate", b"Coordinate3"):
-            self.last_points = parent.points = node.points
-            if node.name is not None:
-                self.points_of_name[node.name] = node.points
-        elif node.kind in _TRANSFORMS:
-            _check_identity(node, self.text, self.source)
-        elif node.kind == b"IndexedFaceSet" and node.index is not None:
-            node.points = node.points or self.last_points
-            if node.points is None:
-                raise self._error(node.start, "points for the IndexedFaceSet", "none")
-            node.has_faces = True
-        if node.has_faces and node.name is not None:
-            self.names_with_faces.add(node.name)
-        parent.has_faces |= node.has_faces
-        self.field = b""
-        return node
-
-    def _read_list(self, match: Match) -> None:
-        """Note a list of points or indices in its node, and refuse a list that is not closed."""
-        token, name, node = match[0], self.before[-1], self.open_nodes[-1]
-        if token == b"[":
-            if name in (b"point", b"coordIndex"):
-                raise self._error(
-                    match.start(), f"a list of numbers closed by ']' after {name.decode()}", "no such end"
-                )
-        elif name == b"point":
-            node.points = match
-        elif name == b"coordIndex":
-            node.index = match
-        elif name == b"children" and b"USE" in token.split():
-            raise self._error(match.start(), "geometry written out", "geometry used again by USE")
-
-    def _read_word(self, match: Match) -> None:
-        """Read a word: a reference to a named node, a number of a transform, or the name of a field."""
-        token, node = match[0], self.open_nodes[-1]
-        if self.before[-1] == b"USE":
-            for_points = self.before[-2] == b"coord"
-            if for_points and token in self.points_of_name:
-                node.points = self.points_of_name[token]
-            elif for_points or token in self.names_with_faces:
-                raise self._error(match.start(), "geometry written out", f"USE {token.decode('ascii', 'replace')}")
-        elif node.kind in _TRANSFORMS and re.fullmatch(_NUMBER, token):
-            node.values.setdefault(self.field, []).append(float(token))
-        else:
-            self.field = token
-
-
-def _check_identity(node: _Node, text: bytes, source: str) -> None:
-    """Raise InputError if a transform node changes coordinates."""
-    for key, values in node.values.items():
-        if key == b"rotation":
-            same = len(values) == 4 and values[3] == 0
-        else:
-            identity = _IDENTITY.get(key)
-            same = identity is None or tuple(values) == identity
-        if not same:
-            raise InputError(
-                f"{source}: line {_line(text, node.start)}: expected coordinates of the body itself, "
-                f"found a {node.kind.decode()} with {key.decode()} {' '.join(f'{v:g}' for v in values)}."
+    Raises
+    ------
+    InputError
+        With the line: a transform is not the identity or geometry is used again, which would change the shape
+        silently; or a list is not closed, holds anything but numbers, or names points that do not exist.
+    """
+    head = re.match(rb"\s*#VRML V?(\d?)", data)
+    if head is None:
+        raise InputError(
+            f"{source}: line 1: expected '#VRML V1.0 ascii' or '#VRML V2.0 utf8', found {_shown(data)}."
+        )
+    # Strings and comments are overwritten with blanks, not removed, so that line numbers stay correct.
+    text = re.sub(rb'"(?:\\.|[^"\\])*(?:"|\Z)|#[^\r\n]*', lambda m: re.sub(rb"[^\r\n]", b" ", m[0]), data)
+    vertices: list[Float64] = [np.empty((0, 3))]
+    faces: list[Int64] = []
+    for points, index in _face_sets(text, source, keeps_points=head[1] == b"1"):
+        coordinates = _list_numbers(text, points, "points", source)
+        if len(coordinates) % 3 or len(coordinates) == 0:
+            raise _vrml_error(
+                text, points.start(), source, "points of three coordinates", f"{len(coordinates)} numbers"
             )
+        triangles = _polygons(
+            _list_numbers(text, index, "index", source), len(coordinates) // 3, text, index, source
+        )
+        faces.append(triangles + sum(map(len, vertices)))
+        vertices.append(coordinates.reshape(-1, 3))
+    if not faces:
+        raise _vrml_error(text, len(data.rstrip()), source, "an IndexedFaceSet", "none before the end")
+    return np.concatenate(vertices), np.concatenate(faces)
 
 
-def _list_numbers(text: bytes, block: Match, source: str) -> Float64:
+def _vrml_error(text: bytes, offset: int, source: str, expected: str, given: str) -> InputError:
+    """Return the error at a byte offset."""
+    return InputError(f"{source}: line {_line(text, offset)}: expected {expected}, found {given}.")
+
+
+def _face_sets(text: bytes, source: str, *, keeps_points: bool) -> Iterator[tuple[Match, Match]]:
+    """Yield the statements with the points and with the indices of every IndexedFaceSet, in order.
+
+    With `keeps_points`, as in VRML 1, points hold for all that follows.
+    """
+    if unclosed := _OPEN_LIST.search(text):
+        expected = f"a list of numbers closed by ']' after {unclosed[1].decode()}"
+        raise _vrml_error(text, unclosed.start(), source, expected, "no such end")
+    if text.count(b"{") != text.count(b"}"):
+        counts = f"{text.count(b'{')} and {text.count(b'}')}"
+        raise _vrml_error(text, len(text.rstrip()), source, "as many '}' as '{' by the end", counts)
+    kind, points, named = b"", None, {}
+    for match in _STATEMENT.finditer(text):
+        if match["kind"]:
+            kind = match["kind"]
+        elif match["points"] is not None:
+            points = named[match["name"]] = match
+        elif match["used"]:
+            if match["before"] == b"coord" and match["used"] in named:
+                points = named[match["used"]]
+            elif match["before"] not in _MAY_BE_USED:
+                raise _vrml_error(
+                    text,
+                    match.end(),
+                    source,
+                    "geometry written out",
+                    f"USE {match['used'].decode('ascii', 'replace')}",
+                )
+        elif match["field"]:
+            _check_identity(match, text, source)
+        elif kind == b"Face":
+            if points is None:
+                raise _vrml_error(
+                    text, match.start(), source, "points before the coordIndex of an IndexedFaceSet", "none"
+                )
+            yield points, match
+            points = points if keeps_points else None
+
+
+def _check_identity(match: Match, text: bytes, source: str) -> None:
+    """Raise InputError if a field of a transform changes coordinates."""
+    name, values = match["field"], tuple(map(float, match["values"].replace(b",", b" ").split()))
+    same = values[3:] == (0.0,) if name == b"rotation" else values == _IDENTITY[name]
+    if not same:
+        given = f"a transform with {name.decode()} {' '.join(f'{v:g}' for v in values)}"
+        raise _vrml_error(text, match.start(), source, "coordinates of the body itself", given)
+
+
+def _list_numbers(text: bytes, block: Match, group: str, source: str) -> Float64:
     """Return the numbers in a bracketed list."""
-    start = _line(text, block.start())
-    return _numbers(block[0][1:-1], source, lambda line: start + line - 1)
+    start = _line(text, block.start(group))
+    return _numbers(block[group], source, lambda line: start + line - 1)
 
 
-def _fans(values: Float64, points: int, text: bytes, block: Match, source: str) -> Int64:
+def _polygons(values: Float64, points: int, text: bytes, block: Match, source: str) -> Int64:
     """Split polygons, each ended by -1 in `values` float64[n], into fans of triangles int64[m, 3]."""
 
     def error(index: int, expected: str) -> InputError:
-        line = _line(text, block.start()) + _token_line(block[0][1:-1], index) - 1
+        line = _line(text, block.start("index")) + _token_line(block["index"], index) - 1
         return InputError(f"{source}: line {line}: expected {expected}, found {values[index]:g}.")
 
     wrong = (values != np.floor(values)) | (values < -1) | (values >= points)
@@ -662,12 +531,9 @@ def _fans(values: Float64, points: int, text: bytes, block: Match, source: str) 
     if len(index) == 0 or index[-1] != -1:
         index = np.append(index, -1)
     ends = np.flatnonzero(index == -1)
-    starts = np.concatenate([[0], ends[:-1] + 1])
-    corners = ends - starts
+    corners = np.diff(ends, prepend=-1) - 1
     few = (corners == 1) | (corners == 2)
     if few.any():
-        raise error(int(starts[np.argmax(few)]), "polygons of at least three corners")
-    triangles = np.maximum(corners - 2, 0)
-    first = np.repeat(starts, triangles)
-    step = np.arange(triangles.sum()) - np.repeat(np.cumsum(triangles) - triangles, triangles) + 1
-    return np.stack([index[first], index[first + step], index[first + step + 1]], axis=1)
+        k = int(np.argmax(few))
+        raise error(int(ends[k] - corners[k]), "polygons of at least three corners")
+    return fans(np.delete(index, ends), corners[corners > 0])

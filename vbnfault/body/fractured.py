@@ -31,9 +31,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from .fields import Octaves, smooth_max, smooth_step
+from .geometry import Float64
 from .noise import Float32
-from .octaves import Octaves, smooth_max, smooth_step
-from .shape import Float64
 from .spec import Fractured
 
 _LAYERS = 4096  # random numbers of a sequence of layers, after which it repeats; a power of two

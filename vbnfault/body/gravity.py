@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .shape import Float64, face_normals_areas, signed_volume
+from .geometry import Float64, face_normals_areas, signed_volume
 
 GRAVITATIONAL_CONSTANT = 6.67430e-11  # m³ kg⁻¹ s⁻², CODATA 2018
 

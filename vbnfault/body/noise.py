@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from .blocks import in_blocks
+from .geometry import in_blocks
 
 Float32 = NDArray[np.float32]
 UInt32 = NDArray[np.uint32]

@@ -9,32 +9,35 @@ down to its pixels. Three steps provide it:
 3. `boulders` sets boulders, which are closed meshes of their own, partly into the ground.
 
 The fields of the relief are functions of body-fixed position and seed, so that neighbouring sites see the same
-ground.
+ground. Built patches are kept on disk (`core.array_files`), because to build one takes many seconds.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import hashlib
+import json
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core import activity
+from ..core.array_files import ArrayFiles, code_hash
 from ..core.errors import InputError
 from . import scarps
+from .body import Body
 from .boulders import GroundMesh, add_boulders
+from .geometry import Float64, Int32, mean_edge_m, vertex_normals
 from .noise import Float32
 from .refine import GROWTH_POWER, EdgeLimit, affordable, refine
 from .relief import LONGEST_EDGES, add_relief
-from .roughness import Roughness, mean_edge_m
-from .shape import Float64, Int32, vertex_normals
 from .sites import Site
 from .spec import PatchSpec
-
-if TYPE_CHECKING:
-    from . import Body
 
 _GROUND_FRACTION = 0.66  # fraction of the triangles; the rest is left to the boulders
 _BOULDER_STREAM = 0xB0D
@@ -101,7 +104,7 @@ def build_patch(body: Body, site: Site, spec: PatchSpec) -> Patch:
         )
     model = (body.vertices_m - site.position_T_m, vertex_normals(body.vertices_m, body.faces), body.faces)
     with ThreadPoolExecutor(1) as aside:  # to measure a body for its first patch takes nearly a second
-        measured = aside.submit(_roughness, body)
+        measured = aside.submit(lambda: (body.roughness, mean_edge_m(body.vertices_m, body.faces)))
         limit = affordable(
             EdgeLimit(spec.facet_m, spec.radius_m), model, int(_GROUND_FRACTION * spec.max_triangles)
         )
@@ -161,7 +164,45 @@ def _with_scarps(body: Body, site: Site, model: Surface, limit: EdgeLimit, spec:
     return points + (spec.scarps * raised)[:, None] * where.up, normals, faces
 
 
-@lru_cache(maxsize=4)
-def _roughness(body: Body) -> tuple[Roughness, float]:
-    """Return the model's roughness law and mean edge, computed once per body and not once per site."""
-    return body.roughness, mean_edge_m(body.vertices_m, body.faces)
+# --- patches on disk --------------------------------------------------------------------------------------------
+
+PATCHES = ArrayFiles(kind="patch", content="terrain")
+_GROUND = ("fields", "noise", "relief", "fractured", "roughness", "scarps")
+_SOURCES = (*_GROUND, "refine", "boulders", "patch", "gravity", "geometry")
+_ARRAYS = tuple(name for name in Patch.__dataclass_fields__ if name != "site")
+
+
+def cached_patch(body: Body, site: Site, spec: PatchSpec) -> Patch:
+    """Return what `build_patch` returns for the same arguments, from disk if it was built before.
+
+    The patch is the same bit for bit in both cases. Raises what `build_patch` raises, and InputError if
+    $VBNFAULT_CACHE_GIB is unusable.
+    """
+
+    def build() -> dict[str, Any]:
+        activity.begin(f"terrain of site {site.index} (new patch)")
+        return arrays_of(build_patch(body, site, spec))
+
+    return Patch(site=site, **PATCHES.kept(patch_key(body, site, spec), build))
+
+
+def arrays_of(patch: Patch) -> dict[str, Any]:
+    """Return the arrays and numbers of a patch that its file holds."""
+    return {name: getattr(patch, name) for name in _ARRAYS}
+
+
+def patch_key(body: Body, site: Site, spec: PatchSpec) -> str:
+    """Return the sha256 (hex) of all that determines a patch."""
+    content = {
+        "code": _code_hash(),
+        "body": [body.content_hash, body.density_kg_m3, body.rotation_period_s],
+        "site": [site.index, site.position_T_m.tolist(), site.T_from_L.tolist()],
+        "spec": dataclasses.asdict(spec),
+    }
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+@lru_cache(maxsize=1)
+def _code_hash() -> str:
+    """Return the sha256 (hex) of the terrain sources, the library versions and the platform."""
+    return code_hash([Path(__file__).with_name(f"{name}.py") for name in _SOURCES])

@@ -8,8 +8,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from .blocks import in_blocks
-from .shape import Float64, Int32
+from .geometry import Float64, Int32, in_blocks
 
 # Splitting halves an edge, so final lengths lie between half the limit and the limit. With this ratio of limit to
 # target, their mean is near the target.

@@ -12,25 +12,21 @@ of the slope against gravity. The relief consists of:
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
 from . import fractured
-from .blocks import in_blocks
+from .body import Body
+from .fields import Octaves, smooth_max, smooth_step
+from .geometry import Float64, Int32, in_blocks, vertex_normals
 from .gravity import GRAVITATIONAL_CONSTANT
 from .noise import Float32
-from .octaves import Octaves, smooth_max, smooth_step
 from .roughness import Roughness
 from .scarps import form
-from .shape import Float64, Int32, vertex_normals
 from .sites import Site
 from .spec import PatchSpec
-
-if TYPE_CHECKING:
-    from . import Body
 
 _SHARED_M = 20.0  # longer octaves raise dust and rock alike
 LONGEST_EDGES = 1.0  # wavelength of the longest octave, in mean edges of the model

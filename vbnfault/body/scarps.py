@@ -15,20 +15,16 @@ curvature makes them wander by less than that.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.sparse
 from scipy.spatial import cKDTree
 
+from .body import Body
 from .fields import GRADIENT_STD, Points
+from .geometry import Float64, Int32, mean_edge_m, vertex_normals
 from .noise import noise_key
-from .roughness import mean_edge_m
-from .shape import Float64, Int32, vertex_normals
-from .sharpen import smoothed
-
-if TYPE_CHECKING:
-    from . import Body
+from .roughness import smoothed
 
 # Lengths in mean edges of the model: smoothing that leaves the ground on which heights are measured, smoothing that
 # tells crests from hollows, and neighbourhood of the local roughness

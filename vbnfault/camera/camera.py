@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import buffers, spectra
+from ..core import spectra
 from ..core.quantities import Electrons, Irradiance, Radiance
 from ..core.sundisc import Projection
 from ..detector import Detector, MosaicDetector
@@ -51,9 +51,7 @@ class Camera:
         if radiance.sun is None:
             return electrons(self.lens.image(radiance))
         # the rounding errors of the Sun's radiance may be as large as the radiance of the scene
-        sunless = buffers.empty(radiance.array.shape)
-        np.subtract(radiance.array, radiance.sun, out=sunless)
-        np.maximum(sunless, 0, out=sunless)
+        sunless = np.maximum(radiance.array - radiance.sun, 0)
         scene = replace(radiance, array=sunless, sun=None, disc=None)
         sun = replace(radiance, array=radiance.sun, sun=None, fine=None)
         of_scene = electrons(self.lens.image(scene))

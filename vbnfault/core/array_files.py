@@ -1,10 +1,10 @@
 """Keep arrays that take seconds to compute on disk: to read them takes a fraction of a second.
 
 All kinds of arrays share one folder and one limit of its size. A file's name is a hash of everything that
-determines its content. The file holds the same hash and ends with a checksum of all its bytes. It is written under
-another name and then renamed, so that a reader sees a whole file or none, whoever is killed and however many
-processes write it. A damaged file is reported to the user, and its arrays are computed again. If the folder cannot
-be written, the user is told once, and only time is lost.
+determines its content. The file is one of numpy (.npz) that ends with a checksum of its bytes and of that hash. It
+is written under another name and then renamed, so that a reader sees a whole file or none, whoever is killed and
+however many processes write it. A damaged file is reported to the user, and its arrays are computed again. If the
+folder cannot be written, the user is told once, and only time is lost.
 """
 
 from __future__ import annotations
@@ -12,23 +12,23 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import importlib.metadata
+import io
 import json
 import os
 import platform
 import shutil
 import stat
-import struct
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+import platformdirs
 
 from .errors import InputError
 
@@ -38,24 +38,16 @@ FOLDER_VARIABLE = "VBNFAULT_CACHE_DIR"
 SIZE_VARIABLE = "VBNFAULT_CACHE_GIB"
 DEFAULT_GIB = 4.0
 _LIBRARIES = ("numpy", "scipy", "drjit")
-_MAGIC = b"vbnfault patch 1"
-_HEADER = struct.Struct("<16sQ")  # magic, and the number of bytes of the table that follows
-_ALIGNED_BYTES = 64  # each array begins at a multiple of this
+_DIGEST_BYTES = hashlib.sha256().digest_size
 _STALE_S = 3600.0  # an unfinished file older than this belongs to no running process
-_KINDS = ("patch", "ghosts", "nucleus", "mie")  # prefixes of names; the suffix is the same word
+_KINDS = ("patch", "ghosts", "mie", "nucleus")  # prefixes and suffixes of names; the last is of earlier versions
 _UNFINISHED = ".part"
 
 
 def cache_folder() -> Path:
-    """Return the folder: $VBNFAULT_CACHE_DIR, or a folder vbnfault in the user's cache folder."""
+    """Return the folder: $VBNFAULT_CACHE_DIR, or a folder vbnfault in the user's cache folder (`platformdirs`)."""
     given = os.environ.get(FOLDER_VARIABLE)
-    if given:
-        return Path(given)
-    if sys.platform == "win32":
-        base = os.environ.get("LOCALAPPDATA")
-        return (Path(base) if base else Path.home() / "AppData" / "Local") / "vbnfault" / "cache"
-    base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "vbnfault"
+    return Path(given) if given else platformdirs.user_cache_path("vbnfault", appauthor=False).expanduser()
 
 
 def cache_limit_bytes() -> int:
@@ -147,25 +139,14 @@ class ArrayFiles:
         """
         if not stat.S_ISREG(path.stat().st_mode):
             raise ValueError("not a regular file")
-        data = np.fromfile(path, dtype=np.uint8)
-        checksum = hashlib.sha256().digest_size
-        if len(data) < _HEADER.size + checksum:
-            raise ValueError("cut short")
-        content = data[:-checksum]
-        if hashlib.sha256(content.data).digest() != data[-checksum:].tobytes():
+        data = path.read_bytes()
+        content = data[:-_DIGEST_BYTES]
+        if _digest(key, content) != data[-_DIGEST_BYTES:]:
             raise ValueError("its checksum does not match")
-        magic, length = _HEADER.unpack(data[: _HEADER.size].tobytes())
-        if magic != _MAGIC:
-            raise ValueError("another format")
-        table = json.loads(data[_HEADER.size : _HEADER.size + length].tobytes())
-        if table["key"] != key:
-            raise ValueError(f"the {self.content} of another key")
-        arrays, start = {}, _aligned(_HEADER.size + length)
-        for name, dtype, shape in table["arrays"]:
-            count = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
-            # `[()]` turns an array without axes into a number
-            arrays[name] = data[start : start + count].view(dtype).reshape(shape)[()]
-            start += _aligned(count)
+        with np.load(io.BytesIO(content), allow_pickle=False) as file:
+            arrays = {
+                name: file[name][()] for name in file.files
+            }  # `[()]` turns an array without axes into a number
         with contextlib.suppress(OSError):
             os.utime(path)  # marks the file as just used, so that it is evicted last
         return arrays
@@ -179,8 +160,9 @@ class ArrayFiles:
                 dir=path.parent, prefix=f"{self.kind}-", suffix=_UNFINISHED, delete=False
             ) as file:
                 unfinished = Path(file.name)
-                for part in _parts(key, arrays):
-                    file.write(part)
+                content = io.BytesIO()
+                np.savez(content, **arrays)
+                file.write(content.getvalue() + _digest(key, content.getvalue()))
             if path.is_dir() and not path.is_symlink():
                 shutil.rmtree(path)
             os.replace(unfinished, path)
@@ -194,22 +176,11 @@ class ArrayFiles:
                     unfinished.unlink()
 
 
-def _parts(key: str, arrays: Mapping[str, Any]) -> Iterator[bytes]:
-    """Yield the content of a file in parts; the checksum is the last part."""
-    whole: dict[str, NDArray[Any]] = {name: np.asarray(array) for name, array in arrays.items()}
-    rows = [[name, array.dtype.str, array.shape] for name, array in whole.items()]
-    table = json.dumps({"key": key, "arrays": rows}).encode()
-    total = hashlib.sha256()
-    for part in (_HEADER.pack(_MAGIC, len(table)) + table, *(array.tobytes() for array in whole.values())):
-        padded = part.ljust(_aligned(len(part)), b"\0")
-        total.update(padded)
-        yield padded
-    yield total.digest()
-
-
-def _aligned(count: int) -> int:
-    """Return a byte count rounded up to the alignment."""
-    return -(-count // _ALIGNED_BYTES) * _ALIGNED_BYTES
+def _digest(key: str, content: bytes) -> bytes:
+    """Return the checksum of a file's content and of the key that determines it."""
+    total = hashlib.sha256(key.encode())
+    total.update(content)
+    return total.digest()
 
 
 @lru_cache

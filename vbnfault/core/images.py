@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -103,36 +103,6 @@ def write_png(path: Path, image: NDArray[Any], *, smallest: bool = False) -> Pat
         raise VbnfaultError(f"{path}: the image cannot be encoded as PNG")
     write_whole(path, data.tobytes())
     return path
-
-
-def indexed_png(values: NDArray[np.uint8], palette: Sequence[tuple[int, int, int, int]]) -> bytes:
-    """Return a PNG file of two bits a pixel: small masks of up to four colours.
-
-    Parameters
-    ----------
-    values
-        Number of the colour of each pixel, 0 to 3, [y, x].
-    palette
-        Up to four colours as R, G, B, opacity, 0 to 255.
-    """
-    height, width = values.shape
-    padded = np.zeros((height, -(-width // 4) * 4), np.uint8)
-    padded[:, :width] = values
-    four = padded.reshape(height, -1, 4)
-    packed = four[..., 0] << 6 | four[..., 1] << 4 | four[..., 2] << 2 | four[..., 3]
-    lines = np.pad(packed, ((0, 0), (1, 0)))  # a line begins with the number of its filter, 0 for none
-    chunks = {
-        b"IHDR": struct.pack(">IIBBBBB", width, height, 2, 3, 0, 0, 0),
-        b"PLTE": bytes(value for colour in palette for value in colour[:3]),
-        b"tRNS": bytes(colour[3] for colour in palette),
-        b"IDAT": zlib.compress(lines.tobytes(), 9),
-        b"IEND": b"",
-    }
-    parts = [
-        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-        for kind, data in chunks.items()
-    ]
-    return b"".join([_PNG, *parts])
 
 
 def encoded(rgb: NDArray[np.uint8], ending: str, quality: int = 0) -> bytes:

@@ -20,13 +20,19 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
 
 from .errors import VbnfaultError
+
+T = TypeVar("T", bound=np.generic)
 
 OLDEST_USABLE = 16
 VARIABLE = "DRJIT_LIBLLVM_PATH"
 _WHEEL = "karellen-llvm-core"
+_ALIGNED_BYTES = 64
 
 _SYSTEM_PATTERNS = {
     "linux": (
@@ -105,6 +111,20 @@ def backend() -> Any:
 
     names = ("Float", "Float64", "UInt8", "UInt32", "Int32", "UInt64", "Int64", "Array4u")
     return SimpleNamespace(dr=drjit, **{name: getattr(types, name) for name in names})
+
+
+def flat(array: NDArray[T]) -> NDArray[T]:
+    """Return an array, or a copy of it, in one dimension and beginning at a multiple of 64 bytes.
+
+    drjit uses numpy's memory as it is, and compiles another kernel for each set of arrays that begin elsewhere.
+    """
+    if array.flags.c_contiguous and array.ctypes.data % _ALIGNED_BYTES == 0:
+        return array.reshape(-1)
+    memory = np.empty(array.nbytes + _ALIGNED_BYTES, np.uint8)
+    start = -memory.ctypes.data % _ALIGNED_BYTES
+    out: NDArray[T] = memory[start : start + array.nbytes].view(array.dtype)
+    out[...] = array.reshape(-1)
+    return out
 
 
 def _paths() -> Iterator[tuple[str, Path]]:

@@ -13,8 +13,6 @@ from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 
-from . import buffers
-
 # Resident memory in bytes that a process reaches before it releases any. To take memory back from the system costs
 # a tenth of a sample's time where every stage does it, so memory is released only where a step would pass this.
 _MOST = 1360 << 20
@@ -33,7 +31,7 @@ def release_unused(coming_bytes: int = 0, *, always: bool = False) -> None:
     always
         Release it also if the process holds little.
     """
-    for release in (_trim, _forget, _flush):  # what drjit keeps serves the next wavefront, so it is released last
+    for release in (_trim, _flush):  # what drjit keeps serves the next wavefront, so it is released last
         if not always and _resident_bytes() + coming_bytes < _MOST:
             return
         release()
@@ -47,12 +45,6 @@ def share_arenas() -> None:
     """
     if "MALLOC_ARENA_MAX" not in os.environ and _malloc_trim() is not None:
         ctypes.CDLL(None).mallopt(_M_ARENA_MAX, _ARENAS)
-
-
-def _forget() -> None:
-    """Return to the system what is kept for coming arrays."""
-    buffers.clear()
-    _trim()
 
 
 def _flush() -> None:

@@ -13,9 +13,7 @@ import re
 import struct
 import warnings
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
-from functools import cached_property
-from itertools import islice
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -59,17 +57,18 @@ def joined(parts: list[MeshPart]) -> tuple[F64, I64]:
 
 # --- Wavefront OBJ -----------------------------------------------------------------------------------------
 
-_DIRECTIVE = re.compile(rb"^[ \t]*(o|g|usemtl)(?![^ \t\r\n])([^\r\n]*)", re.MULTILINE)
-_VERTEX = re.compile(rb"^[ \t]*v[ \t]+([^\r\n#]*)", re.MULTILINE)
-_FACE = re.compile(rb"^[ \t]*f[ \t]+([^\r\n#]*)", re.MULTILINE)
+_CONTINUED = re.compile(rb"(?:\\\r?\n[^\n\\]*)+")
 _CORNER = re.compile(rb"[+-]?[0-9]+(?:/[+-]?[0-9]*){0,2}")
 _TEXTURE_AND_NORMAL = re.compile(rb"/[-+0-9/]*")
 # numbers of a vertex: x y z, with a weight, with a colour, with both
 _VERTEX_WIDTHS = (3, 4, 6, 7)
 
 
-def read_obj(data: bytes, source: str, *, name: str = "") -> list[MeshPart]:
+def read_obj(data: bytes, source: str, *, name: str = "", may_count_from_0: bool = False) -> list[MeshPart]:
     """Return the faces of an OBJ file, one part for every object, group and material.
+
+    trimesh is not used: it counts negative numbers from the end of the file, and it has no names of materials
+    without their .mtl file.
 
     Parameters
     ----------
@@ -77,6 +76,8 @@ def read_obj(data: bytes, source: str, *, name: str = "") -> list[MeshPart]:
         The file's bytes, and its name in error messages.
     name
         Name of the part that holds the faces outside every object and group.
+    may_count_from_0
+        Whether vertices are counted from 0 if a 0 occurs, as in shapes of the PDS.
 
     Returns
     -------
@@ -91,128 +92,98 @@ def read_obj(data: bytes, source: str, *, name: str = "") -> list[MeshPart]:
         (numbers count from 1, or backwards from -1); the message gives the line. Or the file has more than 20
         million triangles or 10,000 parts.
     """
-    file = _ObjFile(data, source)
+    file = _ObjFile(data, source, name)
+    if len(file.parts) > MAX_PARTS:
+        raise InputError(f"{source}: has {len(file.parts)} objects and groups; at most {MAX_PARTS} are read.")
+    if not file.parts:
+        return []
     vertices = file.vertices()
-    parts: list[MeshPart] = []
-    triangles_n = 0
-    for (part, material), faces in file.faces_of_parts(name).items():
-        triangles = file.triangles(faces, len(vertices))
-        triangles_n += len(triangles)
-        if triangles_n > MAX_FACES:
-            raise InputError(f"{source}: has {triangles_n} triangles or more; at most {MAX_FACES} are read.")
-        used, compact = np.unique(triangles, return_inverse=True)
+    corners, lengths = file.corners(len(vertices), may_count_from_0)
+    triangles_n = int(lengths.sum()) - 2 * len(lengths)
+    if triangles_n > MAX_FACES:
+        raise InputError(f"{source}: has {triangles_n} triangles; at most {MAX_FACES} are read.")
+    part_of_triangle = np.repeat(file.part_of_face, lengths - 2)
+    triangles = fans(corners, lengths)[np.argsort(part_of_triangle, kind="stable")]
+    ends = np.cumsum(np.bincount(part_of_triangle))
+    parts = []
+    for (part, material), faces in zip(file.parts, np.split(triangles, ends[:-1]), strict=True):
+        used, compact = np.unique(faces, return_inverse=True)
         compact = compact.reshape(-1, 3).astype(np.int64)
         parts.append(MeshPart(name=part, material=material, vertices=vertices[used], faces=compact))
     return parts
 
 
-@dataclass
-class _ObjFaces:
-    """Hold the text of a part's faces, and the index of each of these faces among all faces of the file."""
-
-    lines: list[bytes] = field(default_factory=list)
-    indices: list[int] = field(default_factory=list)
-
-
 class _ObjFile:
-    """Read the statements of an OBJ file."""
+    """Hold the statements of an OBJ file: rows of vertices and faces, their lines, and the part of each face."""
 
-    def __init__(self, data: bytes, source: str) -> None:
-        self.data, self.source = data, source
-        # join continued lines; offsets stay
-        self.text = re.sub(rb"\\\r?\n", lambda end: b" " * len(end[0]), data)
+    def __init__(self, data: bytes, source: str, name: str) -> None:
+        self.source = source
+        self.rows: dict[bytes, list[bytes]] = {b"v": [], b"f": []}
+        self.lines: dict[bytes, list[int]] = {b"v": [], b"f": []}
+        self.parts: dict[tuple[str, str], int] = {}  # name and material of each part that has faces
+        self.part_of_face: list[int] = []
+        self.vertices_above_face: list[int] = []
+        naming, key = {b"o": "", b"g": "", b"usemtl": ""}, (name, "")
+        # a continued line is joined, and followed by as many empty ones
+        text = _CONTINUED.sub(lambda m: re.sub(rb"\\\r?\n", b" ", m[0]) + b"\n" * m[0].count(b"\n"), data)
+        for number, line in enumerate(text.replace(b"\t", b" ").split(b"\n"), 1):
+            word, _, rest = line.strip().partition(b" ")
+            if word in self.rows:
+                self.rows[word].append(rest.partition(b"#")[0] if b"#" in rest else rest)
+                self.lines[word].append(number)
+                if word == b"f":
+                    self.part_of_face.append(self.parts.setdefault(key, len(self.parts)))
+                    self.vertices_above_face.append(len(self.rows[b"v"]))
+            elif word in naming:
+                naming |= {b"g": ""} if word == b"o" else {}
+                naming[word] = rest.decode("utf-8", "replace").strip()
+                key = "/".join(filter(None, (naming[b"o"], naming[b"g"]))) or name, naming[b"usemtl"]
 
     def vertices(self) -> F64:
         """Return the positions of all vertices, float64[n, 3]. Raises InputError with the line of a wrong one."""
-        lines = _VERTEX.findall(self.text)
-        if not lines:
-            return np.empty((0, 3))
-        values, ends = _values(lines)
+        rows = self.rows[b"v"]
+        values, ends = _values(rows)
         width = np.diff(ends, prepend=-1) - 1
-        if len(ends) == len(lines) and np.isin(width, _VERTEX_WIDTHS).all():
+        if len(ends) == len(rows) and np.isin(width, _VERTEX_WIDTHS).all():
             vertices = values[(ends - width)[:, None] + np.arange(3)]
-        else:
-            vertices = np.full((len(lines), 3), np.nan)
-        if not np.isfinite(vertices).all():
-            self._refuse_wrong_vertex(lines)
-        return vertices
-
-    def _refuse_wrong_vertex(self, lines: list[bytes]) -> None:
-        """Raise InputError for the first vertex without finite coordinates."""
-        for k, line in enumerate(lines):
-            numbers, end = _values([line])
+            if np.isfinite(vertices).all():
+                return vertices
+        for k, row in enumerate(rows):
+            numbers, end = _values([row])
             if len(end) != 1 or end[0] not in _VERTEX_WIDTHS or not np.isfinite(numbers[:3]).all():
-                text = shown(line.decode("utf-8", "replace").strip())
-                raise self._error(_VERTEX, k, "'v x y z', finite numbers", text)
+                raise self._error(b"v", k, "'v x y z', finite numbers")
+        raise InputError(f"{self.source}: its vertices are unreadable.")
 
-    def faces_of_parts(self, name: str) -> dict[tuple[str, str], _ObjFaces]:
-        """Return the faces by the name and material of their part; `name` is that of faces outside every object."""
-        parts: dict[tuple[str, str], _ObjFaces] = {}
-        count = 0
-        for key, stretch in _stretches(self.text, name):
-            lines = _FACE.findall(stretch)
-            if lines:
-                part = parts.setdefault(key, _ObjFaces())
-                part.lines += lines
-                part.indices += range(count, count + len(lines))
-                count += len(lines)
-        if len(parts) > MAX_PARTS:
-            raise InputError(f"{self.source}: has {len(parts)} objects and groups; at most {MAX_PARTS} are read.")
-        return parts
+    def corners(self, vertices_n: int, may_count_from_0: bool) -> tuple[I64, I64]:
+        """Return the vertices of all faces from 0, int64[corner], and how many each face has, int64[face].
 
-    def triangles(self, faces: _ObjFaces, vertices_n: int) -> I64:
-        """Return faces as triangles, int64[m, 3] from 0. Raises InputError with the line of a wrong face."""
-        corners, ends = _values([_TEXTURE_AND_NORMAL.sub(b"", f) if b"/" in f else f for f in faces.lines])
+        Raises InputError with the line of a wrong face.
+        """
+        rows = self.rows[b"f"]
+        written, ends = _values([_TEXTURE_AND_NORMAL.sub(b"", row) if b"/" in row else row for row in rows])
         lengths = np.diff(ends, prepend=-1) - 1
-        if len(ends) != len(faces.lines) or (lengths < 3).any() or (corners % 1 > 0).any():
-            self._refuse_wrong_face(faces)
-        written = np.delete(corners, ends)
-        face = np.repeat(np.array(faces.indices), lengths)
-        number = written
+        if len(ends) != len(rows) or (lengths < 3).any() or (written % 1 > 0).any():
+            for k, row in enumerate(rows):
+                words = row.split()
+                if len(words) < 3 or not all(map(_CORNER.fullmatch, words)):
+                    raise self._error(b"f", k, "'f a b c', three vertex numbers or more")
+        written = np.delete(written, ends)
+        face = np.repeat(np.arange(len(rows)), lengths)
+        first = 0 if may_count_from_0 and (written == 0).any() else 1
+        index = written - first
         if (written < 0).any():  # counted back from the last vertex above the face
-            number = np.where(written < 0, self._vertices_above_face[face] + written + 1, written)
-        outside = ~((number >= 1) & (number <= vertices_n))
+            index = np.where(written < 0, np.array(self.vertices_above_face)[face] + written, index)
+        outside = ~((index >= 0) & (index < vertices_n) & ((written < 0) | (written >= first)))
         if outside.any():
             k = int(np.argmax(outside))
-            raise self._error(_FACE, int(face[k]), f"vertex numbers from 1 to {vertices_n}", f"{written[k]:g}")
-        return _fans(number.astype(np.int64) - 1, lengths)
+            allowed = f"vertex numbers from {first} to {vertices_n - 1 + first}"
+            raise self._error(b"f", int(face[k]), allowed, f"{written[k]:g}")
+        return index.astype(np.int64), lengths
 
-    def _refuse_wrong_face(self, faces: _ObjFaces) -> None:
-        """Raise InputError for the first face that is no list of at least three vertex numbers."""
-        for index, line in zip(faces.indices, faces.lines, strict=True):
-            corners = line.split()
-            if len(corners) < 3 or not all(map(_CORNER.fullmatch, corners)):
-                text = shown(line.decode("utf-8", "replace").strip())
-                raise self._error(_FACE, index, "'f a b c', three vertex numbers or more", text)
-
-    @cached_property
-    def _vertices_above_face(self) -> I64:
-        """Return how many vertices the file lists above each face, int64[face]."""
-        vertices, faces = ([match.start() for match in p.finditer(self.text)] for p in (_VERTEX, _FACE))
-        return np.searchsorted(np.array(vertices), faces)
-
-    def _error(self, statement: re.Pattern[bytes], index: int, expected: str, given: str) -> InputError:
-        """Return the error for the statement of this kind and index, with its line."""
-        match = next(islice(statement.finditer(self.text), index, None))
-        line = self.data.count(b"\n", 0, match.start()) + 1
-        return InputError(f"{self.source}: line {line}: expected {expected}, found {given}.")
-
-
-def _stretches(text: bytes, name: str) -> Iterator[tuple[tuple[str, str], bytes]]:
-    """Yield (name, material) and the text of each stretch of an OBJ between two naming statements."""
-    current = {b"o": "", b"g": "", b"usemtl": ""}
-    start = 0
-
-    def key() -> tuple[str, str]:
-        return "/".join(piece for piece in (current[b"o"], current[b"g"]) if piece) or name, current[b"usemtl"]
-
-    for match in _DIRECTIVE.finditer(text):
-        yield key(), text[start : match.start()]
-        start = match.end()
-        current[match[1]] = match[2].decode("utf-8", "replace").strip()
-        if match[1] == b"o":
-            current[b"g"] = ""
-    yield key(), text[start:]
+    def _error(self, kind: bytes, k: int, expected: str, given: str = "") -> InputError:
+        """Return the error for statement `k` of a kind, with its line."""
+        given = given or shown(self.rows[kind][k].decode("utf-8", "replace").strip())
+        return InputError(f"{self.source}: line {self.lines[kind][k]}: expected {expected}, found {given}.")
 
 
 def _values(lines: list[bytes]) -> tuple[F64, I64]:
@@ -231,7 +202,7 @@ def _values(lines: list[bytes]) -> tuple[F64, I64]:
     return values, np.flatnonzero(np.isnan(values))
 
 
-def _fans(index: I64, corners: I64) -> I64:
+def fans(index: I64, corners: I64) -> I64:
     """Return polygons with the given numbers of corners as triangles int64[m, 3], fans about each first corner."""
     starts = np.cumsum(corners) - corners
     triangles = corners - 2
@@ -457,26 +428,9 @@ class _Gltf:
             raise self.error(f"{key}.componentType", component, f"one of {', '.join(map(str, _COMPONENTS))}")
         dtype = np.dtype(_COMPONENTS[component])
         count = self.whole(table, "count", key, 3 * MAX_FACES)
-        if "bufferView" in table:
-            values = self.view(table, key, dtype, count, width)
-        elif "sparse" in table:
-            values = np.zeros((count, width), dtype=dtype)
-        else:
-            raise self.error(f"{key}.bufferView", None, "given")
-        sparse = table.get("sparse")
-        if isinstance(sparse, dict):
-            values = values.copy()
-            n = self.whole(sparse, "count", f"{key}.sparse", count)
-            indices, replacements = sparse.get("indices"), sparse.get("values")
-            if not (isinstance(indices, dict) and isinstance(replacements, dict)):
-                raise self.error(f"{key}.sparse", sparse, "a table with indices and values")
-            index_type = indices.get("componentType")
-            if index_type not in (5121, 5123, 5125):
-                raise self.error(f"{key}.sparse.indices.componentType", index_type, "5121, 5123 or 5125")
-            changed = self.view(indices, f"{key}.sparse.indices", np.dtype(_COMPONENTS[index_type]), n, 1)[:, 0]
-            if n and changed.max() >= count:
-                raise self.error(f"{key}.sparse.indices", int(changed.max()), f"from 0 to {count - 1}")
-            values[changed.astype(np.int64)] = self.view(replacements, f"{key}.sparse.values", dtype, n, width)
+        if "bufferView" not in table or "sparse" in table:
+            raise self.error(key, table, "values in a bufferView, none of them sparse")
+        values = self.view(table, key, dtype, count, width)
         if table.get("normalized") is True and dtype.kind != "f":
             return np.maximum(values / float(np.iinfo(dtype).max), -1.0)
         return values
@@ -532,9 +486,8 @@ def _triangles(index: I64, mode: int) -> I64:
     """Return the triangles int64[m, 3] of a list, strip or fan of corners."""
     if mode == _TRIANGLES:
         return index[: len(index) // 3 * 3].reshape(-1, 3)
-    n = max(len(index) - 2, 0)
-    k = np.arange(n)
     if mode == _FAN:
-        return np.stack([np.broadcast_to(index[:1], (n,)), index[k + 1], index[k + 2]], axis=1)
+        return fans(index, np.array([max(len(index), 2)]))
+    k = np.arange(max(len(index) - 2, 0))
     turned = k % 2  # every second triangle of a strip has its corners in reverse order
     return np.stack([index[k], index[k + 1 + turned], index[k + 2 - turned]], axis=1)

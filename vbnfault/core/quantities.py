@@ -12,9 +12,6 @@ from typing import Any, ClassVar, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from . import buffers
-from .fine_light import FineLight
-
 CHANNELS = ("R", "G", "B", "I")
 
 # Rec. 709 luminance of linear RGB: the intensity channel of a camera without W pixels.
@@ -89,6 +86,118 @@ class FarSource:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class FineLight:
+    """Hold points of light, and what they add to the pixels of a render.
+
+    Attributes
+    ----------
+    slopes
+        float64[point, 2]: tangents x/z and y/z in C.
+    power
+        float32[band, point]: radiance times projected solid angle, the irradiance on a plane across the boresight.
+    rows, columns
+        Window of the render's pixels that holds all of the light.
+    mean
+        float32[band, y, x]: radiance of the points averaged over each pixel of the window.
+    """
+
+    slopes: F64
+    power: F32
+    rows: slice
+    columns: slice
+    mean: F32
+
+    @classmethod
+    def of(cls, *, slopes: F64, area_px: F64, radiance: F32, intrinsics: F64, shape: tuple[int, int]) -> FineLight:
+        """Return the light of points in a pinhole's frame of (height, width) pixels.
+
+        Parameters
+        ----------
+        slopes
+            float64[point, 2]: tangents in C. Points beyond the frame are kept for the lens.
+        area_px
+            float64[point]: area of each point in pixels.
+        radiance
+            float32[band, point].
+        intrinsics
+            fx, fy, cx and cy in pixels.
+        """
+        light = radiance * area_px.astype(np.float32)
+        # cos⁴θ / (fx fy) is the projected solid angle of a pixel
+        solid_sr = 1 / (intrinsics[0] * intrinsics[1] * (1 + (slopes**2).sum(axis=1)) ** 2)
+        power = light * solid_sr.astype(np.float32)
+        pixels = slopes * intrinsics[:2] + intrinsics[2:]
+        column, row = np.floor(pixels).astype(np.int64).T
+        inside = (column >= 0) & (column < shape[1]) & (row >= 0) & (row < shape[0])
+        column, row, values = column[inside], row[inside], light[:, inside]
+        rows, columns = ((int(v.min()), int(v.max()) + 1) if len(v) else (0, 1) for v in (row, column))
+        height, width = rows[1] - rows[0], columns[1] - columns[0]
+        index = (row - rows[0]) * width + column - columns[0]
+        mean = np.stack([np.bincount(index, band, height * width) for band in values])
+        return cls(
+            slopes=slopes,
+            power=power,
+            rows=slice(*rows),
+            columns=slice(*columns),
+            mean=mean.reshape(-1, height, width).astype(np.float32),
+        )
+
+    def joined(self, other: FineLight | None) -> FineLight:
+        """Return the light of both."""
+        if other is None:
+            return self
+        rows, columns = (
+            slice(min(a.start, b.start), max(a.stop, b.stop))
+            for a, b in ((self.rows, other.rows), (self.columns, other.columns))
+        )
+        mean = np.zeros((len(self.mean), rows.stop - rows.start, columns.stop - columns.start), np.float32)
+        for part in (self, other):
+            top, left = part.rows.start - rows.start, part.columns.start - columns.start
+            mean[:, top : top + part.mean.shape[1], left : left + part.mean.shape[2]] += part.mean
+        return FineLight(
+            slopes=np.concatenate([self.slopes, other.slopes]),
+            power=np.concatenate([self.power, other.power], axis=1),
+            rows=rows,
+            columns=columns,
+            mean=mean,
+        )
+
+    def scaled(self, factor: float) -> FineLight:
+        """Return the light multiplied by a factor."""
+        return replace(self, power=self.power * np.float32(factor), mean=self.mean * np.float32(factor))
+
+    def added_to(self, array: F32) -> F32:
+        """Return a render, float32[band, y, x], with this light."""
+        out = array.copy()
+        out[:, self.rows, self.columns] += self.mean
+        return out
+
+    def removed_from(self, array: F32) -> F32:
+        """Return a render, float32[band, y, x], without this light, which it contains."""
+        out = array.copy()
+        window = out[:, self.rows, self.columns]
+        np.maximum(window - self.mean, 0, out=window)
+        return out
+
+
+def splat(pixels: F64, weights: F64, shape: tuple[int, int]) -> F32:
+    """Return weights, float64[point], on the four pixels around each position x, y, float32[height, width].
+
+    Sum and centroid of the weights are kept, also from one pixel to the next.
+    """
+    first = np.floor(pixels - 0.5).astype(np.int64)
+    x, y = (pixels - 0.5 - first).T
+    out = np.zeros(shape[0] * shape[1])
+    for right, across in ((0, 1 - x), (1, x)):
+        for down, along in ((0, 1 - y), (1, y)):
+            column, row = first[:, 0] + right, first[:, 1] + down
+            inside = (column >= 0) & (column < shape[1]) & (row >= 0) & (row < shape[0])
+            index = (row * shape[1] + column)[inside]
+            out += np.bincount(index, (weights * across * along)[inside], len(out))
+    return out.reshape(shape).astype(np.float32)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Radiance(Quantity):
     """Hold the spectral radiance at the camera at the band nodes `wavelength_nm` float64[band].
 
@@ -120,20 +229,6 @@ class Irradiance(Quantity):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class RimRows:
-    """Hold the light of a few rows of the image, before the lens's rims and past them.
-
-    - `rows` are these rows; no other row has light past the rims.
-    - `before` float32[row, x, channel] is the light before the rims, in electrons.
-    - `past` float32[row, x, channel] is the additional light past the rims.
-    """
-
-    rows: slice
-    before: NDArray[np.float32]
-    past: NDArray[np.float32]
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
 class Electrons(Quantity):
     """Hold electrons per pixel and channel; every pixel has all channels, R, G, B or those of the mosaic.
 
@@ -144,64 +239,27 @@ class Electrons(Quantity):
     pupil and rims are included already: the Sun's direct image and its traced straylight. The lens's own vignetting
     does not reduce it again. A fault at the rims, such as a slipped ring or a moved hood, multiplies all of it by
     one fraction, that of the Sun's beam which clears the fault (`Fault.passed_to_sun`). None: there is no
-    such light, or it is in `rim_rows`.
-
-    `rim_rows` describes such light if it lies in a few rows only, as the Sun's disc behind a thin lens does. It is
-    then contained in `array`, so that a second plane of zeros takes neither memory nor time.
+    such light.
     """
 
     white_e: NDArray[np.float32]
     past_rims: NDArray[np.float32] | None = None
-    rim_rows: RimRows | None = None
     unit = "e-"
     axes = ("y", "x", "channel")
 
     @property
     def merged(self) -> Electrons:
         """Return all light in one array, as the detector needs it. It is added anew, so that no copy is kept."""
-        if self.rim_rows is not None:
-            return replace(self, rim_rows=None)
         if self.past_rims is None:
             return self
-        array = buffers.empty(self.array.shape, self.array.dtype)
-        return replace(self, array=np.add(self.array, self.past_rims, out=array), past_rims=None)
+        return replace(self, array=self.array + self.past_rims, past_rims=None)
 
     def scaled(self, factor: float) -> Electrons:
-        """Return all light multiplied by a factor; light past the rims in few rows becomes `rim_rows`."""
-        if self.rim_rows is not None:
-            return self.in_planes.scaled(factor)
-        times = np.float32(factor)
-        array = np.multiply(self.array, times, out=buffers.empty(self.array.shape, self.array.dtype))
-        if self.past_rims is None:
-            return replace(self, array=array)
-        rows = _lit_rows(self.past_rims)
-        if rows.stop == rows.start:
-            return replace(self, array=array, past_rims=None)
-        if rows.stop - rows.start > len(array) * _MOST_RIM_ROWS:
-            return replace(self, array=array, past_rims=self.past_rims * times)
-        band = RimRows(rows=rows, before=array[rows].copy(), past=self.past_rims[rows] * times)
-        array[rows] += band.past
-        return replace(self, array=array, past_rims=None, rim_rows=band)
-
-    @property
-    def in_planes(self) -> Electrons:
-        """Return the same light, that past the rims in `past_rims` and not in `rim_rows`."""
-        band = self.rim_rows
-        if band is None:
-            return self
-        array, past = buffers.copy(self.array), buffers.zeros(self.array.shape)
-        array[band.rows], past[band.rows] = band.before, band.past
-        return replace(self, array=array, past_rims=past, rim_rows=None)
-
-
-# Light past the rims in more of the rows than this fraction stays in a plane of its own.
-_MOST_RIM_ROWS = 0.25
-
-
-def _lit_rows(plane: NDArray[np.float32]) -> slice:
-    """Return the range of the rows of a plane that hold anything but 0."""
-    lit = np.flatnonzero(plane.reshape(len(plane), -1).any(axis=1))
-    return slice(int(lit[0]), int(lit[-1]) + 1) if len(lit) else slice(0, 0)
+        """Return all light multiplied by a factor; a plane of no light past the rims becomes None."""
+        times, past = np.float32(factor), self.past_rims
+        return replace(
+            self, array=self.array * times, past_rims=past * times if past is not None and past.any() else None
+        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -332,3 +390,7 @@ class Sample:
     index: int
     layers: Mapping[str, NDArray[Any]]
     scalars: Mapping[str, Any] = field(default_factory=dict)
+
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]

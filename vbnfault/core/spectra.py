@@ -167,15 +167,13 @@ class Bands:
             return self.wavelength_nm
         return np.linspace(self.nm[0], self.nm[-1], _SMOOTH_NODES)
 
-    @cached_property
-    def sampled_nm(self) -> F64:
-        """Return the wavelengths at which coatings are sampled for ghosts: of an even grid about every other one.
-
-        The weights count at every wavelength; films of up to 20 µm have fringes that are wider than 4 nm.
-        """
+    def sampled_nm(self, step_nm: float) -> F64:
+        """Return an even grid of wavelengths at most `step_nm` apart, float64[n]."""
         if len(self.nm) <= _SMOOTH_NODES:
             return self.wavelength_nm
-        return np.linspace(self.nm[0], self.nm[-1], len(self.nm) // 2 + 1)
+        return np.linspace(
+            self.nm[0], self.nm[-1], max(_SMOOTH_NODES, int(np.ceil((self.nm[-1] - self.nm[0]) / step_nm)) + 1)
+        )
 
     def mean(self, values: F64) -> F64:
         """Return the means of values float64[n] in all bands, float64[band]."""

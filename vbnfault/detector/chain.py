@@ -20,12 +20,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import buffers
 from ..core.errors import VbnfaultError
 from ..core.quantities import DEAD, HOT, RGBI, RTS, RTS_HIGH, STUCK, TRAP
-from . import compiled_bayer
-from .demosaic import correct_defects, interpolate
-from .display import Display, levels, luminance
+from .charge import transfer_dark_e
+from .compiled import luminance
+from .demosaic import bounded_at_edges, correct_defects, demosaic, interpolate
 from .effects import Acts, Effect, Exposure, chain_of, is_packaged
 from .effects.electrons import upper_fraction
 from .effects.output import full_well_to_codes
@@ -35,7 +34,6 @@ from .mosaic import channel_of
 from .noise import NormalField, draw_normals
 from .readout import ReadoutIndividual, ReadoutNoise, read_out
 from .sensor import Sensor
-from .transfer import transfer_dark_e
 
 F32 = NDArray[np.float32]
 Raw = NDArray[np.uint16]
@@ -187,14 +185,11 @@ class Device:
         noise can take away (interference whole, the rest four standard deviations).
         """
         readout = self.sensor.readout
-        full = buffers.empty(self.shape)
-        full.fill(readout.full_well_e)
+        full = np.full(self.shape, readout.full_well_e, np.float32)
         temporal_e = math.hypot(readout.noise_e_rms, readout.row_noise_e_rms)
         margin_dn = (4 * temporal_e + 2 * readout.banding_seen_e) * readout.system_gain_dn_per_e
-        level = buffers.empty(self.shape)
-        np.subtract(read_out(full, readout, None, self.readout_individual), np.float32(margin_dn), out=level)
-        np.maximum(level, 0, out=level)
-        return np.ceil(level, out=level).astype(np.uint16)
+        level = read_out(full, readout, None, self.readout_individual) - np.float32(margin_dn)
+        return np.ceil(np.maximum(level, 0)).astype(np.uint16)
 
     @cached_property
     def bad(self) -> NDArray[np.bool_]:
@@ -247,10 +242,19 @@ class Device:
         }
         red, green, blue = (scale.get(colour, scale.get("W", full)) for colour in "RGB")
         noise_dn = sensor.readout.read_noise_e_rms * sensor.readout.system_gain_dn_per_e
-        display = Display(black_dn=black, noise_dn=noise_dn, scale=(red, green, blue))
-        if compiled_bayer.serves(mosaic, sensor.pattern, sensor.method):
-            return RGBI(array=compiled_bayer.image(mosaic, sensor.pattern, self.saturated_dn, display))
-        rgb = levels(mosaic, sensor.pattern, sensor.method, mosaic >= self.saturated_dn, display)
+        linear = demosaic(mosaic, sensor.pattern, sensor.method)
+        linear = bounded_at_edges(
+            linear,
+            mosaic,
+            sensor.pattern,
+            sensor.method,
+            black=black,
+            noise=noise_dn,
+            clipped=mosaic >= self.saturated_dn,
+        )
+        # OpenCV multiplies with 64 bits, rounds to even and saturates at 0 and 255 as it converts
+        above = cv2.subtract(linear, (black, black, black, 0.0))
+        rgb = np.asarray(cv2.multiply(above, (red, green, blue, 0.0), dtype=cv2.CV_8U))
         out = np.empty((*raw.shape, 4), dtype=np.uint8)
         if "W" in sensor.pattern.channels:
             unfiltered = interpolate(mosaic, sensor.pattern, "W")

@@ -11,22 +11,25 @@ A direction ("up", "down", "left", "right") says where the charge moves. "up" ha
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from ..core import buffers
-from ..core.architecture import READOUT_DIRECTIONS
-from ..core.errors import InputError
 from ..core.tables import table_class
-from .blocks import by_rows
+
+if TYPE_CHECKING:
+    from .sensor import Sensor
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
+
+ROWS_PER_BLOCK = 64  # measured as the fastest for steps on one plane
+_TRAIL_LEFT_OUT = 0.01
 
 
 # ------------------------------------------------------------------------------------------------------ smear
@@ -61,14 +64,7 @@ def smear(
         Fraction of the light that passes the shutter during the transfer: 1 without a shutter, 0 when closed.
     direction
         Direction of the charge.
-
-    Raises
-    ------
-    InputError
-        A value is out of range.
     """
-    _at_least_0(exposure_s=exposure_s, row_transfer_s=row_transfer_s, row_clear_s=row_clear_s)
-    _fraction(shutter_transmission=shutter_transmission)
     late, early = row_transfer_s * shutter_transmission, row_clear_s * shutter_transmission
     rate = _facing(rate_e_s, direction)
     if not (late or early):
@@ -102,16 +98,73 @@ def smear_interline(
     light along the whole column. This draws a line above and below a bright spot.
 
     `leak` in [0, 1] is the fraction of a pixel's light that reaches the covered register beside it. Other arguments
-    and errors are as in `smear`.
+    are as in `smear`.
     """
-    _at_least_0(exposure_s=exposure_s, row_transfer_s=row_transfer_s)
-    _fraction(leak=leak)
 
     rate = _facing(rate_e_s, direction)
     gathered = rate.sum(axis=0, dtype=np.float64) * (leak * row_transfer_s)
     out = rate * np.float32(exposure_s)
     out += gathered.astype(np.float32)
     return _facing(out, direction, back=True)
+
+
+# ------------------------------------------------------------------------------ paths of charge, dark current
+
+
+def transfer_dark_e(sensor: Sensor, dark_rate_e_s: F32, direction: str) -> F32 | None:
+    """Return the electrons from dark current that charge packets collect during transfer, float32[y, x].
+
+    A full-frame CCD moves each packet through all pixels between its own pixel and the register. It stays in each
+    for the readout time of a row, so a hot pixel leaves a line. Packets in the store of a frame-transfer CCD and in
+    the registers of an interline CCD wait equally long; their dark current is assumed to be the median of the
+    image. In a frame-transfer CCD a packet also passes the image pixels on its quick transfer to the store.
+
+    Returns None for a CMOS sensor, and for a CCD without transfer times.
+    """
+    move = sensor.transfer
+    if sensor.architecture == "cmos" or not (move.row_readout_s or move.row_transfer_s):
+        return None
+    if sensor.architecture == "full_frame_ccd":
+        return passing_dark_e(sensor, dark_rate_e_s, direction)
+    even = np.full_like(dark_rate_e_s, np.median(dark_rate_e_s))
+    waiting = partial(smear, exposure_s=0.0, row_transfer_s=move.row_readout_s)
+    return along_columns(sensor, direction, waiting, even) + passing_dark_e(sensor, dark_rate_e_s, direction)
+
+
+def passing_dark_e(sensor: Sensor, dark_rate_e_s: F32, direction: str) -> F32:
+    """Return the part of `transfer_dark_e` from the image's own pixels, float32[y, x]: linear in their rate."""
+    period_s = {
+        "full_frame_ccd": sensor.transfer.row_readout_s,
+        "frame_transfer_ccd": sensor.transfer.row_transfer_s,
+    }.get(sensor.architecture, 0.0)
+    if not period_s:
+        return np.zeros_like(dark_rate_e_s)
+    gather = partial(smear, exposure_s=0.0, row_transfer_s=period_s)
+    return along_columns(sensor, direction, gather, dark_rate_e_s)
+
+
+def along_columns(sensor: Sensor, direction: str, step: Callable[..., F32], image: F32) -> F32:
+    """Apply `step(part, direction=…)` along the columns of an image.
+
+    A part holds all rows that are read towards one register: the whole image or, with four nodes, each half of it.
+    """
+    if sensor.readout.nodes < 4:
+        return step(image, direction=direction)
+    middle = (len(image) + 1) // 2
+    return np.concatenate([step(image[:middle], direction="up"), step(image[middle:], direction="down")])
+
+
+def along_registers(sensor: Sensor, step: Callable[..., F32], image: F32) -> F32:
+    """Apply `step(part, direction=…)` along the rows of an image.
+
+    All rows move to the left or, with two or four nodes, each half to its own side.
+    """
+    if sensor.readout.nodes == 1:
+        return step(image, direction="left")
+    middle = (image.shape[1] + 1) // 2
+    return np.concatenate(
+        [step(image[:, :middle], direction="left"), step(image[:, middle:], direction="right")], axis=1
+    )
 
 
 # ------------------------------------------------------------------------------------------------- blooming
@@ -135,15 +188,7 @@ def bloom(signal_e: F32, *, full_well_e: float, antiblooming: float = 0.0, direc
         Fraction of the excess that a drain removes in the pixel itself, 0 to 1.
     direction
         Direction of the charge, which selects columns or rows.
-
-    Raises
-    ------
-    InputError
-        A value is out of range.
     """
-    _above_0(full_well_e=full_well_e)
-    _fraction(antiblooming=antiblooming)
-    _known(direction)
     if signal_e.size == 0 or signal_e.max() <= full_well_e:
         return signal_e.copy()
     image = _facing(signal_e.copy() if direction == "up" else signal_e, direction)
@@ -238,9 +283,6 @@ def cti(
     cloud: ChargeCloud,
     transfer_s: float,
     direction: str = "up",
-    transfers_before: int = 0,
-    passes: int = 1,
-    trail_left_out: float = 0.01,
 ) -> F32:
     """Return the image after readout through a register with traps, float32[y, x] in e.
 
@@ -249,10 +291,10 @@ def cti(
     The model is volume-driven (ArCTIC: Massey et al. 2010, MNRAS 401, 371; 2014, MNRAS 439, 887). A packet fills
     every trap within its cloud at once. A trap releases its electron with probability 1 − exp(−t/τ) per transfer of
     `transfer_s`, into the packet that is there at that time. Row i passes the traps of pixels 0 … i, including its
-    own pixel, and of `transfers_before` pixels ahead of them (a store, a prescan). All traps are empty when readout
+    own pixel. All traps are empty when readout
     starts.
 
-    The computation is an express approximation: a packet's cloud keeps its size during a pass (`_clock`). The cost
+    The computation is an express approximation: a packet's cloud keeps its size (`_clock`). The cost
     rises with the longest release time. The total charge is conserved, except for charge that is still trapped when
     the last row has left.
 
@@ -264,61 +306,34 @@ def cti(
         Kinds of traps, and the charge cloud of a packet.
     transfer_s, direction
         Time per transfer in s, above 0, and direction of the charge.
-    transfers_before
-        Pixels with traps ahead of row 0, at least 0.
-    passes
-        Number of equal parts into which the transfers are divided, at least 1. Each part uses the clouds that the
-        part before left. The error is of second order in the loss and falls as 1/passes, until float32 rounding
-        dominates (beyond about 16 passes).
-    trail_left_out
-        Fraction of the trapped charge at which a trail ends, between 0 and 1.
-
-    Raises
-    ------
-    InputError
-        A value is out of range.
     """
-    _above_0(transfer_s=transfer_s)
-    _check_transfers(transfers_before, passes, trail_left_out)
     species = [s for s in species if s.density_per_px > 0]
     image = _facing(signal_e.copy() if direction == "up" else signal_e, direction)
     if not species or image.shape[0] == 0:
         return signal_e.copy()
-    trapped = _trapped(species, transfer_s, len(image), trail_left_out) / passes
+    trapped = _trapped(species, transfer_s, len(image))
     density = sum(s.density_per_px for s in species)
-    met = density * (np.arange(len(image)) + 1.0 + transfers_before)  # number of traps that a packet passes
-    per_cloud = (passes / met).astype(np.float32)[:, None]
-    for _ in range(passes):
-        _clock(image, cloud, per_cloud, trapped, transfers_before)
+    met = density * (np.arange(len(image)) + 1.0)  # number of traps that a packet passes
+    _clock(image, cloud, (1 / met).astype(np.float32)[:, None], trapped)
     return _facing(image, direction, back=True)
 
 
-def _check_transfers(transfers_before: int, passes: int, trail_left_out: float) -> None:
-    """Raise InputError for a value of `cti` that is out of range."""
-    if transfers_before < 0:
-        raise InputError(f"transfers_before = {transfers_before}: must be at least 0")
-    if passes < 1:
-        raise InputError(f"passes = {passes}: must be at least 1")
-    if not 0 < trail_left_out < 1:
-        raise InputError(f"trail_left_out = {trail_left_out:g}: must be between 0 and 1")
-
-
-def _trapped(species: Iterable[TrapSpecies], transfer_s: float, height: int, left_out: float) -> F64:
+def _trapped(species: Iterable[TrapSpecies], transfer_s: float, height: int) -> F64:
     """Return f(j) = Σ ρ exp(−j t/τ), float64[j]: electrons that a pixel's traps hold j transfers after a cloud.
 
-    The trail ends where the fraction `left_out` of the trapped charge is left: f is lowered by a constant to reach
-    0 there and scaled to keep f(0), so that nothing is lost.
+    The trail ends where the fraction `_TRAIL_LEFT_OUT` of the trapped charge is left: f is lowered by a constant to
+    reach 0 there and scaled to keep f(0), so that nothing is lost.
     """
     f = np.zeros(height + 1)
     for s in species:
         f += s.density_per_px * np.exp(-np.arange(height + 1) * (transfer_s / s.release_time_s))
-    window = 1 + int(np.count_nonzero(f[1:] > left_out * f[0]))
+    window = 1 + int(np.count_nonzero(f[1:] > _TRAIL_LEFT_OUT * f[0]))
     if window < height:
         f = (f[: window + 1] - f[window]) * (f[0] / (f[0] - f[window]))
     return f
 
 
-def _clock(image: F32, cloud: ChargeCloud, per_cloud: F32, trapped: F64, before: int) -> None:
+def _clock(image: F32, cloud: ChargeCloud, per_cloud: F32, trapped: F64) -> None:
     """Run one pass of `cti` towards row 0, in place, in blocks of rows.
 
     A packet's cloud keeps its size during the pass, instead of shrinking from pixel to pixel. Then the sum over all
@@ -346,9 +361,7 @@ def _clock(image: F32, cloud: ChargeCloud, per_cloud: F32, trapped: F64, before:
             part = largest[skip:]
             if j:
                 np.maximum(part, volume[start + skip - j : stop - j], out=part)
-            if j >= start:  # in the `before` pixels, the first packet meets empty traps
-                total[skip] += part[0] * np.float32(before * f[j + 1])
-            cv2.scaleAdd(part, f[j] + released[j] * (start - j + before), total[skip:], dst=total[skip:])
+            cv2.scaleAdd(part, f[j] + released[j] * (start - j), total[skip:], dst=total[skip:])
             cv2.scaleAdd(part, released[j], slope[skip:], dst=slope[skip:])
         slope *= np.arange(stop - start, dtype=np.float32)[:, None]
         total += slope
@@ -390,14 +403,7 @@ def capture(
         Electrons that each trap holds, float[n].
     direction
         "up" or "down".
-
-    Raises
-    ------
-    InputError
-        `direction` is neither "up" nor "down".
     """
-    if direction not in ("up", "down"):
-        raise InputError(f"direction = {direction!r}: must be up or down: traps sit in columns")
     out = signal_e.copy()
     image = out if direction == "up" else out[::-1]
     distance = row if direction == "up" else len(image) - 1 - row
@@ -418,21 +424,6 @@ def capture(
 # ------------------------------------------------------------------------------------ shutters, waiting
 
 
-def row_wait_s(height_px: int, *, row_period_s: float, direction: str = "up") -> F64:
-    """Return the time from the end of a global exposure until each row is read, float64[y] in s: i · row_period_s.
-
-    "up" reads row 0 first, "down" the last row. Raises InputError for other directions, height_px < 1 or a negative
-    period.
-    """
-    _at_least_0(row_period_s=row_period_s)
-    if height_px < 1:
-        raise InputError(f"height_px = {height_px}: must be at least 1")
-    if direction not in ("up", "down"):
-        raise InputError(f"direction = {direction!r}: must be up or down: rows are read one by one")
-    wait: F64 = np.arange(height_px) * np.float64(row_period_s)
-    return wait if direction == "up" else wait[::-1].copy()
-
-
 def parasitic_light(
     signal_e: F32,
     exposure_s: float,
@@ -445,18 +436,20 @@ def parasitic_light(
 
     The scene shines on during the wait as it did during the exposure, so the stored charge gains sensitivity ×
     signal / exposure × waiting time of its row. `sensitivity` in [0, 1] is the parasitic light sensitivity: that of
-    the storage node over that of the photodiode (1/50 000 for a CMV4000, recalled from its data sheet). Raises
-    InputError for it, for an exposure of 0 or less, and as `row_wait_s` does.
+    the storage node over that of the photodiode (1/50 000 for a CMV4000, recalled from its data sheet).
     """
-    _fraction(sensitivity=sensitivity)
-    if not exposure_s > 0:
-        raise InputError(f"exposure_s = {exposure_s:g}: must be above 0")
-    wait = row_wait_s(len(signal_e), row_period_s=row_period_s, direction=direction)
-    out: F32 = buffers.empty(signal_e.shape)
-    return np.multiply(signal_e, (1 + sensitivity / exposure_s * wait).astype(np.float32)[:, None], out=out)
+    wait = np.arange(len(signal_e)) * np.float64(row_period_s)
+    wait = wait if direction == "up" else wait[::-1]
+    return signal_e * (1 + sensitivity / exposure_s * wait).astype(np.float32)[:, None]
 
 
 # ---------------------------------------------------------------------------------------------------- helpers
+
+
+def by_rows(step: Callable[[slice], None], height: int) -> None:
+    """Call `step` for each block of rows of a plane, which fits the cache."""
+    for start in range(0, height, ROWS_PER_BLOCK):
+        step(slice(start, min(start + ROWS_PER_BLOCK, height)))
 
 
 def _facing(image: F32, direction: str, *, back: bool = False) -> F32:
@@ -464,7 +457,6 @@ def _facing(image: F32, direction: str, *, back: bool = False) -> F32:
 
     The result is contiguous, and a copy unless `direction` is "up".
     """
-    _known(direction)
     sideways = direction in ("left", "right")
     if direction == "up":
         return np.ascontiguousarray(image)
@@ -473,26 +465,3 @@ def _facing(image: F32, direction: str, *, back: bool = False) -> F32:
     if direction in ("down", "right"):
         image = cv2.flip(image, 0)
     return cv2.transpose(image) if sideways and back else image
-
-
-def _known(direction: str) -> None:
-    if direction not in READOUT_DIRECTIONS:
-        raise InputError(f"direction = {direction!r}: must be one of {', '.join(READOUT_DIRECTIONS)}")
-
-
-def _at_least_0(**values: float) -> None:
-    for key, value in values.items():
-        if not 0 <= value < math.inf:
-            raise InputError(f"{key} = {value:g}: must be finite and at least 0")
-
-
-def _above_0(**values: float) -> None:
-    for key, value in values.items():
-        if not 0 < value < math.inf:
-            raise InputError(f"{key} = {value:g}: must be finite and above 0")
-
-
-def _fraction(**values: float) -> None:
-    for key, value in values.items():
-        if not 0 <= value <= 1:
-            raise InputError(f"{key} = {value:g}: must be from 0 to 1")

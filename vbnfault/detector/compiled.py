@@ -10,18 +10,18 @@ one of the 65,536 quantiles of the variates.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from ..core import buffers
-from ..core.llvm import backend
-from .display import LUMINANCE_WEIGHTS, with_luminance
+from ..core.llvm import backend, flat
+from ..core.quantities import LUMINANCE
 from .noise import (
     ALL_TERMS_BELOW_E,
     EXACT_POISSON_BELOW_E,
@@ -34,6 +34,20 @@ from .noise import (
 
 F32 = NDArray[np.float32]
 U8 = NDArray[np.uint8]
+
+# The weights of R, G and B are rounded to whole 65536ths, and their sum is 1. Their products with levels, and the
+# sums of these, are exact in single precision, so every order of the sum, fused or not, gives the same bits.
+LUMINANCE_WEIGHTS = np.rint(LUMINANCE.astype(np.float64) * 65536) / 65536
+
+
+def luminance(rgb: U8) -> U8:
+    """Return the luminance, uint8[y, x], of R, G and B, uint8[y, x, 3]; halves become the even level."""
+    return np.asarray(cv2.transform(rgb, LUMINANCE_WEIGHTS.reshape(1, 3))).reshape(rgb.shape[:2])
+
+
+def with_luminance(rgb: U8) -> U8:
+    """Return R, G, B and the luminance as I, uint8[y, x, 4], of R, G and B, uint8[y, x, 3]."""
+    return np.asarray(cv2.insertChannel(luminance(rgb), cv2.cvtColor(rgb, cv2.COLOR_RGB2RGBA), 3))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -83,20 +97,20 @@ def image(curve: Curve, signal: F32, codes: NDArray[np.uint16] | None, base: tup
     dr, trace = be.dr, _Trace(curve, noisy=codes is not None)
     place = dr.arange(be.UInt32, signal.size)
     given = [
-        be.Float(buffers.flat(signal)),
+        be.Float(flat(signal)),
         place,
-        be.UInt32(0) if codes is None else be.UInt32(buffers.flat(codes).view(np.uint32)),
+        be.UInt32(0) if codes is None else be.UInt32(flat(codes).view(np.uint32)),
     ]
     if base is None:
         found = trace.level(*given)
     else:
-        of_base = be.UInt32(buffers.flat(base[1]).view(np.uint32))
+        of_base = be.UInt32(flat(base[1]).view(np.uint32))
 
         def known(_: Any, place: Any, __: Any) -> Any:
             pixel = place // 3
             return dr.gather(be.UInt32, of_base, pixel) >> 8 * (place - 3 * pixel) & 0xFF
 
-        found = dr.if_stmt(tuple(given), given[0] != be.Float(buffers.flat(base[0])), trace.level, known)
+        found = dr.if_stmt(tuple(given), given[0] != be.Float(flat(base[0])), trace.level, known)
     out = be.UInt8(found)
     dr.eval(out)
     dr.sync_thread()
@@ -125,16 +139,10 @@ def _with_luminance(rgb: U8) -> U8:
 
 def _luminance_of(pixel: Any) -> Any:
     """Return the luminance, as UInt32, of pixels that hold R, G and B in the three lowest bytes of a word."""
-    Int32 = backend().Int32
-    return luminance(Int32(pixel >> (8 * k) & 0xFF) for k in range(3))
-
-
-def luminance(rgb: Iterable[Any]) -> Any:
-    """Return `display.luminance`, as UInt32, of the levels of R, G and B, three arrays Int32."""
     be = backend()
     light = be.Float(0.0)
-    for level, weight in zip(rgb, LUMINANCE_WEIGHTS, strict=True):
-        light = be.dr.fma(be.Float(level), float(weight), light)
+    for k, weight in enumerate(LUMINANCE_WEIGHTS):
+        light = be.dr.fma(be.Float(be.Int32(pixel >> (8 * k) & 0xFF)), float(weight), light)
     return be.UInt32(be.Int32(be.dr.round(light)))
 
 
@@ -162,7 +170,7 @@ class _Trace:
         self._scale = [be.dr.opaque(be.Float64, float(value)) for value in curve.scale]
         if noisy:
             self._normal = _tables()[0]
-            self._dark_counts = be.Float(buffers.flat(curve.dark_counts_e))
+            self._dark_counts = be.Float(flat(curve.dark_counts_e))
 
     def level(self, signal: Any, place: Any, codes: Any) -> Any:
         """Return the 8 bit levels of signals; the low half of a word of codes is that of the shot noise."""
@@ -195,16 +203,16 @@ def poisson(mean: F32, normal: NormalField) -> F32:
     """
     be = backend()
     dr = be.dr
-    codes = buffers.flat(normal.codes)
+    codes = flat(normal.codes)
     if codes.size % 2:  # two codes share a word
-        codes = buffers.flat(np.append(codes, np.uint16(0)))
+        codes = flat(np.append(codes, np.uint16(0)))
     words = be.UInt32(codes.view(np.uint32))
 
     def code_at(place: Any, lanes: Any) -> Any:
         return dr.gather(be.UInt32, words, place >> 1, lanes) >> 16 * (place & 1) & 0xFFFF
 
-    flat, z = be.Float(buffers.flat(mean)), be.Float(buffers.flat(normal.looked_up))
-    counts = _quantile(flat, z, dr.arange(be.UInt32, mean.size), code_at)
+    z = be.Float(flat(normal.looked_up))
+    counts = _quantile(be.Float(flat(mean)), z, dr.arange(be.UInt32, mean.size), code_at)
     dr.eval(counts)
     dr.sync_thread()
     out: F32 = np.array(counts, copy=False)
@@ -269,4 +277,4 @@ def _summed(mean: Any, code: Any, few: Any) -> Any:
 def _tables() -> tuple[Any, Any]:
     """Return the normal variates by code, and the values of their distribution function, on the device."""
     be, normal = backend(), variates_by_code()
-    return be.Float(buffers.flat(normal)), be.Float64(buffers.flat(ndtr(normal.astype(np.float64))))
+    return be.Float(flat(normal)), be.Float64(flat(ndtr(normal.astype(np.float64))))

@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import buffers
 from ..core.errors import InputError
-from ..core.llvm import backend
+from ..core.llvm import backend, flat
 
 if TYPE_CHECKING:
     from .readout import ReadoutSpec
@@ -73,7 +72,7 @@ class Converter:
 
 def on_device(array: NDArray[Any]) -> Any:
     """Return real numbers of any shape as a device array, Float, in their order."""
-    return backend().Float(buffers.flat(np.asarray(array, dtype=np.float32)))
+    return backend().Float(flat(np.asarray(array, dtype=np.float32)))
 
 
 def raw_of(codes: Any, shape: tuple[int, ...]) -> Raw:
@@ -81,9 +80,7 @@ def raw_of(codes: Any, shape: tuple[int, ...]) -> Raw:
     dr = backend().dr
     dr.eval(codes)
     dr.sync_thread()
-    out = buffers.empty(shape, np.uint16)
-    np.copyto(out, np.array(codes, copy=False).reshape(shape), casting="unsafe")
-    return out
+    return np.array(codes, copy=False).reshape(shape).astype(np.uint16)
 
 
 def with_stuck_bits(raw: Raw, stuck_bits: Sequence[tuple[int, int]]) -> Raw:

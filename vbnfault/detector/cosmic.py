@@ -13,14 +13,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtr, ndtri
-
-from ..core.errors import InputError
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -46,10 +44,6 @@ _EXCITATION_EV = 173.0
 _STERNHEIMER = {"x0": 0.2015, "x1": 2.8716, "c": 4.4355, "a": 0.14921, "k": 3.2546}
 
 MOYAL_MEAN = float(np.euler_gamma) + math.log(2)  # mean of the standard Moyal distribution
-
-# Energies of the secondary electrons that are simulated (assumed). Slower electrons stop within about 1 µm, faster
-# electrons are rare.
-SECONDARY_MIN_KEV, SECONDARY_MAX_KEV = 10.0, 100.0
 
 _SIGMAS = 4.0  # diffused charge is cut at this many standard deviations
 # With diffusion, a track is divided into at least this many steps per pixel, and per thickness of the layer because
@@ -117,15 +111,10 @@ class CosmicRays:
 
     @classmethod
     def from_params(cls, params: Sequence[Mapping[str, Any]]) -> CosmicRays:
-        """Return the tracks from a list that `params` gave. Raises InputError if a key is missing."""
-        names = [f.name for f in fields(cls)]
-        for number, row in enumerate(params):
-            missing = [name for name in names if name not in row]
-            if missing:
-                raise InputError(f"cosmic_rays[{number}]: {missing[0]} is missing; needed are {', '.join(names)}")
+        """Return the tracks from a list that `params` gave."""
         columns: dict[str, Any] = {
             name: np.array([row[name] for row in params], dtype=np.uint32 if name == "seed" else np.float64)
-            for name in names
+            for name in (f.name for f in fields(cls))
         }
         return cls(**columns)
 
@@ -152,15 +141,6 @@ class CosmicRayModel:
     diffusion_um
         Gaussian σ of charge from the far face when it is collected. Charge from depth z has √(z/thickness) of this
         (drift in a constant field). 0 switches diffusion off.
-    secondaries
-        Whether to add knock-on electrons of 10 to 100 keV, straight and perpendicular to their track (assumed),
-        with 1/T² in energy and the range of Everhart & Hoff 1971 (J. Appl. Phys. 42, 5837). They add to the mean,
-        by at most 14 %.
-
-    Raises
-    ------
-    InputError
-        A value is out of range.
     """
 
     pixel_pitch_um: float
@@ -169,24 +149,9 @@ class CosmicRayModel:
     electrons_per_um: float = 80.0
     width_e_per_um: float = XI_E_PER_UM
     diffusion_um: float = 0.0
-    secondaries: bool = False
-
-    def __post_init__(self) -> None:
-        for key, value in asdict(self).items():
-            above = key in ("pixel_pitch_um", "thickness_um", "electrons_per_um")
-            if not (0 < value < math.inf if above else 0 <= value < math.inf):
-                raise InputError(f"{key} = {value:g}: must be finite and {'above' if above else 'at least'} 0")
-        # the smallest value that Moyal's distribution gives in practice must still be a positive charge
-        if self.width_e_per_um > 0.15 * self.electrons_per_um:
-            raise InputError(
-                f"width_e_per_um = {self.width_e_per_um:g}: must be at most 0.15 electrons_per_um = "
-                f"{0.15 * self.electrons_per_um:g}"
-            )
 
     def expected_count(self, shape: tuple[int, int], exposure_s: float) -> float:
         """Return the mean number of tracks on a (height, width) sensor: flux/2 × area × time."""
-        if not 0 <= exposure_s < math.inf:
-            raise InputError(f"exposure_s = {exposure_s:g}: must be finite and at least 0")
         area_cm2 = shape[0] * shape[1] * (self.pixel_pitch_um * 1e-4) ** 2
         return 0.5 * self.flux_per_cm2_s * area_cm2 * exposure_s
 
@@ -195,8 +160,7 @@ class CosmicRayModel:
 
         `exposure_s` may include the readout. The number of tracks is Poisson distributed. The directions through a
         plane have the density ∝ cosθ sinθ. Azimuth and position are uniform. A track is thickness/cosθ long, or
-        ends at the sensor's edge. Tracks that enter through the narrow sides are left out. Raises InputError unless
-        `exposure_s` is finite and at least 0.
+        ends at the sensor's edge. Tracks that enter through the narrow sides are left out.
         """
         count = int(rng.poisson(self.expected_count(shape, exposure_s)))
         x, y, sin2, turn = rng.random((count, 4)).T
@@ -205,7 +169,7 @@ class CosmicRayModel:
         x, y = x * shape[1], y * shape[0]
         theta, phi = np.arcsin(np.sqrt(sin2)), 2 * np.pi * turn
         length = self._inside(shape, x, y, np.zeros(count), theta, phi, np.full(count, np.inf))
-        rays = CosmicRays(
+        return CosmicRays(
             x_px=x,
             y_px=y,
             depth_um=np.zeros(count),
@@ -215,7 +179,6 @@ class CosmicRayModel:
             electrons=length * (self.electrons_per_um + self.width_e_per_um * (moyal - MOYAL_MEAN)),
             seed=seed,
         )
-        return self._with_secondaries(rays, shape, rng) if self.secondaries else rays
 
     def deposit(self, rays: CosmicRays, shape: tuple[int, int]) -> tuple[I64, F32]:
         """Return the charge per pixel of the tracks on a (height, width) sensor.
@@ -264,13 +227,6 @@ class CosmicRayModel:
         sigma = self.diffusion_um / self.pixel_pitch_um * np.sqrt(depth / self.thickness_um)
         return _spread(x, y, sigma, (electrons / parts)[piece], shape)
 
-    def image(self, rays: CosmicRays, shape: tuple[int, int]) -> F32:
-        """Return the electrons of `deposit` as an image, float32[y, x]."""
-        out = np.zeros(shape, dtype=np.float32)
-        index, electrons = self.deposit(rays, shape)
-        out.ravel()[index] = electrons
-        return out
-
     def _inside(
         self, shape: tuple[int, int], x: F64, y: F64, depth: F64, theta: F64, phi: F64, length_um: F64
     ) -> F64:
@@ -292,41 +248,6 @@ class CosmicRayModel:
         u = _hash_uniform((seed.astype(np.uint64) << np.uint64(32)) + number.astype(np.uint64))
         moyal = -2 * np.log(-ndtri(u / 2))  # −ln z², z a standard normal variate
         return self.electrons_per_um + self.width_e_per_um * (moyal - MOYAL_MEAN)
-
-    def _with_secondaries(self, rays: CosmicRays, shape: tuple[int, int], rng: np.random.Generator) -> CosmicRays:
-        """Return the tracks together with their knock-on electrons."""
-        low, high = SECONDARY_MIN_KEV, SECONDARY_MAX_KEV
-        # ∫ ξ/T² dT per length, ξ in keV/µm
-        number = rng.poisson(rays.length_um * XI_EV_PER_UM * 1e-3 * (1 / low - 1 / high))
-        parent = np.repeat(np.arange(len(rays)), number)
-        along, energy, turn = rng.random((len(parent), 3)).T
-        seed = rng.integers(2**32, size=len(parent), dtype=np.uint32)
-        energy_kev = low / (1 - energy * (1 - low / high))
-        range_um = 0.0398 / 2.329 * energy_kev**1.75
-        theta, phi = np.radians(rays.theta_deg[parent]), np.radians(rays.phi_deg[parent])
-        length = along * rays.length_um[parent]
-        across = length * np.sin(theta) / self.pixel_pitch_um
-        # (cosθ cosφ, cosθ sinφ, −sinθ) and (−sinφ, cosφ, 0) are perpendicular to (sinθ cosφ, sinθ sinφ, cosθ)
-        turn = 2 * np.pi * turn
-        dx = np.cos(turn) * np.cos(theta) * np.cos(phi) - np.sin(turn) * np.sin(phi)
-        dy = np.cos(turn) * np.cos(theta) * np.sin(phi) + np.sin(turn) * np.cos(phi)
-        dz = -np.cos(turn) * np.sin(theta)
-        x = rays.x_px[parent] + across * np.cos(phi)
-        y = rays.y_px[parent] + across * np.sin(phi)
-        depth = rays.depth_um[parent] + length * np.cos(theta)
-        theta, phi = np.arccos(np.clip(dz, -1, 1)), np.arctan2(dy, dx) % (2 * np.pi)
-        length = self._inside(shape, x, y, depth, theta, phi, range_um)
-        new: dict[str, Any] = {
-            "x_px": x,
-            "y_px": y,
-            "depth_um": depth,
-            "theta_deg": np.degrees(theta),
-            "phi_deg": np.degrees(phi),
-            "length_um": length,
-            "electrons": energy_kev * 1e3 / PAIR_ENERGY_EV * length / range_um,
-            "seed": seed,
-        }
-        return CosmicRays(**{name: np.concatenate([old, new[name]]) for name, old in vars(rays).items()})
 
 
 def _rank(group: I64) -> I64:

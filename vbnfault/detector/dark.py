@@ -13,16 +13,13 @@ from __future__ import annotations
 import math
 import sys
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from pydantic import Field
-from scipy.special import gammaincc
 
 from ..core.errors import InputError
 from ..core.tables import table_class
-from .poisson import poisson_probability
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -39,8 +36,6 @@ _INTERACTIONS_UM3_TEV_G = 0.09717943 / 4100
 _ANNEAL_S = (1e4, 5e6)  # range of times in which the annealing was measured
 
 _MOST_INTERACTIONS = 1000.0
-_TABLE = 4096
-_RAREST = 40.0  # -ln of the rarest survival in the table; a float64 uniform number reaches 36.7
 
 
 def checked(name: str, value: float, low: float, high: float) -> float:
@@ -94,48 +89,6 @@ def rate_e_s(current_nA_cm2: float, pixel_pitch_um: float) -> float:
     return current_nA_cm2 * 1e-9 / ELECTRON_C * (pixel_pitch_um * 1e-4) ** 2
 
 
-def dark_current_e_s(temperature_K: float, *, figure_of_merit_nA_cm2: float, pixel_pitch_um: float) -> float:
-    """Return the dark current of a pixel of undamaged silicon in e/s.
-
-    `figure_of_merit_nA_cm2` is the current density at 300 K. Raises InputError as `silicon_factor` does.
-    """
-    return rate_e_s(figure_of_merit_nA_cm2, pixel_pitch_um) * silicon_factor(temperature_K, 300.0)
-
-
-def doubling_temperature_K(
-    temperature_K: float, *, activation_energy_eV: float | None = None, local: bool = False
-) -> float:
-    """Return the rise in temperature, in K, that doubles the dark current.
-
-    Parameters
-    ----------
-    temperature_K
-        Temperature from which it rises, 100 to 330 K.
-    activation_energy_eV
-        Activation energy, 0.1 to 3 eV; None stands for undamaged silicon.
-    local
-        Whether to use the slope at `temperature_K` (with an activation energy: k T² ln2/Ea) instead of the full
-        step, which is longer.
-
-    Raises
-    ------
-    InputError
-        A value is out of range.
-    """
-    from scipy.optimize import brentq  # takes half a second to import; no detector of a build needs it
-
-    t = checked("temperature_K", temperature_K, 100.0, 330.0)
-    k = BOLTZMANN_EV_K
-    if activation_energy_eV is not None:
-        energy = checked("activation_energy_eV", activation_energy_eV, 0.1, 3.0)
-        per_K = k * math.log(2) / energy
-        return t * t * per_K / (1 if local else 1 - t * per_K)
-    if local:
-        gap_slope = -7.021e-4 * t * (t + 2 * 1108.0) / (t + 1108.0) ** 2
-        return math.log(2) / (1.5 / t + band_gap_eV(t) / (2 * k * t * t) - gap_slope / (2 * k * t))
-    return float(brentq(lambda step: silicon_factor(t + step, t) - 2.0, 0.0, 70.0, xtol=1e-10))
-
-
 # --- displacement damage ----------------------------------------------------------------------------------------
 
 
@@ -177,9 +130,6 @@ class RadiationDamage:
     anneal_s: float = WEEK_S
 
     def __post_init__(self) -> None:
-        checked("dose_TeV_g", self.dose_TeV_g, 0.0, 1e6)
-        checked("depletion_volume_um3", self.depletion_volume_um3, 0.0, 1e6)
-        checked("anneal_s", self.anneal_s, 0.0, 1e12)
         if self.interactions > _MOST_INTERACTIONS:
             most = _MOST_INTERACTIONS / (_INTERACTIONS_UM3_TEV_G * self.depletion_volume_um3)
             raise InputError(
@@ -198,63 +148,6 @@ class RadiationDamage:
         heat = arrhenius_factor(temperature_K, DAMAGE_REFERENCE_K)
         return per_um3_TeV_g / _INTERACTIONS_UM3_TEV_G * annealing_factor(self.anneal_s) * heat
 
-    def mean_e_s(self, temperature_K: float = DAMAGE_REFERENCE_K) -> float:
-        """Return the mean rate per pixel in e/s: µν."""
-        return self.interactions * self.step_e_s(temperature_K)
-
-    def survival(self, rate_e_s: ArrayLike, temperature_K: float = DAMAGE_REFERENCE_K) -> F64:
-        """Return the fraction of pixels above a rate of at least 0: Σ Poisson(n; µ) Γ(n, x/ν)/Γ(n) over n ≥ 1."""
-        return _survival(np.asarray(rate_e_s, dtype=np.float64) / self.step_e_s(temperature_K), self.interactions)
-
-    def cdf(self, rate_e_s: ArrayLike, temperature_K: float = DAMAGE_REFERENCE_K) -> F64:
-        """Return the fraction of pixels at or below a rate of at least 0.
-
-        At rate 0 it is exp(-µ), the fraction of pixels without an interaction.
-        """
-        return 1.0 - self.survival(rate_e_s, temperature_K)
-
-    def quantile(self, uniform: F64, temperature_K: float = DAMAGE_REFERENCE_K) -> F32:
-        """Return the rate below which the fraction `uniform` of the pixels lies, float32 in e/s.
-
-        `uniform` is in [0, 1): one variate per pixel. The result is interpolated in a table of the distribution.
-        The error in probability is at most 1e-6 up to 30 interactions per pixel, and 1e-5 up to 1000.
-        """
-        out = np.zeros(uniform.shape, dtype=np.float32)
-        if self.interactions == 0:
-            return out
-        hit = uniform > math.exp(-self.interactions)
-        rarity, steps = _quantile_table(self.interactions)
-        out[hit] = np.interp(-np.log1p(-uniform[hit]), rarity, steps * self.step_e_s(temperature_K))
-        return out
-
-    def draw(
-        self, shape: tuple[int, int], rng: np.random.Generator, temperature_K: float = DAMAGE_REFERENCE_K
-    ) -> F32:
-        """Draw rates of pixels that received one dose, float32[y, x] in e/s.
-
-        `make_individual` draws rates that grow with the dose.
-        """
-        return self.quantile(rng.random(shape), temperature_K)
-
-
-def _survival(steps: F64, interactions: float) -> F64:
-    """Return the fraction of pixels above a rate, given in units of the mean rate of one interaction."""
-    # numbers outside this range have a probability below 1e-21, by Chernoff's bound
-    spread = 10 * math.sqrt(interactions)
-    out = np.zeros(steps.shape)
-    for n in range(max(1, int(interactions - spread)), int(interactions + spread) + 60):
-        out += poisson_probability(n, interactions) * gammaincc(n, steps)
-    return out
-
-
-@lru_cache(maxsize=16)
-def _quantile_table(interactions: float) -> tuple[F64, F64]:
-    """Return -ln(survival) and the rates at which it is reached, in units of the mean rate of one interaction."""
-    # as a function of -ln(survival) the curve is nearly straight. Chernoff's bound, survival < exp(-(√x - √µ)²),
-    # gives the end of the table
-    steps = np.linspace(0, math.sqrt(interactions) + math.sqrt(_RAREST), _TABLE) ** 2
-    return -np.log(_survival(steps, interactions)), steps
-
 
 # --- hot pixels -------------------------------------------------------------------------------------------------
 
@@ -272,12 +165,8 @@ class HotPixelGrowth:
     iso_power: float = Field(ge=0.01, le=5, description="power of the ISO setting")
 
     def per_yr_mm2(self, pixel_pitch_um: float, iso: float) -> float:
-        """Return the number of new defects per year and mm².
-
-        The pitch is 0.1 to 100 µm, the ISO setting 1 to 1e7. Raises InputError outside the ranges.
-        """
-        size = checked("pixel_pitch_um", pixel_pitch_um, 0.1, 100.0)
-        return 10**self.log10_scale * size**self.size_power * checked("iso", iso, 1.0, 1e7) ** self.iso_power
+        """Return the number of new defects per year and mm²."""
+        return 10**self.log10_scale * pixel_pitch_um**self.size_power * iso**self.iso_power
 
     def expected(self, years: float, shape: tuple[int, int], pixel_pitch_um: float, iso: float) -> float:
         """Return the mean number of defects of a (height, width) sensor after `years`."""
@@ -287,19 +176,6 @@ class HotPixelGrowth:
 
 APS_GROWTH = HotPixelGrowth(log10_scale=-1.13, size_power=-3.05, iso_power=0.505)
 CCD_GROWTH = HotPixelGrowth(log10_scale=-1.849, size_power=-2.25, iso_power=0.687)
-
-
-def hot_pixel_signal(
-    exposure_s: ArrayLike, *, photo_e_s: ArrayLike, dark_e_s: ArrayLike, offset_e: ArrayLike, gain: float = 1.0
-) -> F64:
-    """Return the signal of a hot pixel, I = m (R_photo T + R_dark T + b), in electrons times the gain m.
-
-    The gain is proportional to the ISO setting. All arguments are at least 0 and broadcast. Source: Chapman et al.
-    2013.
-    """
-    rate = np.asarray(photo_e_s, dtype=np.float64) + np.asarray(dark_e_s, dtype=np.float64)
-    charge = rate * np.asarray(exposure_s, dtype=np.float64) + np.asarray(offset_e, dtype=np.float64)
-    return np.asarray(gain * charge)
 
 
 # --- random telegraph signals -----------------------------------------------------------------------------------
@@ -339,15 +215,6 @@ class Telegraph:
     def start(self, rng: np.random.Generator) -> NDArray[np.bool_]:
         """Draw states of signals that have run for a long time."""
         return rng.random(len(self.duty)) < self.duty
-
-    def later(self, state: NDArray[np.bool_], gap_s: float, rng: np.random.Generator) -> NDArray[np.bool_]:
-        """Draw the states `gap_s` after the given states.
-
-        The result is exact for any gap, without drawing the switches in between. Raises InputError for a negative
-        gap.
-        """
-        memory = np.exp(-checked("gap_s", gap_s, 0.0, math.inf) / self.correlation_s)
-        return rng.random(len(state)) < self.duty + (state - self.duty) * memory
 
     def expose(
         self, state: NDArray[np.bool_], exposure_s: float, rng: np.random.Generator

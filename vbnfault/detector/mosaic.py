@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from ..core import buffers
 from ..core.errors import InputError, shown
 from ..core.tables import table_class
 
@@ -114,7 +113,7 @@ def sample(planes: F32, pattern: Pattern) -> F32:
             f"planes have shape {planes.shape}, but must be [y, x, channel] with the channels {pattern.channels} "
             f"of pattern '{pattern.name}'"
         )
-    out = buffers.empty(planes.shape[:2])
+    out = np.empty(planes.shape[:2], np.float32)
     rows, columns = pattern.shape
     height = rows * max(1, _BLOCK_ROWS // rows)  # whole tiles, so that each block begins with the tile's first row
     for start in range(0, len(out), height):

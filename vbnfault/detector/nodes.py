@@ -38,6 +38,12 @@ def readout_steps(shape: tuple[int, int], nodes: int) -> tuple[NDArray[np.intp],
     return np.where(down, shape[0] - 1 - y, y), np.where(right, shape[1] - 1 - x, x)
 
 
+def last_before(lost: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Return, for each of the increasing indices `lost`, the nearest lower index that is not lost, or -1."""
+    run_begins = np.append(True, np.diff(lost) > 1)
+    return (lost[run_begins] - 1)[np.cumsum(run_begins) - 1] if len(lost) else lost
+
+
 def transmission_order(shape: tuple[int, int], nodes: int) -> NDArray[np.intp]:
     """Return the flat indices of the pixels, int[y·x], in the order in which they leave the sensor.
 

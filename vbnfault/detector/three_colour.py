@@ -22,12 +22,13 @@ from ..core.errors import InputError
 from ..core.quantities import RGBI, Electrons, Irradiance, RawDN
 from ..core.spectra import per_joule
 from . import compiled
-from .blocks import blockwise
-from .display import with_luminance
+from .compiled import with_luminance
 from .efficiency import QuantumEfficiency, white_balance
 from .noise import NormalField, counts_of_one_mean, draw_normals, poisson_on_dark, variates_by_code
 
 F32 = NDArray[np.float32]
+
+_ROWS_PER_BLOCK = 64  # measured as the fastest; two threads would wait for the interpreter's lock
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -296,3 +297,23 @@ def electrons_of(irradiance: Irradiance, weights: F32) -> F32:
         return cv2.merge(list(colours)).reshape(height, width, len(weights))
 
     return np.asarray(blockwise(step, np.moveaxis(irradiance.array, 0, 1)))
+
+
+def blockwise(step: Callable[..., NDArray[Any]], array: NDArray[Any], *more: NDArray[Any] | None) -> NDArray[Any]:
+    """Return `step(block, *blocks of more)` of all blocks of rows, joined.
+
+    `more` are arrays; None stays None.
+    """
+
+    def of_block(start: int) -> NDArray[Any]:
+        rows = slice(start, start + _ROWS_PER_BLOCK)
+        return step(array[rows], *(None if extra is None else extra[rows] for extra in more))
+
+    first = of_block(0)
+    if len(array) <= _ROWS_PER_BLOCK:
+        return first
+    out = np.empty((len(array), *first.shape[1:]), first.dtype)
+    out[:_ROWS_PER_BLOCK] = first
+    for start in range(_ROWS_PER_BLOCK, len(array), _ROWS_PER_BLOCK):
+        out[start : start + _ROWS_PER_BLOCK] = of_block(start)
+    return out

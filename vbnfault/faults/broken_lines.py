@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import buffers
 from .context import FaultContext, Params
 from .contract import Fault
 from .fields import Interval, Severity, bounds, choice, number
@@ -96,7 +95,7 @@ class TextureBrokenLines(Fault):
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
         """Return the image with the lines set in all four channels."""
-        out = buffers.copy(quantity.array)
+        out = quantity.array.copy()
         for value in (0, 255):  # saturated lines come last, so they win at crossings
             out[_of_value(params, "row", value)] = value
             out[:, _of_value(params, "column", value)] = value

@@ -19,13 +19,12 @@ The numbers of failures and their fractions are assumed, except that one to five
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..detector.nodes import node_of, readout_steps
-from ..detector.raw_damage import Axis, dead_lines, duplicated_lines, lost_node, saturated_lines, shifted_lines
+from ..detector.nodes import last_before, node_of, readout_steps
 from .context import FaultContext, Params
 from .contract import Fault
 from .fields import Interval, Severity, bounds, number
@@ -146,21 +145,13 @@ class ReadoutBrokenLines(Fault):
             for axis in ("row", "column"):
                 for shift in sorted({line["shift_px"] for line in _of(params, kind, axis)}):
                     lines = [line for line in _of(params, kind, axis) if line["shift_px"] == shift]
-                    index = [line["index"] for line in lines]
-                    along = cast(Axis, axis)
-                    if kind == "dead":
-                        failed = dead_lines(out, index, along, lost_dn)
-                    elif kind == "saturated":
-                        failed = saturated_lines(out, index, along, readout.bits)
-                    elif kind == "duplicated":
-                        failed = duplicated_lines(out, index, along)
-                    else:
-                        failed = shifted_lines(out, index, along, shift, lost_dn)
-                    np.copyto(out, failed.raw, where=_reached(lines, context))
+                    failed = out.copy()
+                    _fail(failed if axis == "row" else failed.T, kind, lines, shift, lost_dn, readout.top_dn)
+                    np.copyto(out, failed, where=_reached(lines, context))
         if params["register"]:
             out[_behind(params["register"], context)] = readout.bias_dn
         if params["node"] >= 0:
-            out = lost_node(out, readout.nodes, params["node"]).raw
+            out[node_of(context.shape, readout.nodes) == params["node"]] = 0
         return quantity.with_array(out)
 
     def footprint(self, params: Params, context: FaultContext) -> Mask:
@@ -174,6 +165,24 @@ class ReadoutBrokenLines(Fault):
             region |= node_of(context.shape, sensor.readout.nodes) == params["node"]
         reached: Mask = detector.footprint(region)
         return reached
+
+
+def _fail(
+    raw: NDArray[np.uint16], kind: str, lines: list[dict[str, Any]], shift_px: int, lost_dn: int, top_dn: int
+) -> None:
+    """Let some lines of a mosaic, its first axis, fail in place."""
+    index = np.unique(np.array([line["index"] for line in lines], dtype=np.intp))
+    if kind == "duplicated":  # a run of lines repeats the last one before it
+        source = last_before(index)
+        raw[index[source >= 0]] = raw[source[source >= 0]]
+        return
+    moved = np.full_like(raw[index], top_dn if kind == "saturated" else lost_dn)
+    if kind == "shifted":
+        to, of = (
+            (slice(shift_px, None), slice(-shift_px)) if shift_px > 0 else (slice(shift_px), slice(-shift_px, None))
+        )
+        moved[:, to] = raw[index][:, of]
+    raw[index] = moved
 
 
 def _of(params: Params, kind: str, axis: str) -> list[dict[str, Any]]:

@@ -35,7 +35,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import buffers
 from .context import FaultContext, Params
 from .contract import Fault
 from .fields import Interval, Severity, bounds, number
@@ -152,7 +151,7 @@ class TextureBrokenPixels(Fault):
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
         """Return the image with lines, neighbours and defects. All other pixels stay bit for bit the same."""
         layout = _layout_once(params, context)
-        out = buffers.copy(quantity.array)
+        out = quantity.array.copy()
         grey = context.camera.is_monochrome
         if len(layout.line):
             touched = _gather(out, layout.line)

@@ -10,7 +10,7 @@ that the device has by then and did not have before:
 - random telegraph signals, each in its state at the exposure.
 
 Defects spread to neighbouring pixels by demosaicing. In a CCD, charge is clocked past the defects. A hot pixel
-therefore draws a line on the side away from the register (`detector.transfer.passing_dark_e`).
+therefore draws a line on the side away from the register (`detector.charge.passing_dark_e`).
 
 Each defect acts at the same step as the device's own defects of its kind (`detector.effects`). Dead pixels keep
 less of the light, but all their dark current. Dark current and telegraph signals are charge with shot noise.
@@ -32,10 +32,10 @@ from numpy.typing import NDArray
 
 from ..core.quantities import DEAD, HOT, RTS, RTS_HIGH, STUCK
 from ..detector.chain import Device
+from ..detector.charge import passing_dark_e
 from ..detector.effects.electrons import upper_fraction
 from ..detector.effects.output import show_stuck
 from ..detector.individual import Individual, IndividualSpec, RtsPixels, StuckPixels, aged, dark_rate_e_s, offset_e
-from ..detector.transfer import passing_dark_e
 from .context import FaultContext, Params
 from .contract import Fault
 from .fields import Interval, Severity, bounds, number

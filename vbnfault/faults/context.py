@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..camera import Camera
 from ..core.quantities import FarSource, Radiance
 from ..core.shared_results import SharedResults
-from ..lens.footprint import ImageFrame
+from ..lens.image_frame import ImageFrame
 
 Params = dict[str, Any]
 T = TypeVar("T")

@@ -19,13 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..camera import Camera
-from ..core import buffers
 from ..core.errors import under_key
-from ..core.quantities import RGBI, Charge, Electrons, Offset, Quantity, RawMosaic, RimRows, soft_kind
+from ..core.quantities import RGBI, Charge, Electrons, Offset, Quantity, RawMosaic, soft_kind
 from ..core.registry import DeclarationError
 from ..detector.effects import STEPS as MOSAIC_STEPS
-from ..lens import load_lens
-from ..lens.footprint import DEFAULT_LENS
+from ..lens import Prescription, load_lens
+from ..lens.image_frame import DEFAULT_LENS, ImageFrame
 from .context import FaultContext, Params
 from .fields import Interval, Severity, parse_field, path
 from .models import register
@@ -181,9 +180,24 @@ class Fault:
         """Return the drawn parameters: plain, JSON-able data, sufficient to inject the same fault again."""
         return {}
 
+    def draw_state(self, context: FaultContext, rng: np.random.Generator) -> Params:
+        """Return the parameters of `draw` on which the image depends; the others only describe the fault."""
+        return self.draw(context, rng)
+
+    def added_light(self, params: Params, context: FaultContext, once: Any, *, spikes: Any = None) -> Any:
+        """Return what the fault adds by its parts, for studies (`straylight_lens.AddedLight`); None: unknown.
+
+        `once` remembers results by function and arguments (`lens.straylight.total.Once`).
+        """
+        return None
+
     def alter(self, camera: Camera, params: Params) -> Camera:
         """Return the camera with this fault, if the fault changes a parameter of the instrument."""
         return camera
+
+    def prescription(self, frame: ImageFrame) -> Prescription | None:
+        """Return the prescription that the model traces behind a camera; None if it traces none."""
+        return None
 
     def inform(self, context: FaultContext, params: Params) -> FaultContext:
         """Return the context for the models with `informed`, if this fault changes what they act on."""
@@ -192,20 +206,6 @@ class Fault:
     def apply(self, quantity: Q, params: Params, context: FaultContext) -> Q:
         """Return the quantity of `step` with this fault. The input is not modified."""
         return quantity
-
-    def reach_rows(self, params: Params) -> int | None:
-        """Return from how many rows away light may reach a pixel in `apply_to_rows`; None: that does not exist.
-
-        A model at the step `electrons` that has it returns a new array from `apply`, which its caller may change.
-        """
-        return None
-
-    def apply_to_rows(self, quantity: Q, rows: slice, params: Params, context: FaultContext) -> Q:
-        """Return `apply` for a quantity that holds some rows of the frame.
-
-        Pixels nearer than `reach_rows` to the edge of `rows`, where that is not the edge of the frame, may differ.
-        """
-        raise NotImplementedError(f"{self.fault}/{self.model} acts on whole frames only")
 
     def apply_at(self, step: str, quantity: Q, params: Params, context: FaultContext) -> Q:
         """Return the quantity of one of `steps` with this fault. A model with `later_steps` overrides this hook."""
@@ -273,13 +273,8 @@ def act(fault: Fault, light: Electrons, params: Params, context: FaultContext) -
     A fault that acts on all light may clip it, so the two planes cannot be treated one by one. The plane past the
     rims becomes the result for all light minus the result for the light before the rims, at least 0.
     """
-    if light.rim_rows is not None:
-        reach = None if fault.adds_past_rims else fault.reach_rows(params)
-        if reach is not None:
-            return _act_beside_rows(fault, light, params, context, reach)
-        light = light.in_planes
     if fault.adds_past_rims:
-        past = buffers.zeros(light.array.shape) if light.past_rims is None else light.past_rims
+        past = np.zeros_like(light.array) if light.past_rims is None else light.past_rims
         return fault.apply(replace(light, past_rims=past), params, context)
     if light.past_rims is None:
         return fault.apply(light, params, context)
@@ -287,42 +282,7 @@ def act(fault: Fault, light: Electrons, params: Params, context: FaultContext) -
     if fault.at_rims:
         return replace(rest, past_rims=light.past_rims * np.float32(fault.passed_to_sun(params, context)))
     whole = fault.apply(light.merged, params, context)
-    past = np.subtract(whole.array, rest.array, out=buffers.empty(rest.array.shape))
-    return replace(rest, past_rims=np.maximum(past, 0, out=past))
-
-
-def _act_beside_rows(
-    fault: Fault, light: Electrons, params: Params, context: FaultContext, reach: int
-) -> Electrons:
-    """Return the light after an optical fault, with the same bits as `act` for two planes.
-
-    Outside the rows with light past the rims both planes of `act` would be computed from the same numbers. So the
-    fault acts on all light, and in these rows, and as far from them as it `reach`es, on the light before the rims.
-    """
-    band = light.rim_rows
-    assert band is not None
-    height = len(light.array)
-    rows = _widened(band.rows, 0 if fault.at_rims else reach, height)
-    seen = _widened(rows, reach, height)
-    before = light.array[seen].copy()
-    before[band.rows.start - seen.start : band.rows.stop - seen.start] = band.before
-    part = replace(light, array=before, rim_rows=None)
-    rest = fault.apply_to_rows(part, seen, params, context).array
-    rest = rest[rows.start - seen.start : rows.stop - seen.start].copy()
-    whole = fault.apply(replace(light, rim_rows=None), params, context)
-    if fault.at_rims:
-        past = band.past * np.float32(fault.passed_to_sun(params, context))
-    else:
-        past = np.maximum(whole.array[rows] - rest, 0)
-    array = buffers.copy(whole.array) if np.shares_memory(whole.array, light.array) else whole.array
-    array.flags.writeable = True
-    array[rows] = rest + past
-    return replace(whole, array=array, rim_rows=RimRows(rows=rows, before=rest, past=past))
-
-
-def _widened(rows: slice, by: int, height: int) -> slice:
-    """Return rows and `by` rows on either side of them, within the frame; no rows stay none."""
-    return slice(max(0, rows.start - by), min(height, rows.stop + by)) if rows.stop > rows.start else rows
+    return replace(rest, past_rims=np.maximum(whole.array - rest.array, 0))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -346,6 +306,10 @@ class LensFault(Fault):
         if self.lens:
             with under_key("lens"):
                 load_lens(self.lens)
+
+    def prescription(self, frame: ImageFrame) -> Prescription:
+        """Return the named lens or the camera's own."""
+        return frame.real_lens(self.lens).prescription
 
 
 def with_sensor(camera: Camera, **changes: Any) -> Camera:

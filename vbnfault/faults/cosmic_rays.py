@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..detector.cosmic import LEAST_MEV_CM2_G, CosmicRayModel, CosmicRays, stopping_power_MeV_cm2_g
-from ..detector.poisson import poisson_above_0
+from ..detector.noise import poisson_above_0
 from .context import FaultContext, Params
 from .contract import Fault
 from .fields import Interval, Severity, bounds, number

@@ -24,7 +24,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import buffers
 from .context import FaultContext, Params
 from .contract import Fault
 from .fields import Interval, Severity, bounds, flag
@@ -75,14 +74,6 @@ class GaussianDegradation(Fault):
         kernel = np.asarray(taps, dtype=np.float32)
         return quantity.with_array(_blur(quantity.array, quantity.white_e, kernel))
 
-    def reach_rows(self, params: Params) -> int:
-        """Return half the filter's size."""
-        return int(params["kernel_px"]) // 2
-
-    def apply_to_rows(self, quantity: Any, rows: slice, params: Params, context: FaultContext) -> Any:
-        """Return the expected electrons of some rows, first clipped to white, then filtered."""
-        return self.apply(quantity, params, context)
-
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
         """Return the whole image as bool[y, x]."""
         return np.ones(context.shape, dtype=bool)
@@ -106,7 +97,7 @@ def _blur(
     height, width = array.shape[:2]
     white_row = np.tile(white_e, width)  # flat rows of width · channels values: far faster than broadcasting
     reach = len(kernel) // 2
-    out = buffers.empty(array.shape)
+    out = np.empty_like(array)
 
     def filter_rows(start: int) -> None:
         stop = min(height, start + step)

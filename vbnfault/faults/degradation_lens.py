@@ -35,16 +35,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from ..core import buffers, spectra
+from ..core import spectra
 from ..core.spectra import Bands
 from ..lens import Prescription
 from ..lens.coating import mean_reflectance
-from ..lens.footprint import ImageFrame
+from ..lens.image_frame import ImageFrame
 from ..lens.straylight.scatter import Harvey
 from .context import FaultContext, Params
 from .contract import LensFault
 from .fields import Interval, Severity, bounds, choice, number
-from .planes import add_to, times
+from .planes import times
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -127,7 +127,7 @@ class Contamination(LensFault):
         lost = params["haze"] + sum(s["share"] for s in params["scratches"])
         out = times(quantity.array, passes * (1 - lost))
         if lost:
-            add_to(out, _strewn(quantity.array, quantity.white_e, passes, params, context))
+            out += _strewn(quantity.array, quantity.white_e, passes, params, context)
         return quantity.with_array(out)
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
@@ -320,6 +320,6 @@ def _strewn(array: F32, white_e: F32, passes: F64, params: Params, context: Faul
     inner = np.maximum(np.ascontiguousarray(inner), np.float32(0)) * passes.astype(np.float32)
     if step == 1:
         return inner[1:-1, 1:-1]
-    finer = buffers.empty(((rows + 2) * step, (columns + 2) * step, channels))
+    finer = np.empty(((rows + 2) * step, (columns + 2) * step, channels), np.float32)
     cv2.resize(inner, finer.shape[1::-1], dst=finer, interpolation=cv2.INTER_LINEAR)
     return finer[step : step + height, step : step + width]

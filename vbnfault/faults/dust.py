@@ -121,14 +121,6 @@ class GaussianDust(Fault):
         # outside the grains the factor is exactly 1; to choose the pixels of the grains takes four times as long
         return quantity.with_array(times(quantity.array, _transmission_once(params, context)))
 
-    def reach_rows(self, params: Params) -> int:
-        """Return 0: each pixel has its own factor."""
-        return 0
-
-    def apply_to_rows(self, quantity: Any, rows: slice, params: Params, context: FaultContext) -> Any:
-        """Return the expected electrons of some rows times the transmission of all grains."""
-        return quantity.with_array(times(quantity.array, _transmission_once(params, context)[rows]))
-
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
         """Return the pixels that a grain darkens by more than `mask_level_dn`, bool[y, x]."""
         return _transmission_once(params, context) < 1

@@ -41,15 +41,16 @@ from scipy.special import j1
 
 from ..lens import RealLens, load_lens
 from ..lens.coating import reflect_transmit
-from ..lens.footprint import Footprint, ImageFrame
+from ..lens.footprint import Footprint
 from ..lens.glass import D_NM
+from ..lens.image_frame import ImageFrame
 from ..lens.rays import forward
 from ..lens.straylight.paraxial import along
 from ..lens.straylight.particles import DUST_INDEX
 from .context import FaultContext, Params
 from .contract import LensFault
 from .fields import Interval, Severity, bounds, number
-from .planes import add_to, reaches, times
+from .planes import reaches, times
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -137,17 +138,9 @@ class DefocusedDust(LensFault):
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
         """Return the expected electrons times the transmission of all grains, plus their glow."""
-        return self.apply_to_rows(quantity, slice(None), params, context)
-
-    def reach_rows(self, params: Params) -> int:
-        """Return 0: each pixel has its own factor and glow."""
-        return 0
-
-    def apply_to_rows(self, quantity: Any, rows: slice, params: Params, context: FaultContext) -> Any:
-        """Return the expected electrons of some rows times the transmission of all grains, plus their glow."""
-        out = times(quantity.array, _shadows_once(params, context).transmission[rows])
+        out = times(quantity.array, _shadows_once(params, context).transmission)
         light = _glow_once(params, context)
-        return quantity.with_array(out if light is None else add_to(out, light[rows]))
+        return quantity.with_array(out if light is None else out + light)
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
         """Return the pixels where the loss reaches `mask_loss`, or the glow that fraction of white, bool[y, x].
@@ -173,7 +166,7 @@ class DefocusedDust(LensFault):
 def _footprint(frame: ImageFrame, name: str, row: int, height_mm: float) -> Footprint:
     """Return the footprints on a surface of the lens, or `height_mm` above the sensor if that is not 0."""
     beams = frame.beams(name)
-    return beams.above_sensor(height_mm) if height_mm else beams.on_row(row)
+    return Footprint.above_sensor(beams, height_mm) if height_mm else Footprint.on_row(beams, row)
 
 
 class _Grains(NamedTuple):

@@ -5,88 +5,33 @@ The definition of a model registers it. The orders of the classes follow from wh
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import inspect
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
-from ..core.errors import InputError, VbnfaultError, shown
+from ..core.errors import InputError, shown
 from ..core.registry import DeclarationError, Registry, chained, is_name
-from ..core.registry import undoing_registrations as undoing_all
 from ..core.tables import did_you_mean
-from .fields import field_schema, parse_field
+from .fields import Severity, field_schema, parse_field
 from .levels import Levels, severity_schema, with_severity
 
 if TYPE_CHECKING:
     from .contract import Fault
 
-_PACKAGE = __package__ or ""
-
-
-def _forget_orders() -> None:
-    """Forget what was computed from the models that were registered so far."""
-    _sorted_registry.cache_clear()
-    _physical_order.cache_clear()
-
-
 # "class/model" → type
-_REGISTRY: Registry[type[Fault]] = Registry("fault model", _PACKAGE, changed=_forget_orders)
-
-
-def _models() -> dict[str, dict[str, type[Fault]]]:
-    """Return fault class → model → type of the models that are registered so far."""
-    classes: dict[str, dict[str, type[Fault]]] = {}
-    for cls in _REGISTRY.registered().values():
-        classes.setdefault(cls.fault, {})[cls.model] = cls
-    return classes
+_REGISTRY: Registry[type[Fault]] = Registry("fault model", __package__ or "")
 
 
 def register(cls: type[Fault]) -> None:
-    """Add a model to the registry. Raise DeclarationError if its names or declarations contradict the others'."""
-    where = f"fault model {cls.fault}/{cls.model}"
-    if not is_name(cls.fault) or not is_name(cls.model):
-        text = f"{where}: its names must consist of lower-case letters, digits and underscores"
-        raise DeclarationError([cls.fault], text)
-    others = {name: other for name, other in _REGISTRY.registered().items() if other.fault == cls.fault}
-    replaceable = {name for name in others if _REGISTRY.is_replaceable(name)}
-    if cls.default:
-        rivals = [m for name, m in others.items() if m.default and m.model != cls.model and name not in replaceable]
-        if rivals:
-            text = f"{where}: default = True, but {rivals[0].fault}/{rivals[0].model} is the default of the class"
-            raise DeclarationError([cls.fault], text)
-        if cls.after is None:
-            text = f"{where}: the default model must state the class after which its class acts: after = ..."
-            raise DeclarationError([cls.fault], text)
-        if cls.axis is not None and not is_packaged(cls):
-            text = f"{where}: axis = {cls.axis}: only the six classes of the paper have a position"
-            raise DeclarationError([cls.fault], text)
-    name = f"{cls.fault}/{cls.model}"
-    _REGISTRY.add(name, cls, module=cls.__module__, qualname=cls.__qualname__)
-    # a plug-in of another scene may have defined the whole class, with a default model of its own
-    _REGISTRY.remove(replaceable - {name})
+    """Add a model to the registry. Raise DeclarationError if another class has its names."""
+    _REGISTRY.add(f"{cls.fault}/{cls.model}", cls, module=cls.__module__, qualname=cls.__qualname__)
 
 
-def is_registered(cls: type[Fault]) -> bool:
-    """Return whether the names of a model belong to this class; the same class of the same file is put back."""
-    name = f"{cls.fault}/{cls.model}"
-    if not _REGISTRY.holds(name, cls):
-        return False
-    if _REGISTRY[name] is not cls:
-        register(cls)
-    return True
-
-
-def models_of(condition: Callable[[type[Fault]], bool]) -> tuple[type[Fault], ...]:
-    """Return the registered models that meet a condition."""
-    return tuple(cls for cls in _REGISTRY.registered().values() if condition(cls))
-
-
-def undoing_registrations(*, always: bool = False) -> contextlib.AbstractContextManager[None]:
-    """Return a context that forgets what its block registers if the block raises an exception, or `always`."""
-    _import_all()
-    return undoing_all(always=always)
+def registered() -> list[type[Fault]]:
+    """Return all models."""
+    return list(_REGISTRY.values())
 
 
 def is_packaged(cls: type[Fault]) -> bool:
@@ -98,8 +43,7 @@ def registry() -> dict[str, dict[str, type[Fault]]]:
     """Return fault class → model → type, with the classes in the order of the dataset.
 
     The first model of each class is its default. The others are sorted by module, those of this package first,
-    whatever the order of imports. Models of installed plug-ins are among them. A class from a plug-in of another
-    scene is missing if it has no place in the physical order any more.
+    whatever the order of imports. Models of installed plug-ins are among them.
 
     Raises
     ------
@@ -109,12 +53,7 @@ def registry() -> dict[str, dict[str, type[Fault]]]:
         If an installed plug-in is broken.
     """
     _import_all()
-    return _sorted_registry()
-
-
-def check_declarations() -> None:
-    """Raise DeclarationError if what the registered classes declare does not fit together."""
-    _sorted_registry()
+    return catalogue()
 
 
 @lru_cache(maxsize=1)
@@ -126,110 +65,91 @@ def _import_all() -> None:
     load_installed()
 
 
-@lru_cache(maxsize=1)
-def _sorted_registry() -> dict[str, dict[str, type[Fault]]]:
-    """Return the registry as it is now; see `registry`."""
-
-    def position(cls: type[Fault]) -> tuple[bool, bool, str]:
-        return not cls.default, not is_packaged(cls), cls.__module__
-
-    for cls in _REGISTRY.registered().values():
-        _check_fields(cls)
-    known = _models()
-    return {
-        name: {cls.model: cls for cls in sorted(known[name].values(), key=position)}
-        for name in _on_axis(_physical_order())
-    }
-
-
-def _check_fields(cls: type[Fault]) -> None:
-    """Raise DeclarationError if a model is no frozen, keyword-only dataclass of fields made by the helpers."""
-    where = f"fault model {cls.fault}/{cls.model}"
-    options = cls.__dict__.get("__dataclass_params__")
-    if options is None or not (options.frozen and getattr(options, "kw_only", True)):
-        raise DeclarationError(
-            [cls.fault], f"{where}: its class must be decorated with @dataclass(frozen=True, kw_only=True)"
-        )
-    for f in dataclasses.fields(cls):
-        if "kind" not in f.metadata:
-            raise DeclarationError(
-                [cls.fault], f"{where}: {f.name} must be declared with one of the field helpers, such as bounds()"
-            )
-
-    _check_severity(cls, where)
-
-
-def _check_severity(cls: type[Fault], where: str) -> None:
-    """Raise DeclarationError if the severity of a model names no number of its, or leaves the number's limits."""
-    severity = cls.severity
-    if severity is None:
-        return
-    declared = {f.name: f.metadata for f in dataclasses.fields(cls) if "limits" in f.metadata}
-    if severity.key not in declared:
-        raise DeclarationError([cls.fault], f"{where}: its severity names {severity.key!r}, no number of it")
-    unknown = severity.keys.keys() - {f.name for f in dataclasses.fields(cls)}
-    if unknown:
-        raise DeclarationError([cls.fault], f"{where}: its severity holds {min(unknown)!r}, no key of it")
-    low, high = declared[severity.key]["limits"]
-    if not all(max(low, 0) <= value <= high and value > 0 for value in (severity.low, severity.high)):
-        raise DeclarationError(
-            [cls.fault],
-            f"{where}: its severity goes from {severity.low:g} to {severity.high:g}: must be above 0 and within "
-            f"the limits [{low:g}, {high:g}] of {severity.key}",
-        )
-
-
-def _defaults() -> dict[str, type[Fault]]:
-    """Return the default model of every class. Raise DeclarationError if a class has none."""
-    known = _models()
-    defaults = {cls.fault: cls for models in known.values() for cls in models.values() if cls.default}
-    for name, models in known.items():
-        if name not in defaults:
-            raise DeclarationError(
-                [name], f"fault class {name}: none of its models ({', '.join(models)}) states default = True"
-            )
-    return defaults
+def catalogue() -> dict[str, dict[str, type[Fault]]]:
+    """Return the models that are registered now; see `registry`."""
+    return _catalogue(_REGISTRY.version)[0]
 
 
 @lru_cache(maxsize=1)
-def _physical_order() -> tuple[str, ...]:
-    """Return all classes in the order in which their effects act.
+def _catalogue(version: int) -> tuple[dict[str, dict[str, type[Fault]]], tuple[str, ...]]:
+    """Return the models that are registered now, and their classes in the order in which their effects act.
 
     The `after` of the classes form a tree with one root. The classes of this package are one long branch of it; a
     class of a plug-in comes directly behind the class that it names.
     """
-    defaults = _defaults()
-    packaged = {name for name, cls in defaults.items() if is_packaged(cls)}
-    of_others = _REGISTRY.unused()
-    unused = {name for name, cls in defaults.items() if f"{name}/{cls.model}" in of_others}
-    return chained({name: str(cls.after) for name, cls in defaults.items()}, packaged, "fault class", unused)
+    known: dict[str, list[type[Fault]]] = {}
+    for cls in sorted(_REGISTRY.values(), key=lambda cls: (not cls.default, not is_packaged(cls), cls.__module__)):
+        _check(cls)
+        known.setdefault(cls.fault, []).append(cls)
+    for name, models in known.items():
+        defaults = [cls for cls in models if cls.default]
+        if not defaults:
+            text = f"none of its models ({', '.join(cls.model for cls in models)}) states default = True"
+            raise DeclarationError([name], f"fault class {name}: {text}")
+        if len(defaults) > 1:
+            first, rival = (f"{name}/{cls.model}" for cls in defaults[:2])
+            raise DeclarationError(
+                [name], f"fault model {rival}: default = True, but {first} is the default of the class"
+            )
+    packaged = {name for name, models in known.items() if is_packaged(models[0])}
+    order = chained({name: str(models[0].after) for name, models in known.items()}, packaged, "fault class")
+
+    def position(name: str) -> tuple[float, str]:
+        axis = known[name][0].axis
+        return float("inf") if axis is None else axis, name
+
+    return {name: {cls.model: cls for cls in known[name]} for name in sorted(known, key=position)}, order
+
+
+def _check(cls: type[Fault]) -> None:
+    """Raise DeclarationError if a model declares its names, its place or its fields wrongly."""
+    problem = ""
+    options = cls.__dict__.get("__dataclass_params__")
+    if not is_name(cls.fault) or not is_name(cls.model):
+        problem = "its names must consist of lower-case letters, digits and underscores"
+    elif cls.default and cls.after is None:
+        problem = "the default model must state the class after which its class acts: after = ..."
+    elif cls.default and cls.axis is not None and not is_packaged(cls):
+        problem = f"axis = {cls.axis}: only the six classes of the paper have a position"
+    elif options is None or not (options.frozen and getattr(options, "kw_only", True)):
+        problem = "its class must be decorated with @dataclass(frozen=True, kw_only=True)"
+    else:
+        wrong = [f.name for f in dataclasses.fields(cls) if "kind" not in f.metadata]
+        if wrong:
+            problem = f"{wrong[0]} must be declared with one of the field helpers, such as bounds()"
+        elif cls.severity is not None:
+            problem = _wrong_severity(cls, cls.severity)
+    if problem:
+        raise DeclarationError([cls.fault], f"fault model {cls.fault}/{cls.model}: {problem}")
+
+
+def _wrong_severity(cls: type[Fault], severity: Severity) -> str:
+    """Return why the severity of a model names no number of its, or leaves the number's limits; "" if it fits."""
+    declared = {f.name: f.metadata for f in dataclasses.fields(cls)}
+    if "limits" not in declared.get(severity.key, {}):
+        return f"its severity names {severity.key!r}, no number of it"
+    unknown = severity.keys.keys() - declared.keys()
+    if unknown:
+        return f"its severity holds {min(unknown)!r}, no key of it"
+    low, high = declared[severity.key]["limits"]
+    if all(max(low, 0) <= value <= high and value > 0 for value in (severity.low, severity.high)):
+        return ""
+    return (
+        f"its severity goes from {severity.low:g} to {severity.high:g}: must be above 0 and within "
+        f"the limits [{low:g}, {high:g}] of {severity.key}"
+    )
 
 
 def dataset_order(names: Iterable[str]) -> list[str]:
     """Return the names in the order of the dataset's `fault` axis."""
-    _import_all()
-    return _on_axis(names)
-
-
-def _on_axis(names: Iterable[str]) -> list[str]:
-    """Return the names as `dataset_order` does, from the models that are registered so far."""
-    axis = {cls.fault: cls.axis for cls in _defaults().values()}
-
-    def position(name: str) -> tuple[float, str]:
-        index = axis.get(name)
-        return float("inf") if index is None else index, name
-
-    return sorted(set(names), key=position)
+    wanted = set(names)
+    return [name for name in registry() if name in wanted]
 
 
 def physical_order(names: Collection[str]) -> list[str]:
-    """Return the names in the order in which the effects act. Raises VbnfaultError for an unknown class."""
-    _import_all()
-    position = {name: k for k, name in enumerate(_physical_order())}
-    for name in names:
-        if name not in position:
-            raise VbnfaultError(f"fault class {name}: its plug-in is not loaded any more; load the scene again")
-    return sorted(set(names), key=position.__getitem__)
+    """Return the names of classes in the order in which the effects act."""
+    registry()
+    return [name for name in _catalogue(_REGISTRY.version)[1] if name in names]
 
 
 def from_dict(fault_class: str, table: Mapping[str, Any], *, source: str) -> Fault:

@@ -58,12 +58,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core import spectra
-from ..detector.poisson import poisson_above_0
+from ..detector.noise import poisson_above_0
 from ..lens.streaks import Streaks, drawn, inside, pupil_support
 from .context import FaultContext, Params
 from .contract import Fault
 from .fields import Interval, bounds, flag, number
-from .planes import add_to, reaches, times
+from .planes import reaches, times
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -164,7 +164,7 @@ class _Particles(Fault):
         light = _light_once(params, context)
         if light is None:
             return quantity
-        return quantity.with_array(add_to(times(quantity.array, light.passes), light.added))
+        return quantity.with_array(times(quantity.array, light.passes) + light.added)
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
         """Return the pixels where any channel gains `mask_level_dn`, or all lose that fraction, bool[y, x]."""

@@ -9,65 +9,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..camera import Camera
-from ..core import buffers
 from ..core.quantities import LUMINANCE
 
-_ROWS_AT_ONCE = 64  # so that the factors of these rows stay in the cache
+F32 = NDArray[np.float32]
 
 
-def times(array: NDArray[np.float32], factor: NDArray[Any]) -> NDArray[np.float32]:
+def times(array: F32, factor: NDArray[Any]) -> F32:
     """Return planes float32[y, x, channel] times a factor for each channel [channel] or for each pixel [y, x]."""
-    out = buffers.empty(array.shape)
-    if factor.ndim == 1:
-        # numpy is quick along rows, but not along three channels; OpenCV multiplies by a scalar in float64
-        row = np.tile(factor.astype(np.float32), array.shape[1])
-        np.multiply(array.reshape(len(array), -1), row, out=out.reshape(len(array), -1))
-        return out
-    for start in range(0, len(array), _ROWS_AT_ONCE):
-        rows = slice(start, start + _ROWS_AT_ONCE)
-        cv2.multiply(array[rows], cv2.merge([factor[rows]] * array.shape[2]), dst=out[rows])
-    return out
+    return array * (factor if factor.ndim == 1 else factor[..., None]).astype(np.float32)
 
 
-def plus(array: NDArray[np.float32], other: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the sum of two arrays float32[y, x, channel] of the same shape."""
-    out = buffers.empty(array.shape)
-    cv2.add(array, other, dst=out)
-    return out
-
-
-def add_to(array: NDArray[np.float32], other: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Add another array of the same shape to an array float32[y, x, channel] in place, and return it."""
-    cv2.add(array, other, dst=array)
-    return array
-
-
-def plus_plane(
-    array: NDArray[np.float32], plane: NDArray[np.float32], factors: NDArray[np.floating[Any]]
-) -> NDArray[np.float32]:
-    """Return planes float32[y, x, channel] plus a plane float32[y, x] times a factor for each channel [channel]."""
-    out = buffers.empty(array.shape)
-    for start in range(0, len(array), _ROWS_AT_ONCE):
-        rows = slice(start, start + _ROWS_AT_ONCE)
-        more = cv2.merge([plane[rows] * np.float32(factor) for factor in factors])
-        cv2.add(array[rows], more.reshape(array[rows].shape), dst=out[rows])
-    return out
-
-
-def sums(array: NDArray[np.float32]) -> NDArray[np.float64]:
+def sums(array: F32) -> NDArray[np.float64]:
     """Return the sum of each channel of float32[y, x, channel], float64[channel]."""
     if array.shape[2] > 4:  # OpenCV's scalars have four numbers
         return np.asarray(array.sum(axis=(0, 1), dtype=np.float64))
     return np.array(cv2.sumElems(array)[: array.shape[2]])
 
 
-def reaches(array: NDArray[np.float32], level: NDArray[np.float32]) -> NDArray[np.bool_]:
+def reaches(array: F32, level: F32) -> NDArray[np.bool_]:
     """Return where any channel of float32[y, x, channel] is at least its level, float32[channel]; bool[y, x]."""
-    if array.shape[2] > 4:
-        return np.asarray((array >= level).any(axis=2))
-    below = tuple(map(float, np.nextafter(level, np.float32(-np.inf))))
-    lowest = (-float(np.finfo(np.float32).max),) * len(below)
-    return np.asarray(cv2.inRange(array, lowest, below) == 0)
+    return np.asarray((array >= level).any(axis=2))
 
 
 def intensity_dn(electrons: NDArray[np.float32], camera: Camera) -> NDArray[np.float32]:

@@ -40,7 +40,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import buffers
 from ..core.errors import InputError, VbnfaultError
 from ..core.file_contents import cached_with_contents
 from ..core.images import decoded_image
@@ -50,7 +49,7 @@ from ..core.user_files import read_input
 from .context import FaultContext, Params
 from .contract import Fault
 from .fields import Interval, Severity, bounds, number, paths, rows
-from .planes import intensity_dn, plus, reaches
+from .planes import intensity_dn, reaches
 
 # Radius of a flare's outline over half the side of its texture, as `benchmarks/flare_textures.py` draws it.
 FILL = 0.9
@@ -210,16 +209,7 @@ class TextureStraylight(Fault):
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
         """Return the expected electrons plus flares and glare."""
         layer = self._layer_once(params, context, quantity.white_e)
-        return quantity if layer is None else quantity.with_array(plus(quantity.array, layer))
-
-    def reach_rows(self, params: Params) -> int:
-        """Return 0: light is added to each pixel."""
-        return 0
-
-    def apply_to_rows(self, quantity: Any, rows: slice, params: Params, context: FaultContext) -> Any:
-        """Return the expected electrons of some rows plus flares and glare."""
-        layer = self._layer_once(params, context, quantity.white_e)
-        return quantity if layer is None else quantity.with_array(plus(quantity.array, layer[rows]))
+        return quantity if layer is None else quantity.with_array(quantity.array + layer)
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
         """Return the pixels where any channel gains at least `mask_level_dn`, bool[y, x]."""
@@ -297,7 +287,7 @@ def _layer(
         if placed is None:
             continue
         if layer is None:
-            layer = buffers.zeros((height, width, len(white_e)))
+            layer = np.zeros((height, width, len(white_e)), np.float32)
         window, stamp = placed
         layer[window] += stamp
     return layer

@@ -25,9 +25,10 @@ were the only ghost: `pair` (the reflecting rows of the prescription), `flux_fra
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from functools import partial
+from typing import Any
 
 import cv2
 import numpy as np
@@ -35,18 +36,29 @@ from numpy.typing import NDArray
 
 from ..core import spectra
 from ..core.quantities import Radiance
-from ..core.shared_results import SharedResults
 from ..core.spectra import Bands
+from ..lens import Prescription
+from ..lens.image_frame import ImageFrame
+from ..lens.straylight.paraxial import Ghost
 from ..lens.straylight.particles import CLEANLINESS_LIMITS
 from ..lens.straylight.scatter import ROUGHNESS_NM_LIMITS, Cleanliness
 from ..lens.straylight.scene import PointSources, RenderGrid, SceneInLens, in_channels, surrounding_grids
-from ..lens.straylight.scene_diffraction import starburst_of_source, wing_fraction
+from ..lens.straylight.scene_convolution import starburst_of_source, wing_fraction
 from ..lens.straylight.settings import Baffle, DirectPath, GhostSettings, SensorGrid, StraylightSettings, SunSource
-from ..lens.straylight.total import ClearLight, SunlightInLens, scene_veil_fraction, veil_per_px
+from ..lens.straylight.total import (
+    FINE_SPIKES,
+    GhostSource,
+    Once,
+    SunInLens,
+    SunStraylight,
+    anew,
+    scene_veil_fraction,
+    veil_per_px,
+)
 from .context import FaultContext, Params
 from .contract import LensFault
 from .fields import Interval, Severity, bounds, choice, flag, number
-from .planes import add_to, intensity_dn, plus, plus_plane, reaches, sums, times
+from .planes import intensity_dn, reaches, sums, times
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -55,8 +67,9 @@ _MOST_GHOSTS = 24
 _LEAST_SUN_RAD = 1e-5
 
 
-class _Light(NamedTuple):
-    """Hold the straylight of the Sun and what it costs the image.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class AddedLight:
+    """Hold what straylight adds to an image and takes from it.
 
     Attributes
     ----------
@@ -68,31 +81,16 @@ class _Light(NamedTuple):
         float64[channel]: fraction of the scene's image that becomes straylight.
     scene_added
         Whether `added` contains the straylight of the scene.
+    source, of_sun
+        The Sun's light in the lens, and what of it is in `added`; None if no Sun is in front of the camera.
     """
 
     added: F32
     direct_left: F64
     scene_lost: F64
     scene_added: bool
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class LensSunlight:
-    """Hold the Sun's light in the lens of a sample.
-
-    Attributes
-    ----------
-    light
-        The Sun's light in the lens, over the Sun's irradiance at the entrance; its bands are the channels.
-    rates
-        float64[channel]: electrons per second and pixel that the irradiance of the visible part of the Sun gives.
-    scene_lost
-        float64[channel]: fraction of the scene's image that becomes veil.
-    """
-
-    light: SunlightInLens
-    rates: F64
-    scene_lost: F64
+    source: SunInLens | None = None
+    of_sun: SunStraylight | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -167,13 +165,17 @@ class _LensStraylight(LensFault):
         if self.baffle_length_mm and not self.baffle_radius_mm:
             raise ValueError("baffle_length_mm: needs baffle_radius_mm")
 
+    def prescription(self, frame: ImageFrame) -> Prescription:
+        """Return the lens with its coating."""
+        return frame.prescription(self.lens, self.coating)
+
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
         """Return lens, coating, roughness, cleanliness, veil, baffle, mask level and the ghosts in the frame."""
-        params = self.draw_state(rng)
+        params = self.draw_state(context, rng)
         params["ghosts"] = self._ghosts(params, context)
         return params
 
-    def draw_state(self, rng: np.random.Generator) -> Params:
+    def draw_state(self, context: FaultContext, rng: np.random.Generator) -> Params:
         """Return the parameters of `draw` without the list of ghosts, which only describes them."""
         params: Params = {
             "lens": self.lens,
@@ -199,10 +201,11 @@ class _LensStraylight(LensFault):
         scene, added = times(quantity.array, 1 - light.scene_lost), light.added
         if not light.scene_added:
             veil = sums(quantity.array) * light.scene_lost
-            added = plus_plane(added, veil_per_px(context.shape, context.camera.focal_length_px), veil)
+            plane = veil_per_px(context.shape, context.camera.focal_length_px)
+            added = added + plane[..., None] * veil.astype(np.float32)
         if quantity.past_rims is None:
-            return quantity.with_array(add_to(scene, added))
-        past = add_to(times(quantity.past_rims, light.direct_left), added)
+            return quantity.with_array(scene + added)
+        past = times(quantity.past_rims, light.direct_left) + added
         return replace(quantity, array=scene, past_rims=past)
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
@@ -223,28 +226,33 @@ class _LensStraylight(LensFault):
         """Return `mask_level_dn`."""
         return float(self.mask_level_dn)
 
-    def _light_once(self, params: Params, context: FaultContext) -> _Light | None:
+    def _light_once(self, params: Params, context: FaultContext) -> AddedLight | None:
         """Return the straylight, computed once for each sample."""
-        return context.once("straylight.lens", params, lambda: self._light(params, context))
+        return context.once("straylight.lens", params, lambda: self.added_light(params, context, _of_view(context)))
 
-    def _light(self, params: Params, context: FaultContext) -> _Light | None:
+    def added_light(
+        self, params: Params, context: FaultContext, once: Once, *, spikes: tuple[int, int] = FINE_SPIKES
+    ) -> AddedLight | None:
         """Return the straylight; None if there is no Sun in front of the camera and no light of the scene."""
-        source, scene = self.sunlight(params, context), self.scene_light(params, context)
+        scene, source = self.scene_light(params, context), self.sun_in_lens(params, context)
+        if source is None and scene is None:
+            return None
+        lost = self.scene_lost(params, context)
         if source is None:
-            if scene is None:
-                return None
-            lost = self.scene_lost(params, context)
-            return _Light(added=scene, direct_left=1 - lost, scene_lost=lost, scene_added=True)
-        camera, light = context.camera, source.light
-        clear = _clear_light(light, source.rates, context)
-        samples = context.of_view.once("glare", light.glare_samples_key, light.glare_samples)
-        planes, direct_left = light.in_channels(source.rates, clear, samples, camera.exposure_s)
+            assert scene is not None
+            return AddedLight(added=scene, direct_left=1 - lost, scene_lost=lost, scene_added=True)
+        source = replace(source, spikes=spikes)
+        visible = 1.0 if context.sun_visible_fraction is None else float(context.sun_visible_fraction)
+        of_sun = source.straylight(channel_bands(context)[1] * visible, once)
+        planes = of_sun.total(context.camera.exposure_s)
         added = cv2.merge(list(planes)).reshape(*context.shape, len(planes))
-        return _Light(
-            added=added if scene is None else plus(added, scene),
-            direct_left=direct_left,
-            scene_lost=source.scene_lost,
+        return AddedLight(
+            added=added if scene is None else added + scene,
+            direct_left=of_sun.direct_fraction,
+            scene_lost=lost,
             scene_added=scene is not None,
+            source=source,
+            of_sun=of_sun,
         )
 
     def scene_light(self, params: Params, context: FaultContext) -> F32 | None:
@@ -272,22 +280,19 @@ class _LensStraylight(LensFault):
         total = in_lens.straylight(array, weights, around, _far_points(context, in_lens.reach)).total
         return np.ascontiguousarray(total.transpose(1, 2, 0))
 
-    def sunlight(self, params: Params, context: FaultContext) -> LensSunlight | None:
-        """Return the Sun's light in the lens before any ray is traced; None if no Sun is in front of the camera."""
+    def sun_in_lens(self, params: Params, context: FaultContext) -> SunInLens | None:
+        """Return the Sun's light in the lens; its bands are the channels. None if no Sun is before the camera."""
         sun = _sun(context)
         if sun is None:
             return None
         theta, azimuth = sun
-        camera = context.camera
-        bands, rates = _channel_bands(context)
-        sensor = _sensor_grid(context)
+        camera, sensor, bands = context.camera, _sensor_grid(context), channel_bands(context)[0]
         assert context.sun_xy_px is not None
         middle = np.array([camera.width_px / 2, camera.height_px / 2])
         x, y = (np.asarray(context.sun_xy_px) - middle) * sensor.pitch_mm
-        passed = camera.lens.transmittance(bands.wavelength_nm)
         area_mm2, axial_mm2 = camera.lens.pupil_area_mm2([np.tan(np.radians(theta)), 0.0])
-        light = SunlightInLens.of(
-            context.frame.prescription(params["lens"], params["coating"]),
+        return SunInLens(
+            lens=context.frame.prescription(params["lens"], params["coating"]),
             bands=bands,
             sensor=sensor,
             sun=SunSource(
@@ -298,16 +303,10 @@ class _LensStraylight(LensFault):
             ),
             settings=self._settings(params, context),
             path=DirectPath(
-                transmittance=passed,
+                transmittance=camera.lens.transmittance(bands.wavelength_nm),
                 admitted_mm2=float(area_mm2 * np.cos(np.radians(theta))),
                 beam_fraction=float(area_mm2 / axial_mm2),
             ),
-        )
-        visible = 1.0 if context.sun_visible_fraction is None else float(context.sun_visible_fraction)
-        return LensSunlight(
-            light=light,
-            rates=rates * visible,
-            scene_lost=self.scene_lost(params, context),
         )
 
     def _settings(self, params: Params, context: FaultContext) -> StraylightSettings:
@@ -341,27 +340,11 @@ class _LensStraylight(LensFault):
 
     def _ghosts(self, params: Params, context: FaultContext) -> list[dict[str, Any]]:
         """Return the brightest ghosts in the frame as plain data."""
-        from ..lens.straylight.irradiance import flare_model
-
-        sun = _sun(context)
-        if sun is None:
+        source, camera = self.sun_in_lens(params, context), context.camera
+        if source is None:
             return []
-        camera = context.camera
-        sensor = _sensor_grid(context)
-        pitch_mm = sensor.pitch_mm
-        key = (
-            context.frame.prescription(params["lens"], params["coating"]),
-            _channel_bands(context)[0],
-            sensor,
-            _sun_radius_rad(context),
-            GhostSettings(model=self.model, reflections=params["reflections"]),
-        )
-        made = flare_model(*key).worn(context.coating_loss)
-        shared = _shared_while_new(context)
-        by_peak = sorted(
-            shared.once("ghosts", (*key, sun), lambda: made.ghosts(*sun, most=_MOST_GHOSTS)),
-            key=lambda g: -g.peak_irradiance_fraction,
-        )
+        pitch_mm = source.sensor.pitch_mm
+        once = anew if context.coating_loss else _of_view(context)  # each sample has its own loss of coatings
         return [
             {
                 "pair": list(g.pair),
@@ -371,27 +354,23 @@ class _LensStraylight(LensFault):
                 "y_px": g.centroid_mm[1] / pitch_mm + camera.height_px / 2,
                 "rms_radius_px": g.rms_radius_mm / pitch_mm,
             }
-            for g in by_peak[:_MOST_GHOSTS]
+            for g in once(_brightest, source.of_ghosts)
         ]
 
 
-def _shared_while_new(context: FaultContext) -> SharedResults:
-    """Return where results of coatings that are whole are kept; each sample has its own loss of coatings."""
-    return SharedResults() if context.coating_loss else context.of_view
+def _brightest(source: GhostSource) -> list[Ghost]:
+    """Return the ghosts in the frame with the highest peaks, at most `_MOST_GHOSTS`, the brightest first."""
+    ghosts = source.model.ghosts(*source.sun, most=_MOST_GHOSTS)
+    return sorted(ghosts, key=lambda g: -g.peak_irradiance_fraction)
 
 
-def _clear_light(light: SunlightInLens, rates: F64, context: FaultContext) -> ClearLight:
-    """Return ghosts and starburst of the Sun, which the samples of a view share, in electrons per second."""
-    shared, key = _shared_while_new(context), (*light.clear_key, rates.tobytes())
-    return shared.once("ghosts and starburst", key, lambda: _new_clear_light(light, rates, context))
+def _of_view(context: FaultContext) -> Once:
+    """Return what remembers the results that the samples of a view share, by function and arguments."""
 
+    def once(function: Callable[..., Any], *arguments: Any) -> Any:
+        return context.of_view.once(function.__qualname__, arguments, partial(function, *arguments))
 
-def _new_clear_light(light: SunlightInLens, rates: F64, context: FaultContext) -> ClearLight:
-    """Return ghosts and starburst; the starburst does not depend on the coatings, whose wear differs by sample."""
-    if not context.coating_loss:
-        return light.clear_light(rates)  # whole coatings: the sum is shared
-    key = *light.burst_key, rates.tobytes()
-    return light.clear_light(rates, context.of_view.once("starburst", key, lambda: light.burst(rates)))
+    return once
 
 
 def _diffracts(params: Params, context: FaultContext) -> bool:
@@ -458,7 +437,7 @@ def _sensor_grid(context: FaultContext) -> SensorGrid:
     return SensorGrid(shape=context.shape, pitch_mm=context.camera.detector.pixel_pitch_um * 1e-3)
 
 
-def _channel_bands(context: FaultContext) -> tuple[Bands, F64]:
+def channel_bands(context: FaultContext) -> tuple[Bands, F64]:
     """Return the bands in which the channels sense sunlight, and its electrons per second, float64[channel]."""
     nodes, irradiance = _sunlight(context)
     nm = spectra.fine_nodes_nm(nodes)
@@ -471,7 +450,7 @@ def _bands_behind_lens(context: FaultContext) -> Bands:
 
     The scene and the Sun's image both have its spectrum.
     """
-    bands, _ = _channel_bands(context)
+    bands, _ = channel_bands(context)
     return bands.behind(context.camera.lens.transmittance(bands.wavelength_nm))
 
 

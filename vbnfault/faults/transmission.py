@@ -13,13 +13,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from ..detector.nodes import transmission_order
-from ..detector.raw_damage import Fill, corrupted_packets, lost_lines, lost_packets, packet_count
+from ..detector.nodes import last_before, transmission_order
 from .context import FaultContext, Params
 from .contract import Fault
 from .fields import Interval, Severity, bounds, choice
@@ -65,7 +64,7 @@ class PacketTransmission(Fault):
         """
         detector = context.camera.mosaic
         packet_px = self.packet_px.integer(rng)
-        packets = packet_count(context.shape, packet_px)
+        packets = -(-context.shape[0] * context.shape[1] // packet_px)
         bursts = self.lost_count.integer(rng)
         begin = rng.integers(packets, size=bursts)
         length = rng.integers(int(self.burst_packets.lo), int(self.burst_packets.hi), bursts, endpoint=True)
@@ -102,20 +101,36 @@ class PacketTransmission(Fault):
 
 def _arrived(raw: Raw, params: Params) -> tuple[Raw, Mask]:
     """Return the mosaic that arrives, and its pixels that were lost or had bits flipped, bool[y, x]."""
-    packet_px, fill = params["packet_px"], cast(Fill, params["fill"])
-    order = None if params["nodes"] == 1 else _order(raw.shape, params["nodes"])
-    damaged = corrupted_packets(
-        raw,
-        params["damaged"],
-        packet_px,
-        params["bit_error_rate"],
-        np.random.default_rng(params["seed"]),
-        params["bits"],
-        order,
-    )
-    lost = lost_packets(damaged.raw, params["lost"], packet_px, fill, order)
-    gone = lost_lines(lost.raw, params["lines"], "row", fill)
-    return gone.raw, damaged.changed | lost.region | gone.region
+    order = _order(raw.shape, params["nodes"])
+    stream, hit = raw.ravel()[order], np.zeros(raw.size, dtype=np.bool_)
+    damaged, lost = (_positions(params[packets], params["packet_px"]) for packets in ("damaged", "lost"))
+    # the number of variates depends neither on the signal nor on the rate
+    rng, flips = np.random.default_rng(params["seed"]), np.zeros(damaged.shape, dtype=np.uint16)
+    for bit in range(params["bits"]):
+        flips |= (rng.random(damaged.shape) < params["bit_error_rate"]).astype(np.uint16) << np.uint16(bit)
+    inside = damaged < raw.size
+    stream[damaged[inside]] ^= flips[inside]
+    hit[damaged[inside]] = flips[inside] != 0
+    repeats, inside = params["fill"] == "previous", lost < raw.size
+    shown = np.zeros(lost.shape, dtype=np.uint16)
+    if repeats:
+        source = last_before(np.asarray(params["lost"], dtype=np.intp))
+        shown[source >= 0] = stream[_positions(source[source >= 0], params["packet_px"])]
+    stream[lost[inside]] = shown[inside]
+    hit[lost[inside]] = True
+    out, region = np.empty_like(raw), np.empty(raw.shape, dtype=np.bool_)
+    out.ravel()[order], region.ravel()[order] = stream, hit
+    lines = np.asarray(params["lines"], dtype=np.intp)
+    source = last_before(lines)
+    arrived = source >= 0 if repeats else np.zeros(len(lines), dtype=np.bool_)
+    out[lines[~arrived]], out[lines[arrived]] = 0, out[source[arrived]]
+    region[lines] = True
+    return out, region
+
+
+def _positions(packets: ArrayLike, packet_px: int) -> NDArray[np.intp]:
+    """Return the positions of the packets' pixels in the order sent, int[packet, packet_px], also past the end."""
+    return np.asarray(packets, dtype=np.intp)[:, None] * packet_px + np.arange(packet_px)
 
 
 @lru_cache(maxsize=2)

@@ -19,7 +19,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import buffers
 from ..lens.thin import cos4_map
 from .context import FaultContext, Params
 from .contract import Fault
@@ -67,19 +66,9 @@ class Cos4Vignetting(Fault):
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
         """Return the expected electrons times the factor of each pixel."""
-        return self.apply_to_rows(quantity, slice(None), params, context)
-
-    def reach_rows(self, params: Params) -> int:
-        """Return 0: each pixel has its own factor."""
-        return 0
-
-    def apply_to_rows(self, quantity: Any, rows: slice, params: Params, context: FaultContext) -> Any:
-        """Return the expected electrons of some rows times the factor of each pixel."""
-        cos4 = _cos4_planes(context.shape, context.camera.focal_length_px, quantity.array.shape[2])[rows]
+        cos4 = _cos4_planes(context.shape, context.camera.focal_length_px, quantity.array.shape[2])
         e0 = params["on_axis_illuminance_dn"] / 255
-        out = buffers.empty(cos4.shape)
-        cv2.multiply(quantity.array, cos4, dst=out, scale=e0)
-        return quantity.with_array(out)
+        return quantity.with_array(cv2.multiply(quantity.array, cos4, scale=e0).reshape(cos4.shape))
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
         """Return the pixels where the loss reaches `mask_loss`, bool[y, x]."""

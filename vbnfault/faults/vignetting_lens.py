@@ -29,7 +29,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..lens.footprint import Beams, ImageFrame
+from ..lens.beams import Beams
+from ..lens.image_frame import ImageFrame
 from .context import FaultContext, Params
 from .contract import LensFault
 from .fields import Interval, Severity, bounds, number
@@ -103,15 +104,7 @@ class LensVignetting(LensFault):
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
         """Return the expected electrons times the factor of each pixel."""
-        return self.apply_to_rows(quantity, slice(None), params, context)
-
-    def reach_rows(self, params: Params) -> int:
-        """Return 0: each pixel has its own factor."""
-        return 0
-
-    def apply_to_rows(self, quantity: Any, rows: slice, params: Params, context: FaultContext) -> Any:
-        """Return the expected electrons of some rows times the factor of each pixel."""
-        return quantity.with_array(times(quantity.array, _factor_once(params, context)[rows]))
+        return quantity.with_array(times(quantity.array, _factor_once(params, context)))
 
     def passed_to_sun(self, params: Params, context: FaultContext) -> float:
         """Return the fraction of the Sun's beam that clears ring and hood.

@@ -1,13 +1,12 @@
 """Map scene radiance to irradiance on the sensor plane, with an ideal lens or a real one."""
 
 from .aperture import closed_to, open_f_number, stopped_down
-from .halo import Halo
 from .imaging import RealLens
 from .interface import Lens
 from .paraxial import ParaxialProperties, paraxial_properties, scaled_to_field, scaled_to_focal_length
 from .prescription import Prescription, Surface
 from .prescription_file import load_lens, parse_lens
-from .thin import ThinLens
+from .thin import Halo, ThinLens
 
 __all__ = [
     "Halo",

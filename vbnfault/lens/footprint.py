@@ -1,298 +1,27 @@
-"""Compute where a lens's beams cross its surfaces and other planes, with exact rays.
+"""Compute where a lens's beams cross its surfaces and other planes, and what a disc there covers of them.
 
-A beam is the light of a far point that passes all rims. The part of a surface that the beam crosses is its
-footprint on this surface. The lens has rotational symmetry, so one table over the field angle holds all footprints.
-The middle of a footprint lies in the plane of the axis and the far point; the table gives the distance of the rim
-from this middle.
-
-Positions have the image's axes: x to the right, y down. Light of a point to the right of the axis travels to +x.
-Everything holds for the d line.
+The part of a surface that a beam crosses is its footprint on this surface. The middle of a footprint lies in the
+plane of the axis and the far point; the table gives the distance of the rim from this middle. Axes as in `beams`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 
-from ..core import file_contents
-from .aperture import stopped_down
-from .changes import OF_COATINGS, Change, changed
-from .glass import D_NM
-from .imaging import RealLens
-from .interface import Lens
-from .mapping import inclined_rays, relative_radii
-from .paraxial import scaled_to_focal_length
-from .prescription import Prescription
-from .prescription_file import load_lens
-from .rays import Path
+from .beams import Beams
 
 F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
 
-DEFAULT_LENS = "nikkor_35_f2p8"
-
-_MARGIN = 1.1  # beams are computed up to this multiple of the tangent of the frame's corner
-_ANGLES = 33
-_AZIMUTHS = 65  # of half a rim, both ends included
-_HEIGHTS = 97  # rays of a meridional fan
-_FANS = 2
-_HALVINGS = 10
-_NARROWINGS = 8
-_RINGS = 6  # of rays within a rim
 _DENSE = 257  # field angles of a footprint's table
 _TURNS = 65  # directions of a footprint's table, at equal steps of their cosine
 _SHADOW = 64  # cells along each side of a shadow's table
-
-
-# --- a camera's lens and frame ---------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, kw_only=True)
-class ImageFrame:
-    """Describe a camera for the tracing of beams: its lens, and its image centred on the axis.
-
-    The camera's own lens already has the `changes`, and another prescription gets all of them. Where `prescription`
-    replaces the coatings of the own lens, it repeats the changes of coatings.
-    """
-
-    lens: Lens
-    width_px: int
-    height_px: int
-    pixel_pitch_um: float
-    changes: tuple[Change, ...] = ()
-
-    def slopes(self, x_px: NDArray, y_px: NDArray) -> tuple[F32, F32]:
-        """Return the tangents of the field angles of pixels, to the right and down, float32[y, x] each.
-
-        `x_px` float64[x] and `y_px` float64[y] are the positions of columns and rows in the image.
-        """
-        per_px = self.pixel_pitch_um * 1e-3 / self.lens.focal_length_mm
-        x, y = np.broadcast_arrays(
-            ((x_px - self.width_px / 2) * per_px).astype(np.float32)[None, :],
-            ((y_px - self.height_px / 2) * per_px).astype(np.float32)[:, None],
-        )
-        return self.lens.field_slopes(x, y)
-
-    def real_lens(self, name: str) -> RealLens:
-        """Return the camera's own lens if it is real and `name` is empty, else the named one, fitted to the camera.
-
-        An empty name then stands for `DEFAULT_LENS`. The named lens is scaled to the camera's focal length, and its
-        stop is closed to the camera's f-number where that is larger than its own.
-        """
-        own = self.lens
-        if own.real is not None and not name:
-            return own.real
-        fitted = self._fitted(name)
-        return _with_changes(fitted, self.changes) if self.changes else fitted
-
-    def _fitted(self, name: str) -> RealLens:
-        """Return a named lens fitted to the camera, without changes."""
-        frame = replace(self, changes=()) if self.changes else self
-        return _scaled(name or DEFAULT_LENS, self.lens.focal_length_mm, self.lens.f_number, frame)
-
-    def prescription(self, name: str, coating: str) -> Prescription:
-        """Return the prescription of `real_lens(name)` with a named coating on every surface between glass and air.
-
-        With the coating `as_prescribed`, the coatings stay.
-        """
-        if coating == "as_prescribed":
-            return self.real_lens(name).prescription
-        changes = self.changes
-        if self.lens.real is not None and not name:
-            lens = self.lens.real.prescription
-            changes = tuple(change for change in changes if change.quantity in OF_COATINGS)
-        else:
-            lens = self._fitted(name).prescription
-        lens = _coated(lens, coating)
-        return changed(lens, changes) if changes else lens
-
-    def beams(self, name: str) -> Beams:
-        """Return the beams of `real_lens(name)`, from the axis to slightly beyond the frame's corners."""
-        slope = np.hypot(*self.slopes(np.array([self.width_px]), np.array([self.height_px])))
-        lens = self.real_lens(name)
-        return beams(lens.prescription, _MARGIN * float(slope[0, 0]), lens.sensor_mm)
-
-
-@file_contents.cached_with_contents(maxsize=8)
-def _scaled(name: str, focal_length_mm: float, f_number: float, frame: ImageFrame) -> RealLens:
-    """Return a packaged lens or a lens file fitted to a frame."""
-    lens = scaled_to_focal_length(load_lens(name), focal_length_mm)
-    return RealLens(
-        prescription=stopped_down(lens, f_number),
-        width_px=frame.width_px,
-        height_px=frame.height_px,
-        pixel_pitch_um=frame.pixel_pitch_um,
-    )
-
-
-@lru_cache(maxsize=4)
-def _with_changes(lens: RealLens, changes: tuple[Change, ...]) -> RealLens:
-    """Return a lens with a changed prescription."""
-    return replace(lens, prescription=changed(lens.prescription, changes))
-
-
-@lru_cache(maxsize=8)
-def _coated(lens: Prescription, coating: str) -> Prescription:
-    """Return the lens with a named coating on every surface between glass and air."""
-    return lens.coated(coating)
-
-
-# --- beams -----------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Beams:
-    """Tabulate beams of far points over the tangent of the field angle, in the plane of the first vertex.
-
-    Attributes
-    ----------
-    slope
-        float64[angle]: tangents of the field angles.
-    centre_mm
-        float64[angle]: a point inside each beam, on the x axis.
-    rim_mm
-        float64[angle, azimuth]: distance of the rim from that point, for azimuths from 0 to π; 0 where no light
-        passes.
-    """
-
-    lens: Prescription
-    sensor_mm: float
-    slope: F64
-    centre_mm: F64
-    rim_mm: F64
-
-    @cached_property
-    def bundle(self) -> Path:
-        """Return traced rays at the centres, on rings of equal areas and on the rims: [angle × azimuth × ring]."""
-        distance = self.rim_mm[..., None] * np.sqrt(np.arange(_RINGS + 1) / _RINGS)
-        turn = np.linspace(0, np.pi, _AZIMUTHS)[:, None]
-        x = self.centre_mm[:, None, None] + distance * np.cos(turn)
-        return inclined_rays(
-            self.lens, self.slope[:, None, None], x, distance * np.sin(turn), D_NM, self.sensor_mm
-        )[0]
-
-    def on_row(self, row: int) -> Footprint:
-        """Return the footprints on a surface."""
-        return self._footprint(self.bundle.points_mm[1 + row, :, :2])
-
-    def above_sensor(self, height_mm: float) -> Footprint:
-        """Return the footprints in a plane in front of the sensor."""
-        slope = self.bundle.directions[:, :2] / self.bundle.directions[:, 2:]
-        return self._footprint(self.bundle.points_mm[-1, :, :2] - height_mm * slope)
-
-    def _footprint(self, points: F64) -> Footprint:
-        """Return the footprints from the points where the bundle crosses, float64[angle × azimuth × ring, 2]."""
-        from scipy.interpolate import PchipInterpolator  # not above: the import takes half a second
-
-        shape = (len(self.slope), _AZIMUTHS, _RINGS + 1)
-        x, y = np.moveaxis(points.reshape(*shape, 2), 3, 0)
-        lit = np.isfinite(x + y).all(axis=(1, 2)) & (self.rim_mm.min(axis=1) > 0)
-        x, y, from_slope = x[lit], y[lit], self.slope[lit]
-        # the rim's half above the axis gives the centroid; the other half mirrors it
-        a, b = x[..., -1], y[..., -1]
-        twice = a[:, :-1] * b[:, 1:] - a[:, 1:] * b[:, :-1]
-        middle = ((a[:, :-1] + a[:, 1:]) * twice).sum(axis=1) / (3 * twice.sum(axis=1))
-        x = x - middle[:, None, None]
-        cells, middle_x, middle_y = _cells(x, y)
-        start = self.bundle.points_mm[0, :, :2].reshape(*shape, 2)[lit]
-        light = np.abs(_cells(*np.moveaxis(start, 3, 0))[0])
-        brightness = _fitted(middle_x, middle_y, np.abs(cells), light)
-        radius, turn = np.hypot(x, y)[..., -1], np.arctan2(np.abs(y), x)[..., -1]
-        order = np.argsort(turn, axis=1)
-        radius, turn = (np.take_along_axis(v, order, 1) for v in (radius, turn))
-        wanted = np.arccos(np.linspace(-1, 1, _TURNS))
-        rim = np.stack([np.interp(wanted, t, r) for t, r in zip(turn, radius, strict=True)])
-        slope = np.linspace(0, self.slope[-1], _DENSE)
-        known = np.minimum(slope, from_slope[-1])
-        dark = slope > known + slope[1]
-
-        def at_slopes(values: F64) -> F64:
-            return np.asarray(PchipInterpolator(from_slope, values)(known))
-
-        rim, area = at_slopes(rim), at_slopes(np.trapezoid(radius**2, turn, axis=1))
-        rim[dark], area[dark] = 0, 0
-        return Footprint(
-            slope=slope, centre_mm=at_slopes(middle), rim_mm=rim, area_mm2=area, brightness=at_slopes(brightness)
-        )
-
-
-def _cells(x: F64, y: F64) -> tuple[F64, F64, F64]:
-    """Return signed area and middle of each cell of a bundle, float64[angle, azimuth, ring] each."""
-    corners = [
-        (slice(None), slice(a, a - 1 or None), slice(r, r - 1 or None)) for a, r in ((0, 0), (0, 1), (1, 1), (1, 0))
-    ]
-    (x0, y0), (x1, y1), (x2, y2), (x3, y3) = ((x[c], y[c]) for c in corners)
-    area = ((x2 - x0) * (y3 - y1) - (x3 - x1) * (y2 - y0)) / 2
-    return area, (x0 + x1 + x2 + x3) / 4, (y0 + y1 + y2 + y3) / 4
-
-
-def _fitted(x: F64, y: F64, area: F64, light: F64) -> F64:
-    """Fit light per area over its mean by c0 + c1 x + c2 x² + c3 y² with least squares; float64[angle, 4]."""
-    n = len(x)
-    scale = np.sqrt(area.sum(axis=(1, 2)))
-    u, v = (w.reshape(n, -1) / scale[:, None] for w in (x, y))
-    area, light = (w.reshape(n, -1) / w.sum(axis=(1, 2))[:, None] for w in (area, light))
-    terms = np.stack([np.ones_like(u), u, u * u, v * v], axis=1)
-    matrix = np.einsum("nik,njk,nk->nij", terms, terms, area)
-    coefficients = np.linalg.solve(matrix, np.einsum("nik,nk->ni", terms, light)[..., None])[..., 0]
-    return np.asarray(coefficients / scale[:, None] ** np.array([0, 1, 2, 2]))
-
-
-@lru_cache(maxsize=8)
-def beams(lens: Prescription, largest_slope: float, sensor_mm: float) -> Beams:
-    """Return the beams of a lens up to a tangent of the field angle, or up to where the lens is dark.
-
-    Rims are located by bisection and a final linear interpolation, on the assumption that beams are convex.
-    """
-    lens = lens.with_round_stop()
-    for _ in range(_NARROWINGS):
-        slope = np.tan(np.linspace(0, np.arctan(largest_slope), _ANGLES))
-        centre, width = _innermost(lens, sensor_mm, slope)
-        # use the field angles where there is light: up to the first dark one
-        last = int(np.flatnonzero(width).max(initial=0))
-        if last >= _ANGLES // 2:
-            break
-        largest_slope = float(slope[last + 1])
-    azimuth = np.linspace(0, np.pi, _AZIMUTHS)
-    low = np.zeros((_ANGLES, _AZIMUTHS))
-    high = low + (1.5 * np.maximum(width, width[0]))[:, None]
-    inside, outside = low, high + np.inf  # relative radius of the rays at both ends
-    for _ in range(_HALVINGS):
-        half = (low + high) / 2
-        x, y = centre[:, None] + half * np.cos(azimuth), half * np.sin(azimuth)
-        beyond = relative_radii(lens, slope[:, None], x, y, sensor_mm)
-        passes = beyond <= 1
-        low, inside = np.where(passes, half, low), np.where(passes, beyond, inside)
-        high, outside = np.where(passes, high, half), np.where(passes, outside, beyond)
-    fraction = np.where(np.isfinite(outside), (1 - inside) / np.maximum(outside - inside, 1e-12), 0)
-    rim = np.where(width[:, None] > 0, low + (high - low) * np.clip(fraction, 0, 1), 0)
-    return Beams(lens=lens, sensor_mm=sensor_mm, slope=slope, centre_mm=centre, rim_mm=rim)
-
-
-def _innermost(lens: Prescription, sensor_mm: float, slope: F64) -> tuple[F64, F64]:
-    """Return a point well inside each beam, from a fan of rays on the x axis, and its approximate width there.
-
-    The width is 0 where no light passes.
-    """
-    reach = lens.surfaces[0].reach_mm(slope)
-    middle, width = np.zeros_like(slope), np.zeros_like(slope)
-    for _ in range(_FANS):
-        heights = middle[:, None] + reach[:, None] * np.linspace(-1, 1, _HEIGHTS)
-        outside = relative_radii(lens, slope[:, None], heights, np.zeros(1), sensor_mm)
-        middle = heights[np.arange(len(slope)), np.argmin(outside, axis=1)]
-        step = heights[:, 1] - heights[:, 0]
-        passing = (outside <= 1).sum(axis=1)
-        width = np.maximum(width, np.where(passing, (passing + 1) * step, 0))
-        reach = 2 * step
-    return middle, width
-
-
-# --- footprints ------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -320,6 +49,53 @@ class Footprint:
     rim_mm: F64
     area_mm2: F64
     brightness: F64
+
+    @classmethod
+    def on_row(cls, beams: Beams, row: int) -> Footprint:
+        """Return the footprints of beams on a surface."""
+        return cls._of(beams, beams.bundle.points_mm[1 + row, :, :2])
+
+    @classmethod
+    def above_sensor(cls, beams: Beams, height_mm: float) -> Footprint:
+        """Return the footprints of beams in a plane in front of the sensor."""
+        slope = beams.bundle.directions[:, :2] / beams.bundle.directions[:, 2:]
+        return cls._of(beams, beams.bundle.points_mm[-1, :, :2] - height_mm * slope)
+
+    @classmethod
+    def _of(cls, beams: Beams, points: F64) -> Footprint:
+        """Return the footprints from the points where the bundle crosses, float64[angle × azimuth × ring, 2]."""
+        from scipy.interpolate import PchipInterpolator  # not above: the import takes half a second
+
+        shape = (*beams.rim_mm.shape, -1)
+        x, y = np.moveaxis(points.reshape(*shape, 2), 3, 0)
+        lit = np.isfinite(x + y).all(axis=(1, 2)) & (beams.rim_mm.min(axis=1) > 0)
+        x, y, from_slope = x[lit], y[lit], beams.slope[lit]
+        # the rim's half above the axis gives the centroid; the other half mirrors it
+        a, b = x[..., -1], y[..., -1]
+        twice = a[:, :-1] * b[:, 1:] - a[:, 1:] * b[:, :-1]
+        middle = ((a[:, :-1] + a[:, 1:]) * twice).sum(axis=1) / (3 * twice.sum(axis=1))
+        x = x - middle[:, None, None]
+        cells, middle_x, middle_y = _cells(x, y)
+        start = beams.bundle.points_mm[0, :, :2].reshape(*shape, 2)[lit]
+        light = np.abs(_cells(*np.moveaxis(start, 3, 0))[0])
+        brightness = _fitted(middle_x, middle_y, np.abs(cells), light)
+        radius, turn = np.hypot(x, y)[..., -1], np.arctan2(np.abs(y), x)[..., -1]
+        order = np.argsort(turn, axis=1)
+        radius, turn = (np.take_along_axis(v, order, 1) for v in (radius, turn))
+        wanted = np.arccos(np.linspace(-1, 1, _TURNS))
+        rim = np.stack([np.interp(wanted, t, r) for t, r in zip(turn, radius, strict=True)])
+        slope = np.linspace(0, beams.slope[-1], _DENSE)
+        known = np.minimum(slope, from_slope[-1])
+        dark = slope > known + slope[1]
+
+        def at_slopes(values: F64) -> F64:
+            return np.asarray(PchipInterpolator(from_slope, values)(known))
+
+        rim, area = at_slopes(rim), at_slopes(np.trapezoid(radius**2, turn, axis=1))
+        rim[dark], area[dark] = 0, 0
+        return cls(
+            slope=slope, centre_mm=at_slopes(middle), rim_mm=rim, area_mm2=area, brightness=at_slopes(brightness)
+        )
 
     def towards(self, slope_x: NDArray, slope_y: NDArray, *, light: bool = True) -> Footprints:
         """Return the footprints of the directions (slope_x, slope_y), float[y, x] each.
@@ -380,6 +156,28 @@ class Footprint:
         inner = np.minimum(self.rim_mm, radius_mm) ** 2 @ weight
         lit = self.area_mm2 > 0
         return np.asarray(np.where(lit, np.minimum(inner / np.where(lit, self.area_mm2, 1), 1), 0), np.float32)
+
+
+def _cells(x: F64, y: F64) -> tuple[F64, F64, F64]:
+    """Return signed area and middle of each cell of a bundle, float64[angle, azimuth, ring] each."""
+    corners = [
+        (slice(None), slice(a, a - 1 or None), slice(r, r - 1 or None)) for a, r in ((0, 0), (0, 1), (1, 1), (1, 0))
+    ]
+    (x0, y0), (x1, y1), (x2, y2), (x3, y3) = ((x[c], y[c]) for c in corners)
+    area = ((x2 - x0) * (y3 - y1) - (x3 - x1) * (y2 - y0)) / 2
+    return area, (x0 + x1 + x2 + x3) / 4, (y0 + y1 + y2 + y3) / 4
+
+
+def _fitted(x: F64, y: F64, area: F64, light: F64) -> F64:
+    """Fit light per area over its mean by c0 + c1 x + c2 x² + c3 y² with least squares; float64[angle, 4]."""
+    n = len(x)
+    scale = np.sqrt(area.sum(axis=(1, 2)))
+    u, v = (w.reshape(n, -1) / scale[:, None] for w in (x, y))
+    area, light = (w.reshape(n, -1) / w.sum(axis=(1, 2))[:, None] for w in (area, light))
+    terms = np.stack([np.ones_like(u), u, u * u, v * v], axis=1)
+    matrix = np.einsum("nik,njk,nk->nij", terms, terms, area)
+    coefficients = np.linalg.solve(matrix, np.einsum("nik,nk->ni", terms, light)[..., None])[..., 0]
+    return np.asarray(coefficients / scale[:, None] ** np.array([0, 1, 2, 2]))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -36,18 +36,23 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..core import spectra
 from ..core.errors import InputError
-from ..core.fine_light import splat
-from ..core.quantities import Irradiance, Radiance
+from ..core.quantities import Irradiance, Radiance, splat
 from ..core.sundisc import Floats, add_mean, pixel_sums
-from .distortion import RadialModel
 from .glass import D_NM, RANGE_NM
-from .mapping import ChiefHeights, FieldMap, camera_model, chief_heights, field_map
+from .mapping import ChiefHeights, FieldMap, RadialModel, camera_model, chief_heights, field_map
 from .paraxial import paraxial_properties
-from .point_spread import REACH_PX, PointSpreads, Tiles, kernels_of_spots
+from .point_spread import (
+    REACH_PX,
+    FieldBundles,
+    PointSpreads,
+    Tiles,
+    field_bundles,
+    kernels_of_spots,
+    spot_diagrams,
+)
 from .prescription import Prescription
+from .rays import axial_transmittance
 from .resampling import RadialTables, Resampling, table_distances
-from .spots import FieldBundles, field_bundles, spot_diagrams
-from .straylight.paraxial import axial_transmittance
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]

@@ -150,6 +150,22 @@ class Prescription:
         """Return the distance of each vertex behind the first vertex, float64[row]."""
         return np.concatenate([[0.0], np.cumsum([s.thickness_mm for s in self.surfaces[:-1]])])
 
+    @property
+    def film_nm(self) -> float:
+        """Return the optical thickness of the thickest coating, 0 without any."""
+        return max(sum(layer.n * layer.thickness_nm for layer in s.coating) for s in self.surfaces)
+
+    @property
+    def spectral_step_nm(self) -> float:
+        """Return the distance of wavelengths that resolve the light of ghosts, for interpolation by a spline.
+
+        There are 16 of them in a fringe of the thickest coating, and they are 2 to 6 nm apart. A glass that absorbs
+        may have edges, for which they are 2 nm apart.
+        """
+        if any(s.internal_transmittance_10mm != CLEAR for s in self.surfaces):
+            return 2.0
+        return float(np.clip(400.0**2 / (2 * max(self.film_nm, 1.0)) / 16, 2.0, 6.0))
+
     def indices(self, wavelength_nm: float = D_NM) -> F64:
         """Return the indices of all media, float64[row + 1]: before the first row, then behind each row."""
         return np.array([1.0, *(float(s.medium.index(wavelength_nm)) for s in self.surfaces)])

@@ -1,17 +1,20 @@
 """Trace exact rays through a prescription in double precision, straight through or along any path of reflections.
 
 Coordinates of the lens: z runs backwards along the axis from the first vertex, x and y lie across it. This tracer
-is the reference by which faster tracers are tested, and it makes the drawings.
+is the reference by which faster tracers are tested, and it makes the drawings. Beside it stands what coatings and
+glass let pass along a path.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .coating import mean_reflectance
 from .glass import D_NM
 from .paraxial import paraxial_properties
 from .prescription import Prescription, Surface
@@ -173,6 +176,42 @@ def _slope(surface: Surface, hit: F64) -> F64:
     for n, coefficient in enumerate(surface.aspheric_mm):
         per_r = per_r + (2 * n + 4) * coefficient * r2 ** (n + 1)
     return np.stack([per_r * hit[0], per_r * hit[1], np.full_like(r2, -1.0)])
+
+
+def transmittance(lens: Prescription, path: Sequence[tuple[int, bool]], wavelength_nm: ArrayLike = D_NM) -> F64:
+    """Return the fraction of the light that takes a path, for normal incidence on every surface.
+
+    The result is float64 like `wavelength_nm`.
+    """
+    nm = np.asarray(wavelength_nm, dtype=np.float64)
+    index = [np.ones(nm.shape), *(surface.medium.index(nm) for surface in lens.surfaces)]
+    fraction = np.ones(nm.shape)
+    for row, mirror in path:
+        if row == len(lens.surfaces):
+            fraction = fraction * lens.sensor_reflectance
+            continue
+        films = lens.surfaces[row].coating
+        reflected = mean_reflectance(films, index[row], index[row + 1], 1.0, nm)
+        fraction = fraction * (reflected if mirror else 1 - reflected)
+    return fraction
+
+
+def axial_transmittance(lens: Prescription, wavelength_nm: ArrayLike) -> F64:
+    """Return the fraction of the axial light that coatings and glass transmit, float64[band].
+
+    It multiplies the image of a scene and the direct image of the Sun alike. It excludes reflected light. Ghosts
+    are part of that light, so they are not subtracted from the direct image a second time.
+    """
+    nodes = np.atleast_1d(np.asarray(wavelength_nm, dtype=np.float64))
+    return np.array(_axial_transmittance(lens, tuple(nodes.tolist())))
+
+
+@lru_cache(maxsize=64)
+def _axial_transmittance(lens: Prescription, wavelength_nm: tuple[float, ...]) -> tuple[float, ...]:
+    """Return `axial_transmittance`, which every exposure and every direct image of the Sun needs."""
+    nm = np.array(wavelength_nm)
+    depth = sum((s.thickness_mm * s.absorption_per_mm(nm) for s in lens.surfaces[:-1]), np.zeros(len(nm)))
+    return tuple((transmittance(lens, forward(lens), nm) * np.exp(-depth)).tolist())
 
 
 def real_pupil_diameter_mm(lens: Prescription, wavelength_nm: float = D_NM) -> float:

@@ -22,7 +22,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from .footprint import Beams, ImageFrame
+from .beams import Beams
+from .image_frame import ImageFrame
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]

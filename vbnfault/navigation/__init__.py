@@ -7,12 +7,14 @@ with their true poses. `limb_error` and `centroid_shift` measure directions, `co
 left corner, centres at +0.5.
 """
 
-from .brightness import CentroidShift, centroid_shift
+from .directions import CentroidShift, LimbError, centroid_shift, limb_error
 from .features import (
+    FeatureLifetime,
     Matches,
     Repeatability,
     corner_repeatability,
     corners,
+    feature_lifetime,
     match,
     match_precision,
     matches_lost,
@@ -20,9 +22,7 @@ from .features import (
     right_matches,
 )
 from .geometry import CameraView, relative_motion, reprojected
-from .limb import LimbError, limb_error
 from .relative_pose import RelativePose, RelativePoseError, relative_pose, relative_pose_error
-from .tracks import FeatureLifetime, feature_lifetime
 
 __all__ = [
     "CameraView",

@@ -21,10 +21,11 @@ from ..core.spectra import Bands
 from ..detector import ThreeColourDetector
 from ..faults import FaultContext, registry
 from ..lens import Prescription, ThinLens, load_lens, paraxial_properties
-from ..lens.straylight.paraxial import Ghost, axial_transmittance, paraxial_ghosts
+from ..lens.rays import axial_transmittance
+from ..lens.straylight.paraxial import Ghost, paraxial_ghosts
 from ..lens.straylight.scatter import Cleanliness
 from ..lens.straylight.settings import VEIL_FRACTION, GhostSettings, SensorGrid, StraylightSettings, SunSource
-from ..lens.straylight.total import SunlightInLens
+from ..lens.straylight.total import SunInLens
 from ..scene import keyed_random
 from .json_files import write_json
 
@@ -165,8 +166,8 @@ def layers(request: FlareRequest) -> dict[str, F32]:
     sun = _direct_image(request)
     if request.model == "texture":
         return {"sun": sun, "texture": _textures(request)}
-    light = SunlightInLens.of(
-        request.lens,
+    light = SunInLens(
+        lens=request.lens,
         bands=request.bands,
         sensor=SensorGrid(shape=(request.pixels, request.pixels), pitch_mm=request.pitch_mm),
         sun=request.sun,
@@ -175,15 +176,9 @@ def layers(request: FlareRequest) -> dict[str, F32]:
             cleanliness=Cleanliness(roughness_nm=request.roughness_nm, level=request.cleanliness_level),
             veil_fraction=request.veil_fraction,
         ),
-    ).total()
+    ).straylight()
     sun *= light.direct_fraction[:, None, None].astype(np.float32)
-    return {
-        "sun": sun,
-        "ghosts": light.ghosts,
-        "starburst": light.starburst,
-        "glare": light.glare,
-        "veil": light.veil,
-    }
+    return {"sun": sun, **light.parts()}
 
 
 def ghosts(request: FlareRequest, progress: Callable[[int], None] | None = None) -> tuple[Ghost, ...]:

@@ -16,7 +16,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import buffers
 from ..faults import Fault, FaultContext, Params
 
 Mask = NDArray[np.bool_]
@@ -31,7 +30,7 @@ def effect(image: NDArray[np.uint8], without: NDArray[np.uint8], least_dn: float
         return np.asarray((cv2.absdiff(image, without) >= least_dn).any(axis=2))
     # compare the four 8 bit channels as one 32 bit word
     a, b = (np.ascontiguousarray(x).view(np.uint32)[..., 0] for x in (image, without))
-    return np.not_equal(a, b, out=buffers.empty(a.shape, np.bool_))
+    return np.asarray(a != b)
 
 
 def kind(fault: Fault, *, is_ccd: bool) -> str:
@@ -72,7 +71,7 @@ def mask_layers(
     """
     if not drawn:
         return no_masks((len(faults), *context.shape))
-    out = buffers.zeros((len(faults), *context.shape), bool)
+    out = np.zeros((len(faults), *context.shape), bool)
     for k, (name, fault) in enumerate(faults.items()):
         if name not in drawn:
             continue

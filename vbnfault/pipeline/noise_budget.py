@@ -17,9 +17,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.fine_light import FineLight
 from ..core.memory import release_unused
-from ..core.quantities import Radiance, Truth
+from ..core.quantities import FineLight, Radiance, Truth
 from ..render.description import RenderInput
 from ..world import assemble
 from .exposure import foreseen_exposure_s, rate_on_axis

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import buffers, frames
+from ..core import frames
 from ..core.quantities import Sample
 from ..scene import plan
 from ..scene.config import Scene
@@ -64,7 +64,7 @@ def _effects(frame: Frame) -> NDArray[np.bool_]:
     effects, shape = frame.labels.effects, frame.labels.masks.shape
     if not effects:
         return masks.no_masks(shape)
-    out = buffers.zeros(shape, bool)
+    out = np.zeros(shape, bool)
     for k, fault in enumerate(frame.spec.faults):
         if fault in effects:
             out[k] = effects[fault]

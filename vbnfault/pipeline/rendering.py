@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import buffers, spectra
-from ..core.fine_light import FineLight
+from ..core import spectra
 from ..core.memory import release_unused
-from ..core.quantities import BODY, SKY, FarSource, Radiance, Truth
+from ..core.quantities import BODY, SKY, FarSource, FineLight, Radiance, Truth
 from ..core.sundisc import Projection
 from ..lens.straylight.scene import RenderGrid, surrounding_grids
 from ..render.description import RenderInput, View
@@ -64,7 +63,6 @@ def render_view(spec: SampleSpec, pose: Pose) -> Rendering:
     """
     from .. import render
 
-    buffers.clear()  # a render takes the memory that arrays of another sample have left
     camera, scene, surface = spec.camera, describe(spec, pose), spec.terrain.surface
     angles = bool(ANGLE_LAYERS & set(spec.scene.dataset.layers))
     stars = spec.scene.sky.stars != "off"

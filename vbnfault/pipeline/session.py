@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -14,13 +14,12 @@ import numpy as np
 from ..body import Body, Fractured, Patch, PatchSpec, Site, Sites, cached_patch, choose_sites
 from ..body.refine import GROWTH_POWER
 from ..camera import Camera
-from ..core import activity, resources, tables
+from ..core import activity, tables
 from ..core.errors import InputError, in_file, shown, under_key
 from ..core.memory import release_unused, share_arenas
-from ..core.quantities import SOFT_KINDS, Sample
-from ..faults import Fault, dataset_order, from_dict, load_plugins, plugins_of
+from ..core.quantities import Sample
 from ..scene import config, plan
-from ..scene.config import Scene
+from ..scene.config import Scene, configure_faults
 from ..scene.keyed_random import keyed_uniform
 from ..scene.trajectory import FlownPose, Trajectory, as_trajectory, load_trajectory, with_rows
 from ..world import assemble
@@ -29,7 +28,7 @@ from ..world.ground import GroundDetail, ground_details
 from ..world.siting import sites_for_suns
 from ..world.spacecraft import SpacecraftMesh
 from .record import to_sample
-from .spec import DEFAULT_TWINS, Frame, SampleSpec, Terrain
+from .spec import Frame, SampleSpec, Terrain
 from .stages import SharedViews, simulate_frame
 
 if TYPE_CHECKING:
@@ -76,88 +75,6 @@ def simulate(
     return Session(scene, threads=threads, source=source, poses=poses).simulate(sample)
 
 
-# --- a session: many samples of one scene ------------------------------------------------------------------
-
-
-def configure_faults(scene: Scene, source: str = "scene") -> dict[str, Fault]:
-    """Return the scene's faults in dataset order.
-
-    Parameters
-    ----------
-    scene
-        The scene.
-    source
-        Name of the scene in messages.
-
-    Raises
-    ------
-    InputError
-        A fault is unknown or does not fit the camera, or the dataset stores a layer that no fault of the scene has.
-    """
-    try:
-        load_plugins(scene.plugins)  # a worker has not read the scene file
-    except InputError as error:
-        raise InputError(f"{source}: {error}") from None
-    for name in scene.faults:
-        from_dict(name, scene.faults[name], source=source)  # refuse unknown classes first: they have no order
-    faults = {n: from_dict(n, scene.faults[n], source=source) for n in dataset_order(scene.faults)}
-    try:
-        plugins_of(faults, scene.plugins)
-    except InputError as error:
-        raise InputError(f"{source}: {error}") from None
-    least, most = scene.plan.classes_per_sample
-    if scene.plan.mode == "per_sample" and faults and least > len(faults):
-        raise InputError(
-            f"{source}: plan.classes_per_sample = [{least}, {most}]: the scene has only {len(faults)} fault classes"
-        )
-    if scene.camera.lens:  # a name without a lens is refused before what does not fit to a lens
-        with in_file(source), under_key("camera.lens"):
-            resources.find("scenes/lenses", scene.camera.lens)
-    for name, fault in faults.items():
-        if fault.thin_lens_only and scene.camera.lens:
-            raise InputError(
-                f"{source}: faults.{name}.model = {fault.model!r}: with camera.lens = {scene.camera.lens!r} "
-                f"{fault.thin_lens_only}"
-            )
-        if fault.needs_mosaic and not scene.camera.detector:
-            raise InputError(
-                f"{source}: faults.{name}.model = {fault.model!r}: acts inside a detector with a mosaic; name a "
-                "camera.detector"
-            )
-        with in_file(source):
-            if fault.needs_ccd and assemble.mosaic_sensor(scene.camera).architecture == "cmos":
-                raise InputError(
-                    f"faults.{name}: acts on charge that a CCD moves, and camera.detector = "
-                    f"{scene.camera.detector!r} is a CMOS sensor; leave the fault out, or name a CCD"
-                )
-    _check_layers(scene, faults, source)
-    return faults
-
-
-def _check_layers(scene: Scene, faults: Mapping[str, Fault], source: str) -> None:
-    """Raise InputError if the dataset stores what the scene's camera and faults do not have."""
-    soft = [fault.soft_layer for fault in faults.values() if fault.soft_layer]
-    for layer in scene.dataset.layers:
-        if (
-            layer.startswith("without_")
-            and layer not in DEFAULT_TWINS
-            and layer.removeprefix("without_") not in faults
-        ):
-            raise InputError(f"{source}: dataset.layers: {layer!r}: the scene has no such fault")
-        if layer.endswith(tuple(f"_{kind}" for kind in SOFT_KINDS)) and layer not in soft:
-            known = ", ".join(soft) or "none"
-            raise InputError(
-                f"{source}: dataset.layers: {layer!r}: no fault of the scene has it; the faults have: {known}"
-            )
-    for layer in ("raw", "defects"):
-        if layer in scene.dataset.layers and not scene.camera.detector:
-            raise InputError(f"{source}: dataset.layers: {layer!r} needs a mosaic: name a camera.detector")
-    for name in scene.dataset.mask_any or ():
-        if name not in faults:
-            known = ", ".join(faults) or "none"
-            raise InputError(f"{source}: dataset.mask_any: {name!r}: the scene has no such fault; it has: {known}")
-
-
 class Session:
     """Hold a scene, its plan, and the terrain of the current site, and simulate its samples in any order.
 
@@ -200,7 +117,8 @@ class Session:
                 self.trajectory = load_trajectory(scene.trajectory.file)
         if self.trajectory is not None:
             self.trajectory = self.trajectory.repeated(scene.dataset.variants_per_view)
-        self.scene = scene = with_rows(scene, None if poses is None else self.trajectory)
+            scene = scene if poses is None else with_rows(scene, self.trajectory)
+        self.scene = scene
         planned = sum(blocks or (scene.dataset.samples,))
         if self.trajectory is not None and planned > len(self.trajectory):
             raise InputError(

@@ -18,7 +18,8 @@ from ..faults import Fault, FaultContext, Params
 from ..lens import Lens
 from ..render.description import RenderInput
 from ..scene import keyed_random, plan
-from ..scene.config import DatasetTable, Scene
+from ..scene.config import Scene
+from ..scene.sampling import DEFAULT_TWINS
 from ..scene.trajectory import FlownPose
 from ..world import assemble
 from ..world.spacecraft import SpacecraftMesh
@@ -72,7 +73,7 @@ class SampleSpec:
     """Hold one sample of a plan, with everything that `simulate` needs.
 
     `flown` is the pose of the sample if a table of poses gives it. If the camera aims, `terrain` is the shape model
-    as it is, and `terrain_of` makes the terrain of a pose.
+    as it is, and `terrain_of` makes the terrain of a pose. `taken_with` is a camera in place of the scene's.
     """
 
     index: int
@@ -82,6 +83,7 @@ class SampleSpec:
     terrain: Terrain
     flown: FlownPose | None = None
     terrain_of: Callable[[FlownPose], Terrain] | None = None
+    taken_with: Camera | None = None
 
     def at(self, pose: Pose) -> SampleSpec:
         """Return the specification with the terrain of a pose."""
@@ -115,7 +117,7 @@ class SampleSpec:
     @cached_property
     def camera(self) -> Camera:
         """Return the camera of the sample before an exposure is set."""
-        return assemble.base_camera(
+        return self.taken_with or assemble.base_camera(
             self.scene,
             architecture=int(self.plan.architecture[self.index]),
             readout_direction=int(self.plan.readout_direction[self.index]),
@@ -293,12 +295,6 @@ class Frame:
     def drawn(self) -> dict[str, Params]:
         """Return the parameters of the faults that are in the image, by class."""
         return {name: draw.params for name, draw in self.injection.draws.items()}
-
-
-# The twins among the default layers: a scene may list them without having their faults.
-DEFAULT_TWINS = frozenset(
-    layer for layer in DatasetTable.model_fields["layers"].default if layer.startswith("without_")
-)
 
 
 def stored_layers(scene: Scene, faults: Mapping[str, Fault]) -> tuple[str, ...]:

@@ -22,9 +22,8 @@ from numpy.typing import NDArray
 
 from ..core.quantities import Truth
 from .bsdf import has_bands
-from .cells import Cells, CellStrata
 from .description import RenderInput, View
-from .light import WAVEFRONT, Light
+from .light import WAVEFRONT, Cells, CellStrata, Light
 from .runtime import dr, mi, packets
 from .sampling import SUN_DIMENSION, Optics, Strata
 from .surface import TerrainMesh, facing

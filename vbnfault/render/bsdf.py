@@ -13,8 +13,8 @@ import numpy as np
 from ..reflectance.hapke import HAPKE_TABLES, Hapke, hapke_at
 from .albedo import GroundPoints, Mirror
 from .description import RenderInput
-from .emitter import SunDisc
 from .runtime import dr, mi
+from .sampling import SunDisc
 from .surface import TerrainMesh, facing
 
 

@@ -12,10 +12,9 @@ from ..core.sundisc import Pinhole, Projection, bounds_px, pixel_sums
 from .albedo import AlbedoMap, GroundPoints
 from .description import Sunlight, View
 from .earth import EarthAlbedo
-from .emitter import SunDisc
 from .light import sun_in_view
 from .runtime import dr, mi
-from .sampling import Optics
+from .sampling import Optics, SunDisc
 from .surface import TerrainMesh, facing
 
 

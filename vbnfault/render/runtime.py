@@ -6,7 +6,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from ..core import buffers, llvm
+from ..core import llvm
 
 llvm.prepare()
 
@@ -35,4 +35,4 @@ def packets(kind: Any, values: NDArray[Any]) -> Any:
     aligned, drjit fetches single numbers, by another kernel: the one in its cache on disk would serve only some of
     the processes.
     """
-    return kind(buffers.flat(values))
+    return kind(llvm.flat(values))

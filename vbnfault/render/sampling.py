@@ -1,4 +1,4 @@
-"""Create camera rays: strata of each pixel, their jitter, and the thin lens.
+"""Create rays: strata of each pixel, their jitter, the thin lens, and directions to the Sun's limb-darkened disc.
 
 The samples of a pixel are neighbours in the wavefront. Packets of rays are therefore coherent, and the sum over a
 pixel is a block sum. It is bit-identical from run to run, whatever the number of threads.
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .description import View
+from .description import Sunlight, View
 from .runtime import dr, mi, packets
 
 # Dimension of a sample's random numbers for the Sun's disc. The lens uses dimension 1, bounces use the later ones.
@@ -242,3 +242,62 @@ class Optics:
 def opaque_vector(kind: Any, values: np.ndarray) -> Any:
     """Return a drjit vector whose entries are runtime values, not constants of the kernel."""
     return kind(*(dr.opaque(mi.Float, float(v)) for v in values))
+
+
+# --- the Sun's disc ---------------------------------------------------------------------------------------------
+
+
+class SunDisc:
+    """Compute directions towards points of the disc.
+
+    Directions are offsets from the direction of the centre. In float32, the cosine of a quarter of a degree would
+    keep only a few significant bits of its difference from 1.
+    """
+
+    def __init__(self, sun: Sunlight) -> None:
+        z = sun.direction_L / np.linalg.norm(sun.direction_L)
+        x = np.cross(z, np.eye(3)[np.argmin(np.abs(z))])
+        x /= np.linalg.norm(x)
+        self.direction = opaque_vector(mi.Vector3f, z)
+        self._x = opaque_vector(mi.Vector3f, x)
+        self._y = opaque_vector(mi.Vector3f, np.cross(z, x))
+        self._tangent = dr.opaque(mi.Float, np.tan(sun.angular_radius_rad))
+
+    def towards(self, p: Any) -> Any:
+        """Return the unit direction towards the point of the disc at `p` on the unit disc."""
+        return dr.normalize(self.direction + self._tangent * (p.x * self._x + p.y * self._y))
+
+
+def mu(p: Any) -> Any:
+    """Return the cosine of the angle to the Sun's local vertical at a point of the unit disc."""
+    return dr.sqrt(dr.maximum(1 - dr.squared_norm(p), 0))
+
+
+class Limb:
+    """Represent limb darkening by few terms: Σ_k weights[k, b] · term_k(μ).
+
+    This sum is the radiance of band b over its mean on the disc. The profiles of neighbouring bands are nearly
+    multiples of one another, so a singular value decomposition keeps only the components above 1e-4 of the largest.
+    """
+
+    def __init__(self, sun: Sunlight) -> None:
+        bands = len(sun.irradiance_W_m2_nm)
+        self.coefficients, self.weights = np.ones((1, 1)), np.ones((1, bands))
+        self.profiles = sun.limb_darkening
+        if sun.limb_darkening is not None:
+            grid = np.linspace(0, 1, 256)[None, :] ** np.arange(6)[:, None]
+            u, s, _ = np.linalg.svd(sun.limb_darkening @ grid, full_matrices=False)
+            kept = max(1, int(np.sum(s > 1e-4 * s[0])))
+            self.coefficients, self.weights = u[:, :kept].T @ sun.limb_darkening, u[:, :kept].T
+
+    def terms(self, mu: Any) -> list[Any]:
+        """Return the terms at μ."""
+        return [polynomial(c, mu) for c in self.coefficients]
+
+
+def polynomial(coefficients: np.ndarray, x: Any) -> Any:
+    """Return Σ c_k xᵏ by Horner's rule; the coefficients are runtime values, not constants of the kernel."""
+    total = dr.opaque(mi.Float, float(coefficients[-1]))
+    for c in coefficients[-2::-1]:
+        total = dr.fma(total, x, dr.opaque(mi.Float, float(c)))
+    return total

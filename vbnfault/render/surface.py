@@ -1,4 +1,4 @@
-"""Trace rays through the terrain: one triangle mesh with its normals and precise origins of shadow rays.
+"""Trace rays through the terrain, one triangle mesh, and through the spacecraft around the camera.
 
 Mitsuba moves the origin of a shadow ray by 9e-5 · (1 + max|p|): 0.22 m at 2.5 km, more than a stone. Here the hit
 is a point of the ray, moved off the facet by a few units of float32 resolution at its own distance. The facet's
@@ -19,10 +19,9 @@ from .albedo import AlbedoMap
 from .description import Sunlight, View
 from .detail import Detail, FineRelief
 from .earth import EarthAlbedo
-from .mesh import mesh_scene
 from .runtime import dr, mi, packets
 from .sampling import opaque_vector
-from .vehicle import Vehicle, World
+from .vehicle import Vehicle, mesh_scene
 
 # Float32 resolves 2⁻²³ of a coordinate. Hit distance, ray direction and vertex rounding each err by about one unit.
 # Eight units therefore clear the facet and do not visibly move the shadow (1 mm at 1 km).
@@ -31,6 +30,12 @@ _POSITIONS = 8  # that one kernel compares with the facets
 # Least cosine between a normal and the direction to the viewer. Truth stores normals in half precision,
 # which moves a cosine by up to √3 · 2⁻¹².
 _LEAST_COSINE = 2.0**-11
+# Distance from the facet at which shadow rays start: far above float32's resolution at 1 km, far below a part's
+# size.
+_OFFSET_M = 5e-4
+
+# Rays that start this close to the camera's centre, or within its aperture, are rays of the camera.
+_AT_CAMERA_M = 1e-6
 
 
 class TerrainMesh:
@@ -211,6 +216,110 @@ class Hit:
             lift += corner.xyz * (weight * dr.maximum(corner.w - dr.dot(point, corner.xyz), 0))
         offset = _OFFSET * (dr.max(dr.abs(point)) + self.distance_m) + 1e-6
         return mi.Ray3f(mi.Point3f(point + lift + self.normal * offset), direction)
+
+
+class World:
+    """Intersect rays with the terrain and with a vehicle at its position."""
+
+    def __init__(self, surface: TerrainMesh, vehicle: Vehicle, view: View) -> None:
+        self.surface, self.vehicle = surface, vehicle
+        self._origin = opaque_vector(mi.Point3f, view.position_L_m)
+        self._axes = [opaque_vector(mi.Vector3f, view.L_from_C[:, k]) for k in range(3)]  # B coincides with C
+        self._centre = opaque_vector(mi.Point3f, vehicle.centre_m)
+        self._radius2 = dr.opaque(mi.Float, vehicle.radius_m**2)
+        self._pupil2 = dr.opaque(mi.Float, (1.01 * view.aperture_radius_m + _AT_CAMERA_M) ** 2)
+        self._low, self._high = (opaque_vector(mi.Vector2f, bound) for bound in vehicle.slopes_in(view))
+
+    def intersect(self, rays: Any, active: Any = True, *, coherent: bool = True) -> VehicleHit:
+        """Return the closest hits on either; `on_vehicle` marks those on the vehicle."""
+        return self.hit(rays, self.trace(rays, active, coherent=coherent))
+
+    def trace(self, rays: Any, active: Any = True, *, coherent: bool = True) -> tuple[Any, ...]:
+        """Return the hits on the terrain and on the vehicle, in the form that `hit` needs besides the rays."""
+        in_B = self._in_B(rays)
+        near = self._may_meet(in_B)
+        # the camera may stand among the parts, but see none of them in most of its field
+        d, from_camera = in_B.d, dr.squared_norm(mi.Vector3f(in_B.o)) <= self._pupil2
+        within = (d.x >= self._low.x * d.z) & (d.x <= self._high.x * d.z)
+        within &= (d.y >= self._low.y * d.z) & (d.y <= self._high.y * d.z)
+        near &= ~from_camera | within | (d.z <= 0)
+        hit = self.vehicle.scene.ray_intersect_preliminary(in_B, coherent=coherent, active=active & near)
+        return *self.surface.trace(rays, active, coherent=coherent), hit
+
+    def hit(self, rays: Any, traced: tuple[Any, ...]) -> VehicleHit:
+        """Return the nearer of the two hits of each ray."""
+        ground, on_vehicle = self.surface.hit(rays, traced[:-1]), traced[-1]
+        nearer = on_vehicle.is_valid() & (~ground.valid | (on_vehicle.t < ground.distance_m))
+        normal, material = self.vehicle.facet(on_vehicle.prim_index, nearer)
+        normal = self._in_L(normal)
+        normal = dr.mulsign(normal, -dr.dot(normal, rays.d))  # towards the viewer
+        return VehicleHit(ground, nearer, on_vehicle, normal, material, rays)
+
+    def occluded(self, rays: Any, active: Any, *, coherent: bool = True) -> Any:
+        """Return whether anything lies along the rays."""
+        in_B = self._in_B(rays)
+        behind = self.vehicle.occluded(in_B, active & self._may_meet(in_B), coherent=coherent)
+        return behind | self.surface.occluded(rays, active & ~behind, coherent=coherent)
+
+    def _may_meet(self, rays: Any) -> Any:
+        """Return whether rays in B pass through the sphere around all parts; the others need no search."""
+        towards = mi.Vector3f(self._centre - rays.o)
+        inside, ahead = dr.squared_norm(towards) <= self._radius2, dr.dot(towards, rays.d) > 0
+        # far away, the difference of squares would lose more digits than the cross product
+        return inside | (ahead & (dr.squared_norm(dr.cross(towards, rays.d)) <= self._radius2))
+
+    def _in_B(self, rays: Any) -> Any:
+        """Return rays transformed into B."""
+        o = rays.o - self._origin
+        turned = mi.Ray3f(
+            mi.Point3f(*(dr.dot(o, axis) for axis in self._axes)),
+            mi.Vector3f(*(dr.dot(rays.d, axis) for axis in self._axes)),
+        )
+        turned.maxt = rays.maxt
+        return turned
+
+    def _in_L(self, v: Any) -> Any:
+        """Return vectors of B in L."""
+        x, y, z = self._axes
+        return v.x * x + v.y * y + v.z * z
+
+
+class VehicleHit:
+    """Hold hits of which some are on the vehicle and the others on the ground."""
+
+    def __init__(self, ground: Hit, nearer: Any, on_vehicle: Any, normal: Any, material: Any, rays: Any) -> None:
+        self._ground, self._rays, self.start_m = ground, rays, 0.0
+        self.on_vehicle, self.material, self.facet = nearer, material, on_vehicle.prim_index
+        self.valid = ground.valid | nearer
+        self.distance_m = dr.select(nearer, on_vehicle.t, ground.distance_m)
+        self.normal = dr.select(nearer, normal, ground.normal)
+
+    @cached_property
+    def dust(self) -> Any:
+        """Return the dust cover of the ground; 0 on the vehicle."""
+        return dr.select(self.on_vehicle, 0, self._ground.dust)
+
+    @property
+    def point(self) -> Any:
+        """Return the positions of the hits in L."""
+        return self._rays(self.distance_m)
+
+    @property
+    def range_m(self) -> Any:
+        """Return the distance from the camera, whose rays start at its pupil."""
+        return self.distance_m
+
+    def shading_normal(self, detail: Detail | None, dither: Any) -> Any:
+        """Return the ground's shading normal; the vehicle has no finer relief."""
+        return dr.select(self.on_vehicle, self.normal, self._ground.shading_normal(detail, dither))
+
+    def shadow_rays(self, direction: Any) -> Any:
+        """Return rays from the hits in a direction; they start off the facet."""
+        rays = self._ground.shadow_rays(direction)
+        # the origin lies on the side on which the ray leaves
+        side = dr.mulsign(mi.Vector3f(self.normal), dr.dot(self.normal, direction))
+        rays.o = dr.select(self.on_vehicle, self._rays(self.distance_m) + side * _OFFSET_M, rays.o)
+        return rays
 
 
 def facing(normal: Any, view: Any) -> Any:

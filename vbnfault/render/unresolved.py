@@ -1,4 +1,4 @@
-"""Render a body of few pixels as from close by, and add its light to the pixels that it lies in.
+"""Compute the light of a body of few pixels, and of parts of the spacecraft that are narrower than a pixel.
 
 The rays of pixels miss a body that is smaller than a pixel, or hit it by chance, and then count for a large part of
 its light. Such a body is rendered in a frame of its own that it fills: a close-up, made of the same rays, light and
@@ -8,6 +8,10 @@ So the light of a body is that of some `_ACROSS`² pixels, whatever its size in 
 Float32 resolves 2⁻²³ of the distance of the camera, which may be more than the size of the body. So the close-up is
 taken from at most `_FARTHEST` radii, on the same line of sight, and its rays start just before the body. This turns
 them by 1e-4 at most.
+
+The rays of pixels also meet a thin boom or a small part of the spacecraft by chance. Rays are therefore aimed at
+points of such facets. A ray that meets its facet first adds the facet's radiance, times the area in pixels that the
+point stands for. Facets that other parts hide, or that face away behind others, add nothing.
 """
 
 from __future__ import annotations
@@ -19,10 +23,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.fine_light import FineLight
-from ..core.quantities import Radiance
+from ..core.quantities import FineLight, Radiance
 from ..core.sundisc import sunflower
 from .description import RenderInput, View
+from .light import Cells, CellStrata, Direct
 from .runtime import dr, mi
 from .surface import TerrainMesh
 
@@ -174,4 +178,56 @@ def close_up(surface: TerrainMesh, view: View, margin_m: float = 0.0) -> CloseUp
         per_px=per_px,
         first=first,
         size_px=size,
+    )
+
+
+# --- thin parts of the spacecraft -------------------------------------------------------------------------------
+
+# Points of a pixel's area and of each facet, at least. Their sequence is even over a facet.
+_PER_PX, _PER_FACET, _MOST = 64, 16, 1 << 20
+_GOLDEN = 1.32471795724474602596 ** -np.arange(1.0, 3.0)  # of two dimensions (Roberts 2018)
+_FACET_KEY = 0x3C6EF372
+
+
+def thin_parts(surface: TerrainMesh, scene: RenderInput) -> FineLight | None:
+    """Return the light of the spacecraft's facets that are narrower than a pixel; None without any."""
+    vehicle, view = surface.vehicle, scene.view
+    facets = np.zeros(0, np.intp) if vehicle is None else np.flatnonzero(vehicle.thin_in(view))
+    if vehicle is None or not len(facets):
+        return None
+    fx, fy = view.intrinsics[:2]
+    corners = vehicle.corners_of(facets)
+    first, second = (corners[:, k] - corners[:, 0] for k in (1, 2))
+    normal = np.cross(first, second) / 2
+    middle = corners.mean(axis=1)
+    area_px = fx * fy * np.abs((normal * middle).sum(axis=1)) / middle[:, 2] ** 3
+    count = np.maximum(np.ceil(_PER_PX * area_px), _PER_FACET)
+    count = np.maximum(count * min(1.0, _MOST / count.sum()), 1).astype(int)
+    owner = np.repeat(np.arange(len(facets)), count)
+    number = np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)
+    u, v = ((0.5 + (number + 0.5) * step) % 1 for step in _GOLDEN)  # the first point of 0.5 + 0 lies on an edge
+    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+    points = corners[owner, 0] + u[:, None] * first[owner] + v[:, None] * second[owner]
+    slopes = points[:, :2] / points[:, 2:]
+    # dω = |n · p| dA / |p|³, and a pixel's area is fx fy dω / cos³θ
+    area_px = fx * fy * np.abs((normal[owner] * points).sum(axis=1)) / points[:, 2] ** 3 / count[owner]
+    direct = Direct(surface, scene)
+    ax, ay, az = direct.optics.axes
+    across, down = (mi.Float(np.ascontiguousarray(column, np.float32)) for column in slopes.T)
+    rays = mi.Ray3f(direct.optics.origin, dr.normalize(across * ax + down * ay + az))
+    cells = Cells(pixel=np.arange(len(owner), dtype=np.uint32), cell=np.zeros(len(owner), np.uint32), side=1)
+    strata = CellStrata(cells, 1, scene.key ^ _FACET_KEY, None)
+    terms = direct.terms(strata, rays, mi.UInt32(facets[owner].astype(np.uint32)))
+    dr.eval(*terms)
+    radiance = direct.weights.T.astype(np.float32) @ np.stack([term.numpy() for term in terms])
+    # defocus shifts the light of each point of the aperture
+    radius, turn = np.sqrt((0.5 + number * _GOLDEN[1]) % 1), 2 * np.pi * ((0.25 + number * _GOLDEN[0]) % 1)
+    lens_m = view.aperture_radius_m * radius[:, None] * np.column_stack([np.cos(turn), np.sin(turn)])
+    lit = radiance.any(axis=0)
+    return FineLight.of(
+        slopes=(slopes + lens_m * (1 / view.focus_distance_m - 1 / points[:, 2:]))[lit],
+        area_px=area_px[lit],
+        radiance=radiance[:, lit],
+        intrinsics=view.intrinsics,
+        shape=(view.height_px, view.width_px),
     )

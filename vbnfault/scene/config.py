@@ -10,21 +10,25 @@ from __future__ import annotations
 import json
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field, model_validator
 
 from ..core import path_checks, resources, tables, toml_files
-from ..core.errors import InputError, in_file, shown
+from ..core.errors import InputError, in_file, shown, under_key
+from ..core.quantities import SOFT_KINDS
 from ..core.tables import Table
 from ..reflectance import is_packaged
 from .bodies import with_named_body
 from .coma import ComaTable
 from .instrument import OF_A_SENSOR_FILE, CameraTable, RenderTable
-from .sampling import OF_AN_AIM, DatasetTable, GeometryTable, PlanTable, StratumTable
+from .sampling import DEFAULT_TWINS, OF_AN_AIM, DatasetTable, GeometryTable, PlanTable, StratumTable
 from .surroundings import OrbitTable, SkyTable, SpacecraftTable, SpiceTable, SunTable
 from .target import EARTH, BodyTable, PatchTable
 from .trajectory import TrajectoryTable, with_rows
+
+if TYPE_CHECKING:
+    from ..faults import Fault
 
 # Values of body.shape and of spacecraft.model that do not name a file.
 _SHAPES = ("embedded", "ellipsoid")
@@ -191,6 +195,13 @@ def load_scene(name_or_path: str | Path, overrides: Mapping[str, Any] | None = N
     from the file's folder, or from the working folder where nothing lies there. A path in `overrides` starts from
     the working folder.
     """
+    scene = read_scene(name_or_path, overrides)
+    configure_faults(scene, str(resources.find("scenes", name_or_path)))
+    return scene
+
+
+def read_scene(name_or_path: str | Path, overrides: Mapping[str, Any] | None = None) -> Scene:
+    """Return a scene as `load_scene` does, without a check of its faults, which a study may still change."""
     if not isinstance(overrides, Mapping | None):
         raise InputError(f"overrides = {shown(overrides)}: must be a table of dotted keys and their values")
     path = resources.find("scenes", name_or_path)
@@ -293,6 +304,79 @@ def _anchor_paths(table: dict[str, Any], folder: Path, overrides: Collection[str
     for name, fault in faults.items() if isinstance(faults, dict) else ():
         for key, packaged in path_fields(name).items():
             (anchor_file if packaged else anchor)(fault, f"faults.{name}.{key}")
+
+
+def configure_faults(scene: Scene, source: str = "scene") -> dict[str, Fault]:
+    """Return the scene's faults in dataset order.
+
+    Parameters
+    ----------
+    scene
+        The scene.
+    source
+        Name of the scene in messages.
+
+    Raises
+    ------
+    InputError
+        A fault is unknown or does not fit the camera, or the dataset stores a layer that no fault of the scene has.
+    """
+    from ..faults import dataset_order, from_dict, load_plugins, plugins_of
+
+    with in_file(source):
+        load_plugins(scene.plugins)  # a worker has not read the scene file
+        parsed = {name: from_dict(name, table, source=source) for name, table in scene.faults.items()}
+        faults = {name: parsed[name] for name in dataset_order(parsed)}
+        plugins_of(faults, scene.plugins)
+        _check_faults(scene, faults)
+        _check_layers(scene, faults)
+    return faults
+
+
+def _check_faults(scene: Scene, faults: Mapping[str, Fault]) -> None:
+    """Raise InputError if there are too few faults, or if one does not fit the camera."""
+    camera, (least, most) = scene.camera, scene.plan.classes_per_sample
+    if scene.plan.mode == "per_sample" and faults and least > len(faults):
+        raise InputError(
+            f"plan.classes_per_sample = [{least}, {most}]: the scene has only {len(faults)} fault classes"
+        )
+    if camera.lens:  # a name without a lens is refused before what does not fit to a lens
+        with under_key("camera.lens"):
+            resources.find("scenes/lenses", camera.lens)
+    for name, fault in faults.items():
+        where = f"faults.{name}.model = {fault.model!r}"
+        if fault.thin_lens_only and camera.lens:
+            raise InputError(f"{where}: with camera.lens = {camera.lens!r} {fault.thin_lens_only}")
+        if fault.needs_mosaic and not camera.detector:
+            raise InputError(f"{where}: acts inside a detector with a mosaic; name a camera.detector")
+        if fault.needs_ccd:
+            from ..detector import load_sensor
+
+            with under_key("camera.detector"):
+                sensor = load_sensor(camera.detector)
+            if sensor.architecture == "cmos":
+                raise InputError(
+                    f"faults.{name}: acts on charge that a CCD moves, and camera.detector = {camera.detector!r} is "
+                    "a CMOS sensor; leave the fault out, or name a CCD"
+                )
+
+
+def _check_layers(scene: Scene, faults: Mapping[str, Fault]) -> None:
+    """Raise InputError if the dataset stores what the scene's camera and faults do not have."""
+    soft = [fault.soft_layer for fault in faults.values() if fault.soft_layer]
+    for layer in scene.dataset.layers:
+        twin = layer.removeprefix("without_")
+        if twin not in (layer, *faults) and layer not in DEFAULT_TWINS:
+            raise InputError(f"dataset.layers: {layer!r}: the scene has no such fault")
+        if layer.endswith(tuple(f"_{kind}" for kind in SOFT_KINDS)) and layer not in soft:
+            known = ", ".join(soft) or "none"
+            raise InputError(f"dataset.layers: {layer!r}: no fault of the scene has it; the faults have: {known}")
+        if layer in ("raw", "defects") and not scene.camera.detector:
+            raise InputError(f"dataset.layers: {layer!r} needs a mosaic: name a camera.detector")
+    for name in scene.dataset.mask_any or ():
+        if name not in faults:
+            known = ", ".join(faults) or "none"
+            raise InputError(f"dataset.mask_any: {name!r}: the scene has no such fault; it has: {known}")
 
 
 def json_schema(faults: Mapping[str, Any]) -> dict[str, Any]:

@@ -41,6 +41,7 @@ class SplitTable(Table):
 
 # The layers of a scene that names none. The twin is left out where the scene lacks its fault.
 DEFAULT_LAYERS = ("clean", "without_straylight", "mask_effect", "depth_m", "normal", "semantic")
+DEFAULT_TWINS = frozenset(layer for layer in DEFAULT_LAYERS if layer.startswith("without_"))
 
 
 class DatasetTable(Table):

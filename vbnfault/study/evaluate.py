@@ -17,11 +17,10 @@ of field of the render are those of the nominal lens.
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -29,44 +28,43 @@ from numpy.typing import NDArray
 
 from ..camera import Camera
 from ..core import spectra
-from ..core.errors import InputError, shown
-from ..core.quantities import Electrons
+from ..core.errors import InputError, in_file, shown
 from ..core.spectra import Bands
 from ..core.tables import did_you_mean
-from ..faults import Fault, Params, act, registry
-from ..lens import Prescription
+from ..faults import Fault, FaultContext, act
 from ..lens.changes import changed
-from ..lens.footprint import ImageFrame
 from ..lens.straylight.irradiance import flare_model
-from ..lens.straylight.pyramid import scaled
+from ..lens.straylight.scatter import GlareLayout
 from ..lens.straylight.settings import GhostSettings, SensorGrid
-from ..lens.straylight.total import SunlightInLens, veil_per_px
-from ..pipeline.development import Development
-from ..pipeline.exposure import exposure_s
-from ..pipeline.injection import fault_context, inject_faults
+from ..lens.straylight.total import (
+    COARSE_SPIKES,
+    GhostSource,
+    SpreadLight,
+    SunInLens,
+    ghosts,
+    veil_per_px,
+)
+from ..pipeline.exposure import meter
+from ..pipeline.injection import inject_faults
 from ..pipeline.rendering import render_view
 from ..pipeline.resolve import resolve
-from ..pipeline.session import Session, configure_faults
-from ..pipeline.spec import Injection, Pose, Rendering, SampleSpec, SceneExposure
-from ..pipeline.stars import add_stars
-from ..scene.config import Scene
+from ..pipeline.session import Session
+from ..pipeline.spec import Injection, SampleSpec
+from ..scene.config import Scene, configure_faults
+from ..world.assemble import base_camera
 from . import chosen_fault, image_metrics
 from . import navigation_metrics as nav
-from .factors import Factors, Setting
+from .factors import Factors, Setting, StudyScene, base_scene, changed_scene
 from .image_metrics import LitImage
 from .kept import Kept
-from .scenes import StudyScene, check_models, faults_of, scene_of
 from .spec import Evaluation, Metric, StudySpec
 from .views import (
+    CleanView,
     Exposed,
     RenderedView,
     camera_shape,
     dark_e,
-    efficiency_key,
-    lit_pixels,
-    planes_of,
-    scene_rate,
-    sun_rate,
+    rendered_sequence,
     with_detector,
     with_sun,
 )
@@ -94,21 +92,27 @@ class SceneEvaluator:
     def __init__(self, spec: StudySpec) -> None:
         self.spec = spec
         self.kept = Kept()
-        self._base = scene_of(spec)
+        self._source = f"study {shown(spec.title)}"
         self._session: tuple[Hashable, Session] | None = None
-        self._kept_scene = lru_cache(maxsize=16)(self._made_scene)
-        with self._named():
-            faults = dict(self._base.faults)
+        with in_file(self._source):
+            self._base = base_scene(spec)
+            self.scene_of = lru_cache(maxsize=16)(partial(changed_scene, spec, self._base))
+            plain = [StudyScene(self._base)]
             if spec.models is not None:
-                check_models(spec, faults)
-            camera = Session(self._plain_scene()).base_camera
-            self._nominal_camera = camera
-            self.factors = Factors(spec, self._base, camera, self._nominal_lens(camera))
+                plain = [self.scene_of(self._base.dataset.seed, model) for model in spec.models.compare]
+            configure_faults(plain[0].scene)
             self._chosen_faults = chosen_fault.choices(spec)
             for choice in self._chosen_faults:
-                scene = self.factors.scene_of(spec.scene.seeds[0], "", ((chosen_fault.SCENE_KEY, choice),))
-                configure_faults(scene, f"{chosen_fault.KEY} = {choice!r}")
-        self._check_metrics()
+                made = self.scene_of(spec.scene.seeds[0], "", ((chosen_fault.SCENE_KEY, choice),))
+                configure_faults(made.scene, f"{chosen_fault.KEY} = {choice!r}")
+            self._nominal_camera = camera = base_camera(plain[0].scene)
+            adding = [name for made in plain for name, f in made.faults.items() if f.soft_layer.endswith("_added")]
+            self._adding = adding[0] if adding else ""  # the fault that adds light
+            frame = FaultContext(camera=camera).frame
+            traced = [made.faults[self._adding].prescription(frame) for made in plain if adding]
+            self._nominal_lens = next(filter(None, traced), None) or frame.prescription("", "as_prescribed")
+            self.factors = Factors(spec, self._base, camera, self._nominal_lens)
+            self._check_metrics()
 
     # --- the contract of an evaluator -----------------------------------------------------------------------------
 
@@ -221,41 +225,6 @@ class SceneEvaluator:
 
     # --- the study's scene ----------------------------------------------------------------------------------------
 
-    @contextlib.contextmanager
-    def _named(self) -> Iterator[None]:
-        """Name the study in errors."""
-        try:
-            yield
-        except InputError as error:
-            raise InputError(f"study {shown(self.spec.title)}: {error}") from None
-
-    @cached_property
-    def _adding(self) -> str:
-        """Return the fault class of the scene that adds light, by its soft layer; empty where it has none."""
-        adds = [name for name, fault in faults_of(self._base).items() if fault.soft_layer.endswith("_added")]
-        return adds[0] if adds else ""
-
-    def _plain_scene(self) -> Scene:
-        """Return the scene with the first seed and model."""
-        if self.spec.models is None:
-            return self._base
-        name, model = self.spec.models.fault, self.spec.model_names[0]
-        table = {**self._base.faults.get(name, {}), "model": model}
-        fault = registry()[name][model]
-        own = {key: value for key, value in table.items() if key == "model" or key in fault.__dataclass_fields__}
-        return self._base.model_copy(update={"faults": {**self._base.faults, name: own}})
-
-    def _nominal_lens(self, camera: Camera) -> Prescription:
-        """Return the prescription that the scene's straylight traces, without factors."""
-        table = self._base.faults.get(self._adding, {})
-        frame = ImageFrame(
-            lens=camera.lens,
-            width_px=camera.width_px,
-            height_px=camera.height_px,
-            pixel_pitch_um=camera.detector.pixel_pitch_um,
-        )
-        return frame.prescription(str(table.get("lens", "")), str(table.get("coating", "as_prescribed")))
-
     def _check_metrics(self) -> None:
         """Raise InputError if a metric is unknown, or has nothing to measure in the scene."""
         known = [*image_metrics.NAMES, *_NAVIGATION]
@@ -263,31 +232,23 @@ class SceneEvaluator:
             if name in _NAVIGATION:
                 continue
             if not image_metrics.is_image_metric(name):
-                raise InputError(
-                    f"study {shown(self.spec.title)}: metrics.names: {shown(name)} is unknown"
-                    f"{did_you_mean(name, known)}"
-                )
+                raise InputError(f"metrics.names: {shown(name)} is unknown{did_you_mean(name, known)}")
             if self._chosen_faults:
                 raise InputError(
-                    f"study {self.spec.title!r}: metrics.names: {name!r} measures the straylight of the scene; "
+                    f"metrics.names: {name!r} measures the straylight of the scene; "
                     f"with the factor {chosen_fault.KEY} use metrics of navigation: {', '.join(_NAVIGATION)}"
                 )
             if not self._adding:
                 raise InputError(
-                    f"study {shown(self.spec.title)}: metrics.names: {shown(name)} needs a fault that adds light, "
-                    f"which the scene {shown(self.spec.scene.base)} has not"
+                    f"metrics.names: {shown(name)} needs a fault that adds light, which the scene "
+                    f" {shown(self.spec.scene.base)} has not"
                 )
 
     # --- stages ---------------------------------------------------------------------------------------------------
 
     def _scene(self, evaluation: Evaluation, setting: Setting) -> StudyScene:
         """Return the scene of an evaluation."""
-        return self._kept_scene(evaluation.seed, evaluation.model, tuple(sorted(setting.scene.items())))
-
-    def _made_scene(self, seed: int, model: str, changes: tuple[tuple[str, Any], ...]) -> StudyScene:
-        """Return the scene with a seed, with a model of the compared fault, and with changed keys."""
-        with self._named():
-            return StudyScene(self.factors.scene_of(seed, model, changes))
+        return self.scene_of(evaluation.seed, evaluation.model, tuple(sorted(setting.scene.items())))
 
     def _view(self, evaluation: Evaluation, made: StudyScene) -> RenderedView:
         """Return a view, rendered where this was not done before for what the renderer reads of the scene."""
@@ -298,13 +259,8 @@ class SceneEvaluator:
         """Render a view."""
         if self._session is None or self._session[0] != key:
             self._session = None  # release the old terrain first
-            self._session = key, Session(scene, source=f"study {shown(self.spec.title)}")
+            self._session = key, Session(scene, source=self._source)
         session = self._session[1]
-        if not 0 <= index < len(session.plan):
-            raise InputError(
-                f"study {shown(self.spec.title)}: scene.samples = {index}: must be from 0 to "
-                f"{len(session.plan) - 1}"
-            )
         spec = session.spec(index)
         pose = resolve(spec, 0)
         spec = spec.at(pose)
@@ -313,43 +269,24 @@ class SceneEvaluator:
     def _exposed(self, evaluation: Evaluation, setting: Setting) -> Exposed:
         """Return the view of an evaluation with its camera, its Sun and its exposure."""
         made = self._scene(evaluation, setting)
-        scene, view = made.scene, self._view(evaluation, made)
-        spec = replace(view.spec, scene=scene, faults=faults_of(scene))
-        camera = self._camera(spec, setting)
-        pose, rendering = with_sun(view, camera, setting.sun)
-        far = setting.sun.get("distance_au")
-        view_key = evaluation.seed, evaluation.view, made.render_key
-        optics = (*view_key, camera.lens, efficiency_key(camera))
-        per_s = self.kept.once(
-            "direct image", (*optics, far), lambda: scene_rate(camera, rendering.light.rendered), "scene"
-        )
-        sun_key = (*optics, tuple(sorted(setting.sun.items())))
-        direct = self.kept.once("direct image", sun_key, lambda: sun_rate(camera, rendering.light.rendered))
-        white = camera.detector.white_e
-        rate = Electrons(array=per_s, white_e=white, past_rims=direct)
-        metered = self.kept.once(
-            "exposure",
-            (*sun_key, white.tobytes(), scene.camera),
-            lambda: exposure_s(scene, camera, rendering.truth, rate.merged),
-        )
-        camera = replace(camera, exposure_s=metered)
-        planes = self.kept.once(
-            "direct image",
-            (*sun_key, metered, white.tobytes()),
-            lambda: (planes_of(per_s, metered), None if direct is None else planes_of(direct, metered)),
-            "planes",
-        )
-        lit = self.kept.once(
-            "direct image", (*optics, far), lambda: lit_pixels(per_s, rendering.truth.semantic), "lit"
-        )
-        return Exposed(
-            spec=spec,
+        seen = self._seen(self._view(evaluation, made), evaluation, made, setting)
+        return Exposed(**vars(seen), exposure=meter(seen.spec, seen.rendering))
+
+    def _seen(self, view: RenderedView, evaluation: Evaluation, made: StudyScene, setting: Setting) -> RenderedView:
+        """Return a rendered view with the scene, the camera and the Sun of an evaluation.
+
+        What the stages share between the samples of a view is kept by all that this view differs in.
+        """
+        scene = made.scene
+        camera = self._camera(replace(view.spec, scene=scene), setting)
+        pose, rendering = with_sun(view, setting.sun)
+        optics = camera.lens, camera.lens_changes
+        key = (made.render_key, evaluation.view, view.number, tuple(setting.sun.items()), scene.camera, optics)
+        return RenderedView(
+            spec=replace(view.spec, scene=scene, faults=made.faults, taken_with=camera),
             pose=pose,
-            rendering=rendering,
-            exposure=SceneExposure(camera=camera, light=rendering.light, rate=rate),
-            scene_e=planes[0],
-            direct_e=planes[1],
-            lit=lit,
+            rendering=replace(rendering, shared=self.kept.of_view(key)),
+            number=view.number,
         )
 
     def _camera(self, spec: SampleSpec, setting: Setting) -> Camera:
@@ -376,13 +313,10 @@ class SceneEvaluator:
         """Return the expected light of an evaluation."""
         exposed = self._exposed(evaluation, setting)
         fault = exposed.spec.faults[self._adding]
-        sunlight = getattr(fault, "sunlight", None)
-        rng = exposed.spec.rng("fault", f"{self._adding}/0")
-        if sunlight is None:
-            with self.kept.timed("texture"):
-                light = _added_by(fault, exposed, fault.draw(exposed.context, rng))
-        else:
-            light = self._traced(fault, fault.draw_state(rng), exposed)  # type: ignore[attr-defined]
+        params = fault.draw_state(exposed.context, exposed.spec.rng("fault", f"{self._adding}/0"))
+        added = fault.added_light(params, exposed.context, self._once, spikes=COARSE_SPIKES)
+        with self.kept.timed("light"):
+            light = _added_by(fault, exposed, params) if added is None else self._by_parts(added, exposed)
         camera = exposed.camera
         detector = camera.detector
         return LitImage(
@@ -396,90 +330,38 @@ class SceneEvaluator:
             **light,
         )
 
-    def _traced(self, fault: Any, params: Params, exposed: Exposed) -> dict[str, Any]:
-        """Return the fields of `LitImage` that hold the straylight of a lens; `fault` is a model that traces it."""
-        source = fault.sunlight(params, exposed.context)
-        with self.kept.timed("light"):
-            scene = fault.scene_light(params, exposed.context)
-            of_scene = None if scene is None else np.ascontiguousarray(scene.transpose(2, 0, 1))
-        if source is None:
-            if of_scene is None:
-                unchanged = {"kept": exposed.clean, "added": np.zeros_like(exposed.clean)}
-                return {**unchanged, "direct": exposed.direct_e, "parts_e": {}, "ghosts_e": ()}
-            remaining = 1 - fault.scene_lost(params, exposed.context).astype(np.float32)[:, None, None]
-            direct = None if exposed.direct_e is None else exposed.direct_e * remaining
-            kept_e = exposed.clean * remaining
-            return {"kept": kept_e, "direct": direct, "added": of_scene, "parts_e": {}, "ghosts_e": ()}
-        light: SunlightInLens = source.light
-        camera, pitch_mm = exposed.camera, light.sensor.pitch_mm
-        per_s = source.rates
-        once = self.kept.once
-        # over the Sun's irradiance
-        levels = once("ghosts", light.ghost_key, light.ghost_levels)
-        burst = once("starburst", light.starburst_key, light.starburst_layers)
-        samples = once("glare", light.glare_samples_key, light.glare_samples, "samples")
-        table, glare_beyond, kept = once("glare", light.glare_key, light.glare_light)
-        # in electrons per second
-        burst_gain = light.starburst_gain(burst.flux_mm2 + burst.beyond_mm2)
-        glare_gain = light.glare_gain(kept)
-        glare_key = light.glare_key, light.glare_samples_key
-        with self.kept.timed("light"):
-            parts = {
-                "ghosts": self._channels(
-                    "ghosts", lambda w: scaled(levels.irradiance, w), light.ghost_key, per_s * light.past_baffle
-                ),
-                "starburst": self._channels("starburst", burst.planes, light.starburst_key, per_s * burst_gain),
-                "glare": self._channels(
-                    "glare", lambda w: samples.planes(table * w[:, None]), glare_key, per_s * glare_gain
-                ),
-            }
-            entering, veil_plane = light.veil_light()
-            taken = (burst.flux_mm2 + burst.beyond_mm2) * burst_gain + entering
-            taken = taken + (samples.flux_mm2(table) + glare_beyond) * glare_gain
-            direct_left = light.direct_fraction(levels.flux_mm2 * light.past_baffle, taken)
-            seconds = np.float32(camera.exposure_s)
-            added = parts["ghosts"][0] + parts["starburst"][0]
-            added += parts["glare"][0]
-            added *= seconds
-            lost = source.scene_lost
-            scene_e = exposed.scene_e
-            if of_scene is None:  # what the lens scatters of the scene returns as a veil, distributed as the Sun's
-                veil = veil_per_px(camera_shape(camera), camera.focal_length_px)
-                flux = scene_e.sum(axis=(1, 2), dtype=np.float64) * lost
-                of_scene = veil * flux.astype(np.float32)[:, None, None]
-            sun_veil = (per_s * entering * camera.exposure_s).astype(np.float32)
-            for channel, plane in enumerate(added):
-                plane += veil_plane * sun_veil[channel]
-                plane += of_scene[channel]
-            left, direct = scene_e * (1 - lost).astype(np.float32)[:, None, None], None
-            if exposed.direct_e is not None:
-                direct = exposed.direct_e * direct_left.astype(np.float32)[:, None, None]
-                left += direct
-            ghosts = parts["ghosts"][0].mean(axis=0) * seconds
-            reference = self._traced_ghosts(light, per_s * light.past_baffle)
-            reference = None if reference is None else reference.mean(axis=0) * seconds
-        ghosts_e = self._single_ghosts(light, per_s * light.past_baffle * camera.exposure_s / pitch_mm**2)
-        totals = {name: float(total.mean() * camera.exposure_s) for name, (_, total) in parts.items()}
-        spatial = {"direct": direct, "ghosts": ghosts, "traced_ghosts": reference}
-        return {"kept": left, "added": added, "parts_e": totals, "ghosts_e": ghosts_e, **spatial}
+    def _once(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Return `function(*arguments)`, which is a stage of its own, from its last results where they hold it."""
+        stage, part = _STAGES.get(function, (function.__name__, ""))
+        return self.kept.once(stage, arguments, partial(function, *arguments), part)
 
-    def _traced_ghosts(self, light: SunlightInLens, weights: F64) -> F32 | None:
-        """Return the ghosts of exact rays, float32[channel, y, x] per second; None where no metric compares."""
-        if "ghost_difference" not in self.spec.metrics.names:
-            return None
-        ghosts = replace(light.settings.ghosts, model="traced")
-        traced = replace(light, settings=replace(light.settings, ghosts=ghosts))
-        levels = self.kept.once("ghosts", traced.ghost_key, traced.ghost_levels)
-        return self._channels("ghosts", lambda w: scaled(levels.irradiance, w), traced.ghost_key, weights)[0]
-
-    def _channels(self, name: str, mixed: Callable[[F64], F32], key: Hashable, weights: F64) -> tuple[F32, F64]:
-        """Return a part of straylight in electrons per second, float32[channel, y, x], and its sums by channel."""
-
-        def make() -> tuple[F32, F64]:
-            image = mixed(weights)
-            return image, image.sum(axis=(1, 2), dtype=np.float64)
-
-        return self.kept.once("light", (key, weights.tobytes()), make, name)
+    def _by_parts(self, light: Any, exposed: Exposed) -> dict[str, Any]:
+        """Return the fields of `LitImage` that hold straylight with parts (`Fault.added_light`)."""
+        seconds = np.float32(exposed.camera.exposure_s)
+        left = exposed.scene_e * (1 - light.scene_lost).astype(np.float32)[:, None, None]
+        direct = None
+        if exposed.direct_e is not None:
+            direct = exposed.direct_e * light.direct_left.astype(np.float32)[:, None, None]
+            left += direct
+        added = np.ascontiguousarray(np.moveaxis(light.added, -1, 0))
+        if not light.scene_added:  # what the lens scatters of the scene returns as a veil
+            veil = veil_per_px(camera_shape(exposed.camera), exposed.camera.focal_length_px)
+            flux = exposed.scene_e.sum(axis=(1, 2), dtype=np.float64) * light.scene_lost
+            added = added + veil * flux.astype(np.float32)[:, None, None]
+        fields = {"kept": left, "direct": direct, "added": added, "parts_e": {}, "ghosts_e": ()}
+        if light.of_sun is None:
+            return fields
+        source, sun = light.source, light.of_sun
+        per_mm2 = float(seconds) / source.sensor.pitch_mm**2
+        rates = sun.rates * sun.ghost_gain
+        fields["parts_e"] = {name: float(flux.mean() * per_mm2) for name, flux in sun.flux_mm2.items()}
+        fields["ghosts_e"] = self._single_ghosts(source, rates * per_mm2)
+        fields["ghosts"] = _mean_of_channels(sun.ghosts, rates * seconds)
+        if "ghost_difference" in self.spec.metrics.names:
+            settings = replace(source.settings, ghosts=replace(source.settings.ghosts, model="traced"))
+            traced = self._once(ghosts, replace(source, settings=settings).of_ghosts)
+            fields["traced_ghosts"] = _mean_of_channels(traced, rates * seconds)
+        return fields
 
     # --- single ghosts --------------------------------------------------------------------------------------------
 
@@ -490,7 +372,7 @@ class SceneEvaluator:
         The Sun stands at half the half-width of the field, to the right.
         """
         camera = self._nominal_camera
-        lens = self._nominal_lens(camera)
+        lens = self._nominal_lens
         scene = self._base.render
         bands = Bands.sunlight(scene.band_min_nm, scene.band_max_nm)
         sensor = SensorGrid(shape=camera_shape(camera), pitch_mm=camera.detector.pixel_pitch_um * 1e-3)
@@ -507,17 +389,13 @@ class SceneEvaluator:
             )
         return self._ghost_pairs[rank - 1]
 
-    def _single_ghosts(self, light: SunlightInLens, e_per_mm2: F64) -> tuple[float, ...]:
+    def _single_ghosts(self, light: SunInLens, e_per_mm2: F64) -> tuple[float, ...]:
         """Return the flux of the ghosts that the study follows, in electrons."""
         ranks = [rank for name in self.spec.metrics.names if (rank := image_metrics.ghost_rank(name)) is not None]
         if not ranks:
             return ()
         pairs = tuple(self._ghost_pair(rank) for rank in range(1, max(ranks) + 1))
-
-        def make() -> dict[tuple[int, ...], F64]:
-            return light.ghost_model().flux_mm2(light.sun.angle_deg, light.sun.azimuth_deg, pairs)
-
-        flux = self.kept.once("ghosts", light.ghost_key, make, "single")
+        flux = self._once(_flux_mm2, light.of_ghosts, pairs)
         return tuple(float((e_per_mm2 * flux[pair]).mean()) for pair in pairs)
 
     # --- frames for navigation ------------------------------------------------------------------------------------
@@ -538,16 +416,15 @@ class SceneEvaluator:
 
         There are none where the fault that a factor chooses cannot act, or does not show.
         """
-        scene = self._scene(evaluation, setting).scene
-        faults = faults_of(scene)
+        made = self._scene(evaluation, setting)
         frames: list[nav.NavigationFrame] = []
         first: Injection | None = None
         for clean in self._clean_views(evaluation, setting, count).views:
             with self.kept.timed("faults"):
-                spec = replace(clean.spec, scene=scene, faults=faults)
+                spec = replace(clean.spec, scene=made.scene, faults=made.faults)
                 view = spec, clean.pose, clean.rendering, clean.exposure
                 if first is None:
-                    chosen = chosen_fault.acting(faults, spec, clean.pose) if self._chosen_faults else None
+                    chosen = chosen_fault.acting(made.faults, spec, clean.pose) if self._chosen_faults else None
                     first = injection = inject_faults(*view, commanded=chosen)
                     if self._chosen_faults and not first.draws:
                         return []
@@ -561,31 +438,17 @@ class SceneEvaluator:
         """Return the first `count` views of an evaluation's sequence without faults."""
         without = replace(setting, scene={k: v for k, v in setting.scene.items() if k != chosen_fault.SCENE_KEY})
         made = self._scene(evaluation, without)
-        scene, view = made.scene, self._view(evaluation, made)
+        view = self._view(evaluation, made)
         key = made.render_key, evaluation.view, count
-        sequence = self.kept.once("render", key, lambda: _rendered_sequence(view, count), "sequence")
+        sequence = self.kept.once("render", key, lambda: list(rendered_sequence(view, count)), "sequence")
         sun, detector = tuple(sorted(setting.sun.items())), tuple(sorted(setting.detector.items()))
 
         def make() -> _CleanSequence:
-            views = [self._clean_view(seen, scene, setting) for seen in sequence]
-            twins = nav.CleanTwins([view.frame.clean for view in views], [view.frame.view for view in views])
-            return _CleanSequence(views=views, twins=twins)
+            seen = (self._seen(view, evaluation, made, setting) for view in sequence)
+            views = [CleanView.of(view, nominal.spec.camera) for view, nominal in zip(seen, sequence, strict=True)]
+            return _CleanSequence(views=views, twins=nav.CleanTwins.of([view.frame for view in views]))
 
-        return self.kept.once("clean twins", (*key, scene.camera, tuple(setting.lens), detector, sun), make)
-
-    def _clean_view(self, seen: RenderedView, scene: Scene, setting: Setting) -> _CleanView:
-        """Return a view of a sequence with its exposure and its clean twin."""
-        spec = replace(seen.spec, scene=scene, faults=faults_of(scene))
-        camera = self._camera(spec, setting)
-        pose, rendering = with_sun(seen, camera, setting.sun)
-        rate = camera.expose(rendering.light.rendered, 1.0)
-        seconds = exposure_s(scene, camera, rendering.truth, rate.merged)
-        exposed = SceneExposure(camera=replace(camera, exposure_s=seconds), light=rendering.light, rate=rate)
-        exposed = add_stars(spec, pose, rendering, exposed)
-        context = fault_context(pose, rendering, exposed)
-        clean = Development(exposure=exposed, context=context, rng=spec.rng).image({}).array
-        frame = nav.navigation_frame(pose, rendering.truth, seen.spec.camera, clean, clean)
-        return _CleanView(spec=spec, pose=pose, rendering=rendering, exposure=exposed, frame=frame)
+        return self.kept.once("clean twins", (*key, made.scene.camera, tuple(setting.lens), detector, sun), make)
 
     # --- what a factor moves --------------------------------------------------------------------------------------
 
@@ -594,7 +457,7 @@ class SceneEvaluator:
         seed, view = self.spec.scene.seeds[0], self.spec.scene.views[0]
         evaluation = Evaluation(index=0, seed=seed, view=view, model=model, role="check", values=values)
         setting = self.factors.setting(values)
-        changed(self._nominal_lens(self._nominal_camera), setting.lens)
+        changed(self._nominal_lens, setting.lens)
         with_detector(self._nominal_camera, setting.detector)
         self._scene(evaluation, setting)
 
@@ -616,31 +479,11 @@ class SceneEvaluator:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _CleanView:
-    """Hold a view of a sequence as far as no fault changes it; both images of `frame` are its clean twin."""
-
-    spec: SampleSpec
-    pose: Pose
-    rendering: Rendering
-    exposure: SceneExposure
-    frame: nav.NavigationFrame
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
 class _CleanSequence:
     """Hold the views of a sequence, and what the metrics need of their clean twins."""
 
-    views: Sequence[_CleanView]
+    views: Sequence[CleanView]
     twins: nav.CleanTwins
-
-
-def _rendered_sequence(view: RenderedView, count: int) -> list[RenderedView]:
-    """Return the views of a sequence that begins with a view."""
-    views = [view]
-    for k, pose in enumerate(nav.sequence(view.spec, view.pose, view.rendering, count)[1:], start=1):
-        spec = nav.spec_of_view(view.spec, k)
-        views.append(RenderedView(spec=spec, pose=pose, rendering=render_view(spec, pose)))
-    return views
 
 
 # --- values and images -------------------------------------------------------------------------------------------
@@ -650,6 +493,23 @@ def _value(factor: Any, point: float) -> float | str:
     """Return the value of a factor at a point of the unit interval."""
     value = np.asarray(factor.values(np.array([point])), dtype=object).tolist()[0]
     return value if isinstance(value, str) else float(value)
+
+
+def _flux_mm2(source: GhostSource, paths: tuple[tuple[int, ...], ...]) -> dict[tuple[int, ...], F64]:
+    """Return the flux of the ghosts of some paths on the unbounded sensor plane, float64[band] each."""
+    return source.model.flux_mm2(*source.sun, paths)
+
+
+# Stage and part of the functions that are not stages of their own.
+_STAGES: Mapping[Callable[..., Any], tuple[str, str]] = {
+    _flux_mm2: ("ghosts", "single"),
+    GlareLayout: ("glare", "layout"),
+}
+
+
+def _mean_of_channels(light: SpreadLight, rates: F64) -> F32:
+    """Return light times a rate for each channel, the mean of all, float32[y, x]."""
+    return np.asarray((light.planes * rates.astype(np.float32)[:, None, None]).mean(axis=0))
 
 
 def _added_by(fault: Fault, exposed: Exposed, params: Any) -> dict[str, Any]:

@@ -28,23 +28,23 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-from collections.abc import Callable, Mapping
+import hashlib
+import json
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 from ..camera import Camera
 from ..core import tables
 from ..core.errors import InputError, shown
 from ..core.tables import did_you_mean
-from ..faults import registry
+from ..faults import Fault, from_dict, registry
 from ..lens import Prescription
 from ..lens.changes import Change
-from ..scene.config import Scene, parse_scene
+from ..scene.config import Scene, parse_scene, read_scene
 from . import chosen_fault
 from .spec import StudySpec
-
-# What an evaluation computes, in order. `render` is the only stage that needs the renderer.
-STAGES = ("render", "direct image", "exposure", "ghosts", "starburst", "glare", "veil", "detector")
 
 _SPELLINGS = {"electrons": "e", "e-": "e", "°": "deg", "um": "µm", "AU": "au", "1": "", "fraction": "", "dn": "DN"}
 _ENDINGS = {
@@ -82,19 +82,19 @@ AFTER_RENDER = (
     *("quantum_efficiency_peak", "detector_temperature_K"),
 )
 _LENGTHS = ("fraction", "mm")
+_SUN_LIMITS = {"angle_deg": (0.0, 89.0), "distance_au": (0.02, 1000.0)}
 
 
 @dataclass(frozen=True)
 class Key:
     """Describe a key of a factor.
 
-    `units` are the units in which its values may be given, the first one by default; empty: any. `moves` are the
-    stages that have to be computed again when the factor changes. `add` puts a value in a unit into a `Setting`.
+    `units` are the units in which its values may be given, the first one by default; empty: any. `add` puts a value
+    in a unit into a `Setting`.
     """
 
     name: str
     units: tuple[str, ...]
-    moves: tuple[str, ...]
     add: Callable[[Setting, Any, str], None]
 
 
@@ -129,7 +129,6 @@ class Factors:
     """
 
     def __init__(self, spec: StudySpec, scene: Scene, camera: Camera, lens: Prescription) -> None:
-        self._spec, self._base = spec, scene
         self.known = known_keys(spec, scene, camera, lens)
         self.keys: dict[str, Key] = {}
         self._units: dict[str, str] = {}
@@ -145,8 +144,8 @@ class Factors:
             if factor.unit and key.units and unit not in allowed:
                 raise InputError(f"{where}: unit = {shown(factor.unit)}: must be {' or '.join(key.units)}")
             self.keys[factor.key] = key
-            self._units[factor.key] = allowed.get(unit, key.units[0] if key.units else "") if factor.unit else ""
-            self._units[factor.key] = self._units[factor.key] or (key.units[0] if key.units else "")
+            default = key.units[0] if key.units else ""
+            self._units[factor.key] = (allowed.get(unit) if factor.unit else "") or default
 
     def setting(self, values: Mapping[str, float | str]) -> Setting:
         """Return what the values of the factors change."""
@@ -154,28 +153,6 @@ class Factors:
         for name, value in values.items():
             self.keys[name].add(setting, value, self._units[name])
         return setting
-
-    def scene_of(self, seed: int, model: str, changes: tuple[tuple[str, Any], ...]) -> Scene:
-        """Return the scene with a seed, with a model of the compared fault, and with changed keys."""
-        table = copy.deepcopy(self._base.resolved())
-        table["dataset"]["seed"] = seed
-        if chosen_fault.KEY in self._spec.keys:
-            choice = dict(changes).get(chosen_fault.SCENE_KEY)
-            table["faults"] = chosen_fault.table_of(table["faults"], choice) if choice else {}
-            table["dataset"] |= {"layers": ["clean"], "mask_any": None}  # other layers may need other faults
-        faults = table["faults"]
-        if self._spec.models is not None and model:
-            name = self._spec.models.fault
-            own = _fields(name, model)
-            faults[name] = {key: v for key, v in faults.get(name, {}).items() if key in own} | {"model": model}
-        changes = tuple((key, value) for key, value in changes if key != chosen_fault.SCENE_KEY)
-        for key, value in changes:
-            if key.startswith("faults."):
-                _, name, own_key = key.split(".", 2)
-                if name not in faults or own_key not in _fields(name, faults[name].get("model", "")):
-                    continue  # another fault or model of the comparison has this key
-            tables.replace(table, {key: value}, source=self._spec.title)
-        return parse_scene(table, source=f"study {shown(self._spec.title)}", overrides=[key for key, _ in changes])
 
 
 def _long_name(name: str, known: Mapping[str, Key]) -> str:
@@ -204,13 +181,96 @@ def _fields(fault: str, model: str) -> dict[str, str]:
     return {f.name: f.metadata.get("unit", "") for f in dataclasses.fields(cls)}
 
 
+# --- scenes ------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class StudyScene:
+    """Hold a scene of a study with its faults, and what identifies its renders."""
+
+    scene: Scene
+
+    @cached_property
+    def faults(self) -> dict[str, Fault]:
+        """Return the faults of the scene."""
+        return {name: from_dict(name, table, source="scene") for name, table in self.scene.faults.items()}
+
+    @cached_property
+    def render_key(self) -> str:
+        """Return a digest of all that plan and renderer read of the scene."""
+        table = self.scene.resolved()
+        for key in ("title", "description"):
+            table.pop(key)
+        table["camera"] = {key: value for key, value in table["camera"].items() if key not in AFTER_RENDER}
+        table["faults"] = sorted((name, f.needs_sun, f.lit_by_surroundings) for name, f in self.faults.items())
+        return hashlib.sha256(json.dumps(table, sort_keys=True).encode()).hexdigest()
+
+
+def base_scene(spec: StudySpec) -> Scene:
+    """Return the scene of a study without factors. Raises InputError, also for a wrong fault or model."""
+    # an empty table, such as that of a fault without keys, adds to the scene what it lacks
+    own = read_scene(spec.scene.base).resolved()
+    values = {key: value for key, value in spec.scene.overrides.items() if value != {} or not _table(own, key)}
+    scene = read_scene(spec.scene.base, dict(sorted(values.items(), key=lambda item: item[1] == {})))
+    largest = max(spec.scene.views)
+    if largest >= scene.dataset.samples:
+        raise InputError(
+            f"scene.samples: sample {largest}: must be below dataset.samples = {scene.dataset.samples} of the "
+            f"scene {shown(spec.scene.base)}"
+        )
+    if spec.models is not None:
+        name, known = spec.models.fault, registry()
+        if name not in known:
+            raise InputError(f"models.fault = {shown(name)}: is unknown{did_you_mean(name, list(known))}")
+        if name not in scene.faults:
+            raise InputError(f"models.fault = {shown(name)}: the scene {shown(spec.scene.base)} has no such fault")
+        for model in spec.models.compare:
+            if model not in known[name]:
+                raise InputError(
+                    f"models.compare: {shown(model)} is unknown{did_you_mean(model, list(known[name]))}"
+                )
+    return scene
+
+
+def _table(node: Any, key: str) -> bool:
+    """Return whether plain data have a table of a dotted key."""
+    for part in key.split("."):
+        node = node.get(part) if isinstance(node, dict) else None
+    return isinstance(node, dict)
+
+
+def changed_scene(
+    spec: StudySpec, base: Scene, seed: int, model: str = "", changes: Sequence[tuple[str, Any]] = ()
+) -> StudyScene:
+    """Return the scene of a study with a seed, with a model of the compared fault, and with changed keys."""
+    table, own_changes = copy.deepcopy(base.resolved()), dict(changes)
+    table["dataset"]["seed"] = seed
+    choice = own_changes.pop(chosen_fault.SCENE_KEY, None)
+    if chosen_fault.KEY in spec.keys:
+        table["faults"] = chosen_fault.table_of(table["faults"], choice) if choice else {}
+        table["dataset"] |= {"layers": ["clean"], "mask_any": None}  # other layers may need other faults
+    faults = table["faults"]
+    if spec.models is not None and model:
+        name = spec.models.fault
+        own = _fields(name, model)
+        faults[name] = {key: v for key, v in faults.get(name, {}).items() if key in own} | {"model": model}
+    for key, value in own_changes.items():
+        if key.startswith("faults."):
+            _, name, own_key = key.split(".", 2)
+            if name not in faults or own_key not in _fields(name, faults[name].get("model", "")):
+                continue  # another fault or model of the comparison has this key
+        tables.replace(table, {key: value}, source=spec.title)
+    return StudyScene(parse_scene(table, source=f"study {shown(spec.title)}", overrides=list(own_changes)))
+
+
 # --- known keys --------------------------------------------------------------------------------------------------
 
 
 def known_keys(spec: StudySpec, scene: Scene, camera: Camera, lens: Prescription) -> dict[str, Key]:
     """Return all keys that a factor of a study may have, by name."""
-    keys = [*_scene_keys(spec, scene), *_lens_keys(lens, camera.lens.real is not None), *_detector_keys(camera)]
-    return {key.name: key for key in (*keys, *_sun_keys())}
+    of_sun = [_table_key("sun", key) for key in ("angle_deg", "azimuth_deg", "distance_au")]
+    keys = (*_scene_keys(spec, scene), *_lens_keys(lens), *_detector_keys(camera), *of_sun)
+    return {key.name: key for key in keys}
 
 
 def _scene_keys(spec: StudySpec, scene: Scene) -> list[Key]:
@@ -223,32 +283,8 @@ def _scene_keys(spec: StudySpec, scene: Scene) -> list[Key]:
             models = list(spec.models.compare)
         for model in models:
             found |= {f"faults.{name}.{key}": unit for key, unit in _fields(name, model).items()}
-    light = ("direct image", "exposure", "ghosts", "starburst", "glare", "veil", "detector")
-    keys = [Key(chosen_fault.KEY, (), light, _adder("scene", chosen_fault.SCENE_KEY))]
-    for key, unit in found.items():
-        own = unit or _unit_of(key)
-        keys.append(Key(f"scene.{key}", (own,) if own else (), _moved_by(key), _adder("scene", key)))
-    return keys
-
-
-def _moved_by(key: str) -> tuple[str, ...]:
-    """Return the stages that a key of the scene moves."""
-    light = ("ghosts", "starburst", "glare", "veil")
-    if key.startswith("faults."):
-        leaf = key.rpartition(".")[2]
-        own = {
-            "roughness_nm": ("glare", "veil"),
-            "cleanliness_level": ("glare", "veil"),
-            "veil_fraction": ("veil",),
-            "reflections": ("ghosts",),
-            "mask_level_dn": ("detector",),
-            "coating": ("ghosts", "glare"),
-        }
-        return own.get(leaf, light)
-    table, _, leaf = key.partition(".")
-    if table == "camera" and leaf in AFTER_RENDER:
-        return ("direct image", "exposure", *light, "detector")
-    return STAGES
+    keys = [Key(chosen_fault.KEY, (), _adder("scene", chosen_fault.SCENE_KEY))]
+    return keys + [_table_key("scene", key, unit) for key, unit in found.items()]
 
 
 def _leaves(table: Mapping[str, Any], above: str = "") -> list[str]:
@@ -259,44 +295,42 @@ def _leaves(table: Mapping[str, Any], above: str = "") -> list[str]:
     return keys
 
 
-def _lens_keys(lens: Prescription, camera_has_surfaces: bool) -> list[Key]:
+def _lens_keys(lens: Prescription) -> list[Key]:
     """Return the keys of a prescription."""
-    own = ("direct image", "exposure") if camera_has_surfaces else ()
-    shape = (*own, "ghosts", "starburst", "glare", "veil")
-    films = (*own, "ghosts", "glare", *(("starburst", "veil") if camera_has_surfaces else ()))
     keys = []
     for row, surface in enumerate(lens.surfaces):
         name = f"lens.surface.{row}"
         if surface.curvature_per_mm:
-            keys.append(_change(f"{name}.radius", _LENGTHS, shape, quantity="radius", row=row))
+            keys.append(_change(f"{name}.radius", *_LENGTHS, quantity="radius", row=row))
         if row < len(lens.surfaces) - 1:
-            keys.append(_change(f"{name}.thickness", _LENGTHS, shape, quantity="thickness", row=row))
+            keys.append(_change(f"{name}.thickness", *_LENGTHS, quantity="thickness", row=row))
         if surface.medium.nd != 1.0:
-            keys.append(_change(f"{name}.index", ("1",), shape, quantity="index", row=row))
-        keys.append(_change(f"{name}.semi_diameter", _LENGTHS, shape, quantity="semi_diameter", row=row))
+            keys.append(_change(f"{name}.index", "1", quantity="index", row=row))
+        keys.append(_change(f"{name}.semi_diameter", *_LENGTHS, quantity="semi_diameter", row=row))
         if surface.coating:
-            keys += _coating_keys(f"{name}.coating", films, row=row)
+            keys += _coating_keys(f"{name}.coating", row=row)
             for layer in range(len(surface.coating)):
-                keys += _coating_keys(f"{name}.coating.{layer}", films, row=row, layer=layer)
-    keys += _coating_keys("lens.coating", films)
-    for name, unit in (("blades", ""), ("blade_rounding", ""), ("rotation_deg", "deg")):
-        keys.append(
-            _change(f"lens.stop.{name}", (unit,) if unit else (), (*own, "ghosts", "starburst"), quantity=name)
-        )
-    keys.append(_change("lens.sensor_reflectance", ("fraction",), ("ghosts",), quantity="sensor_reflectance"))
-    keys.append(_change("lens.f_number", (), shape, quantity="f_number"))
-    return keys
-
-
-def _coating_keys(name: str, moves: tuple[str, ...], **where: int) -> list[Key]:
-    """Return the keys of the layers of a coating."""
+                keys += _coating_keys(f"{name}.coating.{layer}", row=row, layer=layer)
     return [
-        _change(f"{name}.thickness", ("fraction", "nm"), moves, quantity="coating_thickness", **where),
-        _change(f"{name}.index", ("1",), moves, quantity="coating_index", **where),
+        *keys,
+        *_coating_keys("lens.coating"),
+        _change("lens.stop.blades", quantity="blades"),
+        _change("lens.stop.blade_rounding", quantity="blade_rounding"),
+        _change("lens.stop.rotation_deg", "deg", quantity="rotation_deg"),
+        _change("lens.sensor_reflectance", "fraction", quantity="sensor_reflectance"),
+        _change("lens.f_number", quantity="f_number"),
     ]
 
 
-def _change(name: str, units: tuple[str, ...], moves: tuple[str, ...], **what: Any) -> Key:
+def _coating_keys(name: str, **where: int) -> list[Key]:
+    """Return the keys of the layers of a coating."""
+    return [
+        _change(f"{name}.thickness", "fraction", "nm", quantity="coating_thickness", **where),
+        _change(f"{name}.index", "1", quantity="coating_index", **where),
+    ]
+
+
+def _change(name: str, *units: str, **what: Any) -> Key:
     """Return a key that changes the prescription."""
 
     def add(setting: Setting, value: Any, unit: str) -> None:
@@ -304,7 +338,7 @@ def _change(name: str, units: tuple[str, ...], moves: tuple[str, ...], **what: A
             raise InputError(f"{name} = {shown(value)}: must be a number")
         setting.lens.append(Change(value=float(value), relative=unit == "fraction", **what))
 
-    return Key(name, units, moves, add)
+    return Key(name, units, add)
 
 
 def _detector_keys(camera: Camera) -> list[Key]:
@@ -314,31 +348,18 @@ def _detector_keys(camera: Camera) -> list[Key]:
     else:
         plain = dataclasses.asdict(camera.detector.mosaic.sensor)
         names = _leaves({key: value for key, value in plain.items() if key not in _NOT_OF_A_DETECTOR})
-    light = ("direct image", "exposure", "ghosts", "starburst", "glare", "veil")
-    keys = []
-    for name in names:
-        unit = _unit_of(name)
-        leaf = name.rpartition(".")[2]
-        moves = (
-            (*light, "detector") if leaf in ("quantum_efficiency_peak", "response") else ("exposure", "detector")
-        )
-        keys.append(Key(f"detector.{name}", (unit,) if unit else (), moves, _adder("detector", name)))
-    return keys
+    return [_table_key("detector", name) for name in names]
 
 
-def _sun_keys() -> list[Key]:
-    """Return the keys of the Sun."""
-    light = ("direct image", "exposure", "ghosts", "starburst", "glare", "veil")
-    return [
-        Key("sun.angle_deg", ("deg",), light, _adder("sun", "angle_deg")),
-        Key("sun.azimuth_deg", ("deg",), light, _adder("sun", "azimuth_deg")),
-        Key("sun.distance_au", ("au",), light, _adder("sun", "distance_au")),
-    ]
+def _table_key(kind: str, key: str, unit: str = "") -> Key:
+    """Return a key of one of the tables of a setting; by default its ending tells its unit."""
+    own = unit or next((u for ending, u in _ENDINGS.items() if key.endswith(ending)), "")
+    return Key(f"{kind}.{key}", (own,) if own else (), _adder(kind, key))
 
 
 def _adder(kind: str, key: str) -> Callable[[Setting, Any, str], None]:
     """Return a function that puts a value into one of the tables of a setting."""
-    limits = {"angle_deg": (0.0, 89.0), "distance_au": (0.02, 1000.0)}.get(key) if kind == "sun" else None
+    limits = _SUN_LIMITS.get(key) if kind == "sun" else None
 
     def add(setting: Setting, value: Any, unit: str) -> None:
         if limits is not None and not limits[0] <= value <= limits[1]:
@@ -346,8 +367,3 @@ def _adder(kind: str, key: str) -> Callable[[Setting, Any, str], None]:
         getattr(setting, kind)[key] = value
 
     return add
-
-
-def _unit_of(key: str) -> str:
-    """Return the unit in the ending of a key; empty where it has none."""
-    return next((unit for ending, unit in _ENDINGS.items() if key.endswith(ending)), "")

@@ -18,7 +18,7 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
+from typing import Literal, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,29 +99,169 @@ class LitImage:
 
 
 Value = Callable[[LitImage], float]
+_ALL: dict[str, tuple[Metric, Value]] = {}
 
 
-def _straylight_total(image: LitImage) -> float:
+def _metric(unit: str, source: str = "", better: Literal["low", "high"] = "low") -> Callable[[Value], Value]:
+    """Return a decorator that adds a function to the metrics; its docstring is the metric's description."""
+
+    def add(value: Value) -> Value:
+        name, description = value.__name__, " ".join((value.__doc__ or "").split())
+        _ALL[name] = Metric(name=name, unit=unit, description=description, source=source, better=better), value
+        return value
+
+    return add
+
+
+@_metric("electrons")
+def straylight_total_e(image: LitImage) -> float:
+    """Light that straylight adds, Σ V over the frame"""
     return float(image.added_mean.sum(dtype=np.float64))
 
 
-def _straylight_peak(image: LitImage) -> float:
+@_metric("electrons")
+def straylight_peak_e(image: LitImage) -> float:
+    """Most light that straylight adds to a pixel, max V"""
     return float(image.added_mean.max())
 
 
-def _part(name: str) -> Value:
-    """Return the function that gives the total of one part of straylight."""
-    return lambda image: image.parts_e.get(name, float("nan"))
+@_metric("electrons", "Hullin et al. 2011")
+def ghost_total_e(image: LitImage) -> float:
+    """Light of all ghosts in the frame"""
+    return image.parts_e.get("ghosts", float("nan"))
 
 
-def _ghosts(of: Callable[[F32, LitImage], float]) -> Value:
-    """Return the function that gives a value of the ghosts; nan where there are none or they are unknown."""
+@_metric("electrons")
+def ghost_peak_e(image: LitImage) -> float:
+    """Most light of ghosts in a pixel, max G"""
+    return float(image.ghosts.max()) if _has_light(image.ghosts) else float("nan")
 
-    def value(image: LitImage) -> float:
-        ghosts = image.ghosts
-        return float("nan") if ghosts is None or not ghosts.any() else of(ghosts, image)
 
-    return value
+@_metric("1", "EMVA 1288")
+def ghost_area(image: LitImage) -> float:
+    """Fraction of pixels to which ghosts alone add more than the noise without straylight, G > √(S₀ + D + r²)"""
+    return _above(image.ghosts, image) if _has_light(image.ghosts) else float("nan")
+
+
+@_metric("px")
+def ghost_offset_px(image: LitImage) -> float:
+    """Distance of the centre of brightness of all ghosts, Σ G r / Σ G, from the middle of the frame"""
+    return _moments(image.ghosts)[0] if _has_light(image.ghosts) else float("nan")
+
+
+@_metric("px")
+def ghost_spread_px(image: LitImage) -> float:
+    """Root mean square distance of the ghosts' light from its centre of brightness"""
+    return _moments(image.ghosts)[1] if _has_light(image.ghosts) else float("nan")
+
+
+@_metric("1")
+def ghost_difference(image: LitImage) -> float:
+    """Difference of the ghosts, pixel by pixel, from those of exact rays through the same lens,
+    Σ |G − G traced| / Σ G traced; 0 for the model traced, and up to 2
+    """
+    ghosts, traced = image.ghosts, image.traced_ghosts
+    if not (_has_light(ghosts) and _has_light(traced)):
+        return float("nan")
+    return float(np.abs(ghosts - traced).sum(dtype=np.float64) / traced.sum(dtype=np.float64))
+
+
+@_metric("electrons")
+def starburst_total_e(image: LitImage) -> float:
+    """Light in the frame that the stop diffracts"""
+    return image.parts_e.get("starburst", float("nan"))
+
+
+@_metric("electrons", "Peterson 2004")
+def glare_total_e(image: LitImage) -> float:
+    """Light in the frame that surfaces scatter"""
+    return image.parts_e.get("glare", float("nan"))
+
+
+@_metric("electrons", "ISO 9358:1994")
+def veil_median_e(image: LitImage) -> float:
+    """Veil: the median over the frame of V"""
+    values = image.added_mean.ravel()
+    return float(np.partition(values, len(values) // 2)[len(values) // 2])
+
+
+@_metric("1", "ISO 9358:1994")
+def contrast_loss(image: LitImage) -> float:
+    """Loss of contrast of the sunlit ground, the median over its pixels of V / (S + V): a modulation m of the
+    ground appears as m S / (S + V)
+    """
+    if not len(image.lit):
+        return float("nan")
+    kept, added, _ = image.on_lit
+    return float(np.median(added / np.maximum(kept + added, np.float32(1e-30))))
+
+
+@_metric("1", "ISO 9358:1994")
+def veiling_glare_index(image: LitImage) -> float:
+    """Light that straylight adds to the sunlit ground over all light there, Σ V / Σ (S + V): the standard's ratio
+    of the flux of veiling glare to the whole flux, for this scene in place of a uniform field
+    """
+    if not len(image.lit):
+        return float("nan")
+    kept, added, _ = image.on_lit
+    veil = float(added.sum(dtype=np.float64))
+    return veil / (veil + float(kept.sum(dtype=np.float64)))
+
+
+@_metric("1")
+def straylight_over_signal(image: LitImage) -> float:
+    """Light that straylight adds over that of the scene without the Sun's direct image, Σ V / Σ (S − D☉)"""
+    signal = float(image.kept.mean(axis=0).sum(dtype=np.float64)) - sun_direct_e(image)
+    return straylight_total_e(image) / signal if signal > 0 else float("nan")
+
+
+@_metric("electrons", better="high")
+def sun_direct_e(image: LitImage) -> float:
+    """Light of the Sun's direct image that straylight leaves, Σ D☉; it is no part of V"""
+    return 0.0 if image.direct is None else float(image.direct.mean(axis=0).sum(dtype=np.float64))
+
+
+@_metric("1")
+def pixels_above_1dn(image: LitImage) -> float:
+    """Fraction of pixels to which straylight adds 1 DN of the 8-bit image or more in a channel"""
+    level = image.white_e / np.float32(255)
+    return _fraction(image.added >= level[:, None, None])
+
+
+@_metric("1", "EMVA 1288")
+def pixels_above_noise(image: LitImage) -> float:
+    """Fraction of pixels to which straylight adds more than the noise without it, V > √(S₀ + D + r²)"""
+    return _above(image.added_mean, image)
+
+
+@_metric("1")
+def pixels_saturated(image: LitImage) -> float:
+    """Fraction of pixels of which a channel reaches the full well, S + V + D ≥ full well"""
+    dark = np.asarray(image.dark_e, dtype=np.float32)
+    return _fraction(image.kept + image.added + dark >= np.float32(image.full_well_e))
+
+
+@_metric("1", "EMVA 1288", "high")
+def snr(image: LitImage) -> float:
+    """Signal-to-noise ratio of the sunlit ground, the median over its pixels of S / √(S + V + D + r²)"""
+    if not len(image.lit):
+        return float("nan")
+    kept, added, rest = image.on_lit
+    return float(np.median(kept / np.sqrt(np.maximum(kept + added + rest, np.float32(1e-30)))))
+
+
+@_metric("1", "Gallon et al.")
+def mask_area(image: LitImage) -> float:
+    """Fraction of pixels whose expected 8-bit value changes by mask_level_dn or more in a channel"""
+    white = image.white_e[:, None, None]
+    after = np.minimum(image.kept + image.added, white)
+    after -= np.minimum(image.clean, white)
+    return _fraction(np.abs(after) >= white * np.float32(image.mask_level_dn / 255))
+
+
+def _has_light(ghosts: F32 | None) -> TypeGuard[F32]:
+    """Return whether the ghosts are known, and there are any."""
+    return ghosts is not None and bool(ghosts.any())
 
 
 def _moments(ghosts: F32) -> tuple[float, float]:
@@ -136,219 +276,17 @@ def _moments(ghosts: F32) -> tuple[float, float]:
     return float(np.sqrt(total)), float(np.sqrt(square))
 
 
-def _ghost_difference(ghosts: F32, image: LitImage) -> float:
-    traced = image.traced_ghosts
-    if traced is None or not traced.any():
-        return float("nan")
-    return float(np.abs(ghosts - traced).sum(dtype=np.float64) / traced.sum(dtype=np.float64))
-
-
-def _noise_variance(image: LitImage) -> F32:
-    """Return the variance of the noise without straylight, S₀ + D + r²."""
-    dark = np.asarray(image.dark_e, dtype=np.float32) + np.float32(image.read_noise_e**2)
-    return np.asarray(image.clean_mean + dark)
-
-
 def _above(light: F32, image: LitImage) -> float:
-    """Return the fraction of pixels whose light exceeds the noise without straylight."""
-    return float(np.count_nonzero(light * light > _noise_variance(image)) / light.size)
-
-
-def _sun_direct(image: LitImage) -> float:
-    return 0.0 if image.direct is None else float(image.direct.mean(axis=0).sum(dtype=np.float64))
-
-
-def _over_signal(image: LitImage) -> float:
-    signal = float(image.kept.mean(axis=0).sum(dtype=np.float64)) - _sun_direct(image)
-    return _straylight_total(image) / signal if signal > 0 else float("nan")
-
-
-def _veiling_glare_index(image: LitImage) -> float:
-    if not len(image.lit):
-        return float("nan")
-    kept, added, _ = image.on_lit
-    veil = float(added.sum(dtype=np.float64))
-    return veil / (veil + float(kept.sum(dtype=np.float64)))
-
-
-def _veil_median(image: LitImage) -> float:
-    values = image.added_mean.ravel()
-    return float(np.partition(values, len(values) // 2)[len(values) // 2])
-
-
-def _contrast_loss(image: LitImage) -> float:
-    if not len(image.lit):
-        return float("nan")
-    kept, added, _ = image.on_lit
-    return float(np.median(added / np.maximum(kept + added, np.float32(1e-30))))
-
-
-def _above_1dn(image: LitImage) -> float:
-    level = image.white_e / np.float32(255)
-    return _fraction(image.added >= level[:, None, None])
-
-
-def _above_noise(image: LitImage) -> float:
-    return _above(image.added_mean, image)
-
-
-def _saturated(image: LitImage) -> float:
-    dark = np.asarray(image.dark_e, dtype=np.float32)
-    return _fraction(image.kept + image.added + dark >= np.float32(image.full_well_e))
-
-
-def _snr(image: LitImage) -> float:
-    if not len(image.lit):
-        return float("nan")
-    kept, added, rest = image.on_lit
-    return float(np.median(kept / np.sqrt(np.maximum(kept + added + rest, np.float32(1e-30)))))
-
-
-def _mask_area(image: LitImage) -> float:
-    white = image.white_e[:, None, None]
-    after = np.minimum(image.kept + image.added, white)
-    after -= np.minimum(image.clean, white)
-    return _fraction(np.abs(after) >= white * np.float32(image.mask_level_dn / 255))
+    """Return the fraction of pixels whose light exceeds the noise without straylight, √(S₀ + D + r²)."""
+    dark = np.asarray(image.dark_e, dtype=np.float32) + np.float32(image.read_noise_e**2)
+    variance = np.asarray(image.clean_mean + dark)
+    return float(np.count_nonzero(light * light > variance) / light.size)
 
 
 def _fraction(of_channels: NDArray[np.bool_]) -> float:
     """Return the fraction of pixels of which any channel is true."""
     return float(np.count_nonzero(of_channels.any(axis=0)) / of_channels[0].size)
 
-
-def _metric(
-    name: str,
-    unit: str,
-    description: str,
-    value: Value,
-    source: str = "",
-    better: Literal["low", "high"] = "low",
-) -> tuple[Metric, Value]:
-    """Return a metric and the function that computes it."""
-    return Metric(name=name, unit=unit, description=description, source=source, better=better), value
-
-
-_ALL: dict[str, tuple[Metric, Value]] = {
-    entry[0].name: entry
-    for entry in (
-        _metric(
-            "straylight_total_e", "electrons", "Light that straylight adds, Σ V over the frame", _straylight_total
-        ),
-        _metric(
-            "straylight_peak_e", "electrons", "Most light that straylight adds to a pixel, max V", _straylight_peak
-        ),
-        _metric(
-            "ghost_total_e", "electrons", "Light of all ghosts in the frame", _part("ghosts"), "Hullin et al. 2011"
-        ),
-        _metric(
-            "ghost_peak_e",
-            "electrons",
-            "Most light of ghosts in a pixel, max G",
-            _ghosts(lambda g, _: float(g.max())),
-        ),
-        _metric(
-            "ghost_area",
-            "1",
-            "Fraction of pixels to which ghosts alone add more than the noise without straylight, "
-            "G > √(S₀ + D + r²)",
-            _ghosts(_above),
-            "EMVA 1288",
-        ),
-        _metric(
-            "ghost_offset_px",
-            "px",
-            "Distance of the centre of brightness of all ghosts, Σ G r / Σ G, from the middle of the frame",
-            _ghosts(lambda g, _: _moments(g)[0]),
-        ),
-        _metric(
-            "ghost_spread_px",
-            "px",
-            "Root mean square distance of the ghosts' light from its centre of brightness",
-            _ghosts(lambda g, _: _moments(g)[1]),
-        ),
-        _metric(
-            "ghost_difference",
-            "1",
-            "Difference of the ghosts, pixel by pixel, from those of exact rays through the same lens, "
-            "Σ |G − G traced| / Σ G traced; 0 for the model traced, and up to 2",
-            _ghosts(_ghost_difference),
-        ),
-        _metric("starburst_total_e", "electrons", "Light in the frame that the stop diffracts", _part("starburst")),
-        _metric(
-            "glare_total_e",
-            "electrons",
-            "Light in the frame that surfaces scatter",
-            _part("glare"),
-            "Peterson 2004",
-        ),
-        _metric(
-            "veil_median_e", "electrons", "Veil: the median over the frame of V", _veil_median, "ISO 9358:1994"
-        ),
-        _metric(
-            "contrast_loss",
-            "1",
-            "Loss of contrast of the sunlit ground, the median over its pixels of V / (S + V): a modulation m of "
-            "the ground appears as m S / (S + V)",
-            _contrast_loss,
-            "ISO 9358:1994",
-        ),
-        _metric(
-            "veiling_glare_index",
-            "1",
-            "Light that straylight adds to the sunlit ground over all light there, Σ V / Σ (S + V): the standard's "
-            "ratio of the flux of veiling glare to the whole flux, for this scene in place of a uniform field",
-            _veiling_glare_index,
-            "ISO 9358:1994",
-        ),
-        _metric(
-            "straylight_over_signal",
-            "1",
-            "Light that straylight adds over that of the scene without the Sun's direct image, Σ V / Σ (S − D☉)",
-            _over_signal,
-        ),
-        _metric(
-            "sun_direct_e",
-            "electrons",
-            "Light of the Sun's direct image that straylight leaves, Σ D☉; it is no part of V",
-            _sun_direct,
-            better="high",
-        ),
-        _metric(
-            "pixels_above_1dn",
-            "1",
-            "Fraction of pixels to which straylight adds 1 DN of the 8-bit image or more in a channel",
-            _above_1dn,
-        ),
-        _metric(
-            "pixels_above_noise",
-            "1",
-            "Fraction of pixels to which straylight adds more than the noise without it, V > √(S₀ + D + r²)",
-            _above_noise,
-            "EMVA 1288",
-        ),
-        _metric(
-            "pixels_saturated",
-            "1",
-            "Fraction of pixels of which a channel reaches the full well, S + V + D ≥ full well",
-            _saturated,
-        ),
-        _metric(
-            "snr",
-            "1",
-            "Signal-to-noise ratio of the sunlit ground, the median over its pixels of S / √(S + V + D + r²)",
-            _snr,
-            "EMVA 1288",
-            "high",
-        ),
-        _metric(
-            "mask_area",
-            "1",
-            "Fraction of pixels whose expected 8-bit value changes by mask_level_dn or more in a channel",
-            _mask_area,
-            "Gallon et al.",
-        ),
-    )
-}
 
 NAMES = (*_ALL, "ghost_<k>_flux_e")
 
@@ -370,13 +308,13 @@ def metric(name: str, pair: tuple[int, ...] | None = None) -> Metric:
     if rank is None:
         return _ALL[name][0]
     path = "" if pair is None else f", rows {' and '.join(map(str, pair))}"
-    return _metric(
-        name,
-        "electrons",
-        f"Flux, on the unbounded sensor plane, of the path that is number {rank} in flux of the nominal lens{path}",
-        lambda image: image.ghosts_e[rank - 1],
-        "Hullin et al. 2011",
-    )[0]
+    place = f"number {rank} in flux of the nominal lens{path}"
+    return Metric(
+        name=name,
+        unit="electrons",
+        description=f"Flux, on the unbounded sensor plane, of the path that is {place}",
+        source="Hullin et al. 2011",
+    )
 
 
 def value(name: str, image: LitImage) -> float:

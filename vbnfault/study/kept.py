@@ -8,6 +8,8 @@ from collections import Counter, OrderedDict
 from collections.abc import Callable, Hashable, Iterator
 from typing import Any, TypeVar
 
+from ..core.shared_results import SharedResults
+
 T = TypeVar("T")
 
 # How many results of each stage are kept beside those of the base row A of a Sobol design; default: two.
@@ -75,3 +77,19 @@ class Kept:
             yield
         finally:
             self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
+
+    def of_view(self, view: Hashable) -> SharedResults:
+        """Return where the stages of the pipeline keep what evaluations of an equal view share."""
+        return _OfView(self, view)
+
+
+class _OfView(SharedResults):
+    """Keep the results of one view among those of all views."""
+
+    def __init__(self, kept: Kept, view: Hashable) -> None:
+        super().__init__(kept=True)
+        self._all, self._view = kept, view
+
+    def once(self, name: str, key: Hashable, make: Callable[[], T]) -> T:
+        """Return `make()` for a name and a key, from the last results where it was computed before."""
+        return self._all.once(name, (self._view, key), make, "view")

@@ -259,6 +259,11 @@ class CleanTwins:
     def __init__(self, images: Sequence[NDArray[np.uint8]], views: Sequence[navigation.CameraView]) -> None:
         self.images, self.views = images, views
 
+    @classmethod
+    def of(cls, frames: Sequence[NavigationFrame]) -> CleanTwins:
+        """Return what the metrics need of the clean twins of frames."""
+        return cls([frame.clean for frame in frames], [frame.view for frame in frames])
+
     @cached_property
     def matches(self) -> navigation.Matches:
         """Return the matches of the first two."""
@@ -304,51 +309,107 @@ class _Frames:
         faulted, clean = navigation.relative_pose_error(self.matches, *self.views), self.clean.pose_error
         return faulted.rotation_deg - clean.rotation_deg, faulted.translation_deg - clean.translation_deg
 
-    def limb_error_px(self) -> float:
-        """Return the RMS error of the limb in px."""
-        first = self.first
-        return navigation.limb_error(first.clean, first.image, first.body, sky=first.sky).rms_px
 
-    def centroid_shift_px(self) -> float:
-        """Return the shift of the centre of brightness in px."""
-        return navigation.centroid_shift(self.first.clean, self.first.image).distance_px
+_LIMB = "Christian 2017, J. Spacecraft and Rockets 54, 708"
+_CENTRE = "Owen 2011, AAS 11-215"
+_REPEATABILITY = "Schmid, Mohr and Bauckhage 2000, IJCV 37, 151; Mikolajczyk and Schmid 2005, IEEE TPAMI 27, 1615"
+_CORNERS = "Shi and Tomasi 1994, CVPR, 593; " + _REPEATABILITY
+_ORB = "Rublee et al. 2011, ICCV, 2564; " + _REPEATABILITY
+_PRECISION = "Mikolajczyk and Schmid 2005, IEEE TPAMI 27, 1615"
+_FIVE_POINTS = "Nistér 2004, IEEE TPAMI 26, 756"
+_TRACKS = "Lucas and Kanade 1981, IJCAI, 674; Shi and Tomasi 1994, CVPR, 593"
 
-    def corner_repeatability(self) -> float:
-        """Return the fraction of the corners found again."""
-        return navigation.corner_repeatability(self.first.clean, self.first.image).fraction
+_NEEDS: dict[str, int] = {}
+_COMPUTED: dict[str, Callable[[_Frames], float]] = {}
+_METRICS: list[Metric] = []
 
-    def orb_repeatability(self) -> float:
-        """Return the fraction of the ORB features found again."""
-        return navigation.orb_repeatability(self.first.clean, self.first.image).fraction
 
-    def match_precision(self) -> float:
-        """Return the fraction of the matches that are right."""
-        return navigation.match_precision(self.matches, *self.views)
+def _metric(
+    unit: str, source: str, *, better: Literal["low", "high"] = "low", views: int = 1
+) -> Callable[[Callable[[_Frames], float]], Callable[[_Frames], float]]:
+    """Return a decorator that adds a function to the metrics; its docstring is the metric's description.
 
-    def match_precision_lost(self) -> float:
-        """Return how much smaller the fraction of the matches that are right is than in the clean twins."""
-        return self.clean.precision - self.match_precision()
+    `views`: how many views it needs.
+    """
 
-    def matches_lost(self) -> float:
-        """Return the fraction of the right matches that are lost."""
-        return navigation.matches_lost(self.clean.matches, self.matches, *self.views)
+    def add(value: Callable[[_Frames], float]) -> Callable[[_Frames], float]:
+        name, description = value.__name__, " ".join((value.__doc__ or "").split())
+        _METRICS.append(Metric(name=name, unit=unit, description=description, source=source, better=better))
+        _NEEDS[name], _COMPUTED[name] = views, value
+        return value
 
-    def rotation_error_deg(self) -> float:
-        """Return how much more the rotation is off, in deg."""
-        return self.pose_errors[0]
+    return add
 
-    def translation_error_deg(self) -> float:
-        """Return how much more the direction of translation is off, in deg."""
-        return self.pose_errors[1]
 
-    def feature_lifetime_views(self) -> float:
-        """Return the mean lifetime of a feature in views."""
-        frames = self.frames[:VIEWS]
-        return navigation.feature_lifetime([f.image for f in frames], [f.view for f in frames]).mean_views
+@_metric("px", _LIMB)
+def limb_error_px(of: _Frames) -> float:
+    """error of the lit limb along its normals, RMS of the edges' positions, image minus clean twin"""
+    first = of.first
+    return navigation.limb_error(first.clean, first.image, first.body, sky=first.sky).rms_px
 
-    def feature_lifetime_lost_views(self) -> float:
-        """Return how much shorter the mean lifetime of a feature is than in the clean twins, in views."""
-        return self.clean.lifetime_views - self.feature_lifetime_views()
+
+@_metric("px", _CENTRE)
+def centroid_shift_px(of: _Frames) -> float:
+    """shift of the centre of brightness from the clean twin's"""
+    return navigation.centroid_shift(of.first.clean, of.first.image).distance_px
+
+
+@_metric("1", _CORNERS, better="high")
+def corner_repeatability(of: _Frames) -> float:
+    """fraction of the clean twin's corners found again within 1.5 px"""
+    return navigation.corner_repeatability(of.first.clean, of.first.image).fraction
+
+
+@_metric("1", _ORB, better="high")
+def orb_repeatability(of: _Frames) -> float:
+    """fraction of the clean twin's ORB features found again within 1.5 px of their level"""
+    return navigation.orb_repeatability(of.first.clean, of.first.image).fraction
+
+
+@_metric("1", _PRECISION, better="high", views=2)
+def match_precision(of: _Frames) -> float:
+    """fraction of the ORB matches of two views within 3 px of the true reprojection"""
+    return navigation.match_precision(of.matches, *of.views)
+
+
+@_metric("1", _PRECISION, views=2)
+def matches_lost(of: _Frames) -> float:
+    """fraction of the right ORB matches of two clean twins that the faulted images lack"""
+    return navigation.matches_lost(of.clean.matches, of.matches, *of.views)
+
+
+@_metric("deg", _FIVE_POINTS, views=2)
+def rotation_error_deg(of: _Frames) -> float:
+    """error of the rotation between two views, from their matches, faulted images minus clean twins"""
+    return of.pose_errors[0]
+
+
+@_metric("deg", _FIVE_POINTS, views=2)
+def translation_error_deg(of: _Frames) -> float:
+    """error of the direction of translation between two views, faulted images minus clean twins"""
+    return of.pose_errors[1]
+
+
+@_metric("views", _TRACKS, better="high", views=VIEWS)
+def feature_lifetime_views(of: _Frames) -> float:
+    """mean number of consecutive views, of ten, in which corners are tracked within 3 px of the truth"""
+    frames = of.frames[:VIEWS]
+    return navigation.feature_lifetime([f.image for f in frames], [f.view for f in frames]).mean_views
+
+
+@_metric("1", _PRECISION, views=2)
+def match_precision_lost(of: _Frames) -> float:
+    """fraction of right ORB matches of two views, clean twins minus faulted images"""
+    return of.clean.precision - match_precision(of)
+
+
+@_metric("views", _TRACKS, views=VIEWS)
+def feature_lifetime_lost_views(of: _Frames) -> float:
+    """mean number of consecutive views, of ten, in which corners are tracked, clean twins minus faulted images"""
+    return of.clean.lifetime_views - feature_lifetime_views(of)
+
+
+METRICS = tuple(_METRICS)
 
 
 def navigation_values(
@@ -377,108 +438,5 @@ def navigation_values(
         raise ValueError(f"{len(frames)} views: these metrics need {needed}")
     if not needed:
         return {}
-    computed = _Frames(frames, clean or CleanTwins([f.clean for f in frames], [f.view for f in frames]))
+    computed = _Frames(frames, clean or CleanTwins.of(frames))
     return {name: float(_COMPUTED[name](computed)) for name in names if name in _COMPUTED}
-
-
-_LIMB = "Christian 2017, J. Spacecraft and Rockets 54, 708"
-_CENTRE = "Owen 2011, AAS 11-215"
-_REPEATABILITY = "Schmid, Mohr and Bauckhage 2000, IJCV 37, 151; Mikolajczyk and Schmid 2005, IEEE TPAMI 27, 1615"
-_CORNERS = "Shi and Tomasi 1994, CVPR, 593; " + _REPEATABILITY
-_ORB = "Rublee et al. 2011, ICCV, 2564; " + _REPEATABILITY
-_PRECISION = "Mikolajczyk and Schmid 2005, IEEE TPAMI 27, 1615"
-_FIVE_POINTS = "Nistér 2004, IEEE TPAMI 26, 756"
-_TRACKS = "Lucas and Kanade 1981, IJCAI, 674; Shi and Tomasi 1994, CVPR, 593"
-
-# name, unit, description, source, what is better, and the number of views
-_Row = tuple[str, str, str, str, Literal["low", "high"], int]
-_ROWS: tuple[_Row, ...] = (
-    (
-        "limb_error_px",
-        "px",
-        "error of the lit limb along its normals, RMS of the edges' positions, image minus clean twin",
-        _LIMB,
-        "low",
-        1,
-    ),
-    ("centroid_shift_px", "px", "shift of the centre of brightness from the clean twin's", _CENTRE, "low", 1),
-    (
-        "corner_repeatability",
-        "1",
-        "fraction of the clean twin's corners found again within 1.5 px",
-        _CORNERS,
-        "high",
-        1,
-    ),
-    (
-        "orb_repeatability",
-        "1",
-        "fraction of the clean twin's ORB features found again within 1.5 px of their level",
-        _ORB,
-        "high",
-        1,
-    ),
-    (
-        "match_precision",
-        "1",
-        "fraction of the ORB matches of two views within 3 px of the true reprojection",
-        _PRECISION,
-        "high",
-        2,
-    ),
-    (
-        "matches_lost",
-        "1",
-        "fraction of the right ORB matches of two clean twins that the faulted images lack",
-        _PRECISION,
-        "low",
-        2,
-    ),
-    (
-        "rotation_error_deg",
-        "deg",
-        "error of the rotation between two views, from their matches, faulted images minus clean twins",
-        _FIVE_POINTS,
-        "low",
-        2,
-    ),
-    (
-        "translation_error_deg",
-        "deg",
-        "error of the direction of translation between two views, faulted images minus clean twins",
-        _FIVE_POINTS,
-        "low",
-        2,
-    ),
-    (
-        "feature_lifetime_views",
-        "views",
-        "mean number of consecutive views, of ten, in which corners are tracked within 3 px of the truth",
-        _TRACKS,
-        "high",
-        VIEWS,
-    ),
-    (
-        "match_precision_lost",
-        "1",
-        "fraction of right ORB matches of two views, clean twins minus faulted images",
-        _PRECISION,
-        "low",
-        2,
-    ),
-    (
-        "feature_lifetime_lost_views",
-        "views",
-        "mean number of consecutive views, of ten, in which corners are tracked, clean twins minus faulted images",
-        _TRACKS,
-        "low",
-        VIEWS,
-    ),
-)
-_NEEDS = {row[0]: row[5] for row in _ROWS}
-_COMPUTED: dict[str, Callable[[_Frames], float]] = {name: getattr(_Frames, name) for name in _NEEDS}
-
-METRICS: tuple[Metric, ...] = tuple(
-    Metric(name=name, unit=unit, description=description, source=source, better=better)
-    for name, unit, description, source, better, _ in _ROWS
-)

@@ -9,22 +9,20 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 from numpy.typing import NDArray
 
-from ..faults import registry
-from .ranking import QUANTILES
-from .sheets import (
+from ..core.figures import (
     BLUE,
     INK,
     MUTED,
     SMALL,
     VERMILLION,
-    Margins,
+    panels,
     set_linear,
-    sheet,
-    styled,
-    text_width,
     with_unit,
     write_message,
 )
+from ..core.html_page import number_text, with_minus
+from ..faults import registry
+from .ranking import QUANTILES
 from .summaries import StudyResults
 
 F64 = NDArray[np.float64]
@@ -36,41 +34,27 @@ _BELOW = 0.02  # of the largest cost: a cost further below 0 needs a linear axis
 _LOW, _MEDIAN, _HIGH = range(len(QUANTILES))
 
 
-@styled
 def ranking(results: StudyResults) -> Figure:
     """Draw the median cost of each fault with its interval, one panel for each metric, the worst fault on top.
 
     The thin line spans the middle half of the views. Where a large value is the better one, the axis is reversed,
     so that the right side is the worse one in every panel.
     """
-    names = [str(name) for name in results.dataset["fault"].values]
-    model, count = results.models[0], len(results.metrics)
+    count, level = len(results.metrics), f"{100 * results.confidence:g} %"
     columns = min(_COLUMNS, count)
-    label_width = max(text_width(_label(name, 1000), SMALL) for name in names) + 8
-    level = f"{100 * results.confidence:g} %"
     legend = [
         _handle(BLUE, "class of Gallon et al.: median"),
         _handle(VERMILLION, "other class: median"),
         Line2D([], [], color=INK, lw=2.6, label=f"its {level} interval"),
         Line2D([], [], color=MUTED, lw=0.9, label="middle half of the views"),
     ]
-    figure, axes = sheet(
-        "Cost of each fault to navigation",
-        (-(-count // columns), columns),
-        (_WIDTH, _ROW * len(names)),
-        Margins(left=label_width + 4, top=22.0, between_columns=label_width + 16, between_rows=52.0, right=14.0),
-        legend=legend,
-    )
-    for panel, metric in zip(axes, results.metrics, strict=False):
-        _draw_panel(panel, results, metric, model)
-    for panel in axes[count:]:
-        panel.set_axis_off()
+    grid, size = (-(-count // columns), columns), (_WIDTH, _ROW * results.dataset.sizes["fault"])
+    with panels("Cost of each fault to navigation", grid, size, legend=legend) as (figure, axes):
+        for panel, metric in zip(axes, results.metrics, strict=False):
+            _draw_panel(panel, results, metric, results.models[0])
+        for panel in axes[count:]:
+            panel.set_axis_off()
     return figure
-
-
-def _label(name: str, views: int) -> str:
-    """Return the label of a row: the fault, and the number of views behind it."""
-    return f"{name} ({views})"
 
 
 def _handle(colour: str, label: str) -> Line2D:
@@ -105,11 +89,10 @@ def _draw_panel(axes: Axes, results: StudyResults, metric: str, model: str) -> N
     views = chosen["fault_views"].values.astype(int)
     total = results.dataset.sizes["fault"]
     axes.set_ylim(total - 0.4, -0.6)
-    axes.set_yticks(range(len(order)), [_label(n, k) for n, k in zip(order, views, strict=True)], fontsize=SMALL)
+    axes.set_yticks(range(len(order)), [f"{n} ({k})" for n, k in zip(order, views, strict=True)], fontsize=SMALL)
     axes.tick_params(axis="y", length=0)
     axes.spines["left"].set_visible(False)
-    axes.grid(axis="x", zorder=0)
-    axes.set_axisbelow(True)
+    axes.grid(axis="x")
     _set_scale(axes, values, interval, reverse=reverse)
     zero = 1.0 if reverse else 0.0
     axes.axvline(zero, color=MUTED, lw=0.7, zorder=1)
@@ -143,7 +126,7 @@ def _set_scale(axes: Axes, values: F64, interval: F64, *, reverse: bool) -> None
     axes.set_xlim(min(low, -0.12 * linear), high * 1.3)
     axes.xaxis.set_major_locator(FixedLocator([0.0, *(p for p in linear * 10.0 ** np.arange(8) if p <= high)]))
     axes.xaxis.set_minor_locator(NullLocator())
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}".replace("-", "\N{MINUS SIGN}")))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda v, _: with_minus(f"{v:g}")))
 
 
 def ranking_rows(results: StudyResults, metric: str) -> list[list[str]]:
@@ -170,5 +153,4 @@ def ranking_rows(results: StudyResults, metric: str) -> list[list[str]]:
 
 def _number(value: float) -> str:
     """Return a number with three digits and a real minus sign."""
-    text = f"{value:.3f}" if 0.001 <= abs(value) < 1 else f"{value:.3g}"
-    return text.replace("-", "\N{MINUS SIGN}")
+    return with_minus(f"{value:.3f}") if 0.001 <= abs(value) < 1 else number_text(value)

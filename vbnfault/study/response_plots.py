@@ -13,39 +13,39 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from .sheets import (
+from ..core.figures import (
     BAND,
     BLUE,
     INK,
-    LINE,
-    MODEL_COLOURS,
-    MODEL_MARKERS,
     MUTED,
-    NOISE,
+    SERIES_COLOURS,
+    SERIES_MARKERS,
     SKY,
     VERMILLION,
-    Margins,
     axis_exponent,
-    axis_label,
     label_rows,
-    panel_width,
-    rows_of,
+    panels,
+    row_height,
     set_linear,
     set_log,
-    sheet,
-    styled,
-    text_width,
+    with_unit,
     wrapped,
     write_message,
 )
 from .summaries import DesignPoints, ResponseCurve, StudyResults, Swing
+
+NOISE = Patch(facecolor=BAND, alpha=0.75, lw=0, label="noise floor")
 
 _MOST_PANELS = 12
 _PANEL = (134.0, 88.0)  # width and height of a response curve in points
 _LOG_RATIO = 100.0  # a metric that varies more gets a logarithmic axis
 
 
-@styled
+def panel_width(results: StudyResults) -> float:
+    """Return the width in points of one of the panels side by side, one for each model."""
+    return {1: 210.0, 2: 165.0}.get(len(results.models), 140.0)
+
+
 def tornado(results: StudyResults, metric: str) -> tuple[Figure, str]:
     """Draw how far the mean of a metric moves along each factor, sorted, beside the swing of chance."""
     points = {model: results.points(metric, model) for model in results.models}
@@ -53,40 +53,38 @@ def tornado(results: StudyResults, metric: str) -> tuple[Figure, str]:
     sizes = {f: np.nan_to_num([swings[m][f].size for m in results.models], nan=-1).max() for f in results.factors}
     order = sorted(results.factors, key=lambda factor: -sizes[factor])
     labels = [wrapped(factor) for factor in order]
-    left, row = rows_of(labels)
     ends = np.asarray([end for m in results.models for s in swings[m].values() for end in (s.least, s.most)])
     exponent = axis_exponent(ends)
-    figure, axes = sheet(
+    unit = 10.0**exponent
+    ends = ends[np.isfinite(ends)] / unit
+    extent = (float(np.ptp(ends)) or abs(float(ends[0])) or 1.0) if ends.size else 1.0
+    legend = [
+        Patch(facecolor=SKY, alpha=0.6, lw=0, label="range of the mean"),
+        Line2D([], [], color=VERMILLION, marker="<", ms=5, ls="none", label="lowest values of the factor"),
+        Line2D([], [], color=BLUE, marker=">", ms=5, ls="none", label="highest values"),
+        *([NOISE] if results.shows_chance("tornado") else []),
+    ]
+    with panels(
         metric,
         (1, len(results.models)),
-        (panel_width(len(results.models)), row * max(len(order), 2)),
-        Margins(left=left, bottom=44.0),
-        legend=[
-            Patch(facecolor=SKY, alpha=0.6, lw=0, label="range of the mean"),
-            Line2D([], [], color=VERMILLION, marker="<", ms=5, ls="none", label="lowest values of the factor"),
-            Line2D([], [], color=BLUE, marker=">", ms=5, ls="none", label="highest values"),
-            *([NOISE] if results.shows_chance("tornado") else []),
-        ],
+        (panel_width(results), row_height(labels) * max(len(order), 2)),
+        legend=legend,
         heads=results.models,
-    )
-    label_rows(axes, labels, separate_last=False)
-    ends = ends[np.isfinite(ends)] / 10.0**exponent
-    extent = (float(np.ptp(ends)) or abs(float(ends[0])) or 1.0) if ends.size else 1.0
-    x_label = axis_label(f"mean {metric}", results.about(metric, "unit"), exponent, 30)
-    for one, model in zip(axes, results.models, strict=True):
-        one.set_xlabel(x_label, linespacing=1.25)
-        set_linear(one.xaxis, 4)
-        if not points[model].values.size:
-            write_message(one, "no values")
-            one.set_xticks([])
-            continue
-        one.set_xlim(ends.min() - 0.06 * extent, ends.max() + 0.06 * extent)
-        centre, chance = points[model].centre(), points[model].chance_swing()
-        unit = 10.0**exponent
-        one.axvspan((centre - chance / 2) / unit, (centre + chance / 2) / unit, color=BAND, alpha=0.75, lw=0)
-        one.axvline(centre / unit, color=MUTED, lw=0.8, zorder=2)
-        for y, factor in enumerate(order):
-            _draw_swing(one, y, swings[model][factor], unit, ordered=not is_categorical(results, factor))
+    ) as (figure, axes):
+        label_rows(axes, labels)
+        for one, model in zip(axes, results.models, strict=True):
+            one.set_xlabel(with_unit(f"mean {metric}", results.about(metric, "unit"), exponent, 30))
+            set_linear(one.xaxis, 4)
+            if not points[model].values.size:
+                write_message(one, "no values")
+                one.set_xticks([])
+                continue
+            one.set_xlim(ends.min() - 0.06 * extent, ends.max() + 0.06 * extent)
+            centre, chance = points[model].centre(), points[model].chance_swing()
+            one.axvspan((centre - chance / 2) / unit, (centre + chance / 2) / unit, color=BAND, alpha=0.75, lw=0)
+            one.axvline(centre / unit, color=MUTED, lw=0.8, zorder=2)
+            for y, factor in enumerate(order):
+                _draw_swing(one, y, swings[model][factor], unit, ordered=not is_categorical(results, factor))
     return figure, ""
 
 
@@ -133,7 +131,6 @@ class _Responses:
         return low - margin, high + margin, False
 
 
-@styled
 def responses(results: StudyResults, metric: str) -> tuple[Figure, str]:
     """Draw the conditional median of a metric against each factor, with bootstrap bands.
 
@@ -150,45 +147,28 @@ def responses(results: StudyResults, metric: str) -> tuple[Figure, str]:
     exponent = 0 if log else axis_exponent([low, high])
     unit = 10.0**exponent
     columns = min(4, len(factors))
-    names = [_factor_label(results, factor) for factor in factors]
-    y_label = axis_label(metric, results.about(metric, "unit"), exponent, 20)
-    upright = max(map(_height_of_categories, drawn.every), default=0.0)
-    below = max(14.0, upright) + LINE * max(name.count("\n") + 1 for name in names) + 4.0
-    figure, axes = sheet(
-        metric,
-        (math.ceil(len(factors) / columns), columns),
-        _PANEL,
-        Margins(
-            left=40.0 + 11.0 * (y_label.count("\n") + 1),
-            bottom=below,
-            between_rows=below + 8.0,
-            between_columns=22.0,
-        ),
-        legend=_legend(results, drawn),
-    )
-    for one in axes[len(factors) :]:
-        one.set_axis_off()
-    for k, (one, factor, name) in enumerate(zip(axes, factors, names, strict=False)):
-        one.set_ylim(low / unit, high / unit)
-        set_log(one.yaxis, low, high) if log else set_linear(one.yaxis, 5)
-        if k % columns:
-            one.set_yticklabels([])
-        else:
-            one.set_ylabel(y_label, linespacing=1.3)
-        one.grid(axis="y", zorder=0)
-        one.set_axisbelow(True)
-        one.set_xlabel(name, labelpad=1, linespacing=1.1)
-        if not any(curve.x for curve in drawn.curves[factor].values()):
-            write_message(one, "no values")
-            one.set_xticks([])
-            continue
-        _draw_chance(one, list(drawn.chance.values()), unit)
-        if is_categorical(results, factor):
-            _draw_categories(one, drawn, factor, unit)
-        else:
-            _draw_curves(
-                one, drawn.curves[factor], unit, results.factor(factor).get("distribution") == "log_uniform"
-            )
+    grid = math.ceil(len(factors) / columns), columns
+    with panels(metric, grid, _PANEL, legend=_legend(results, drawn), sharey=True) as (figure, axes):
+        for one in axes[len(factors) :]:
+            one.set_axis_off()
+        axes[0].set_ylim(low / unit, high / unit)
+        set_log(axes[0].yaxis, low, high) if log else set_linear(axes[0].yaxis, 5)
+        for one in axes[::columns]:
+            one.set_ylabel(with_unit(metric, results.about(metric, "unit"), exponent, 20))
+        for one, factor in zip(axes, factors, strict=False):
+            key = "" if is_categorical(results, factor) else str(results.factor(factor).get("unit") or "")
+            one.set_xlabel(with_unit(factor, key, 0, 25) if key else wrapped(factor, 25), linespacing=1.1)
+            one.grid(axis="y")
+            if not any(curve.x for curve in drawn.curves[factor].values()):
+                write_message(one, "no values")
+                one.set_xticks([])
+                continue
+            _draw_chance(one, list(drawn.chance.values()), unit)
+            if is_categorical(results, factor):
+                _draw_categories(one, drawn, factor, unit)
+            else:
+                log_factor = results.factor(factor).get("distribution") == "log_uniform"
+                _draw_curves(one, drawn.curves[factor], unit, log_factor)
     words = results.importance[0].split(" / ")[0]
     note = f"Drawn are the {len(factors)} of {len(results.factors)} factors with the highest {words}."
     return figure, note if len(results.factors) > len(factors) else ""
@@ -199,7 +179,7 @@ def _legend(results: StudyResults, drawn: _Responses) -> list[Any]:
     several = len(results.models) > 1
     names = results.models if several else ("median",)
     handles: list[Any] = [
-        Line2D([], [], color=MODEL_COLOURS[k % 6], marker=MODEL_MARKERS[k % 6], ms=3.5, lw=1.4, label=name)
+        Line2D([], [], color=SERIES_COLOURS[k % 6], marker=SERIES_MARKERS[k % 6], ms=3.5, lw=1.4, label=name)
         for k, name in enumerate(names)
     ]
     if any(np.isfinite(curve.low).any() for curve in drawn.every):
@@ -221,38 +201,15 @@ def _draw_chance(axes: Axes, bands: Sequence[tuple[float, float] | None], unit: 
         x = 1.02 + 0.022 * k
         ends = [band[0] / unit, band[1] / unit]
         axes.plot(
-            [x, x], ends, color=MODEL_COLOURS[k % 6], lw=2.2, transform=axes.get_yaxis_transform(), clip_on=False
+            [x, x], ends, color=SERIES_COLOURS[k % 6], lw=2.2, transform=axes.get_yaxis_transform(), clip_on=False
         )
-
-
-def _factor_label(results: StudyResults, factor: str) -> str:
-    """Return the label of a factor's axis: its key and unit."""
-    if is_categorical(results, factor):
-        return wrapped(factor, 25)
-    return axis_label(factor, str(results.factor(factor).get("unit") or ""), 0, 25)
-
-
-def _category(value: float | str) -> str:
-    """Return a category as the label of a tick."""
-    return wrapped(value if isinstance(value, str) else f"{value:g}", 14, 1)
-
-
-def _height_of_categories(curve: ResponseCurve) -> float:
-    """Return the height in points of the names of categories, which stand upright where they are long."""
-    names = [_category(x) for x in curve.x] if curve.categorical else []
-    return max(map(text_width, names)) + 6 if names and _upright(names) else 14.0
-
-
-def _upright(names: Sequence[str]) -> bool:
-    """Return whether the names of categories are too wide to stand side by side."""
-    return max(map(text_width, names)) + 4 > _PANEL[0] / len(names)
 
 
 def _draw_curves(axes: Axes, curves: Mapping[str, ResponseCurve], unit: float, log: bool) -> None:
     """Draw the median of each model against numbers, with its band."""
     every = [x for curve in curves.values() for x in curve.x if isinstance(x, float)]
     for k, curve in enumerate(curves.values()):
-        colour, marker = MODEL_COLOURS[k % 6], MODEL_MARKERS[k % 6]
+        colour, marker = SERIES_COLOURS[k % 6], SERIES_MARKERS[k % 6]
         x = np.asarray(curve.x, dtype=float)
         axes.fill_between(x, curve.low / unit, curve.high / unit, color=colour, alpha=0.25, lw=0, zorder=3)
         axes.plot(x, curve.median / unit, color=colour, marker=marker, ms=2.6, mew=0, lw=1.3, zorder=4)
@@ -277,9 +234,10 @@ def _draw_categories(axes: Axes, drawn: _Responses, factor: str, unit: float) ->
         x = np.asarray([categories.index(value) for value in curve.x]) + (k - (len(curves) - 1) / 2) * width
         base = float(np.median(drawn.points[model].values)) / unit
         height = curve.median / unit - base
-        axes.bar(x, height, 0.9 * width, bottom=base, color=MODEL_COLOURS[k % 6], lw=0, zorder=3)
+        axes.bar(x, height, 0.9 * width, bottom=base, color=SERIES_COLOURS[k % 6], lw=0, zorder=3)
         axes.vlines(x, curve.low / unit, curve.high / unit, color=INK, lw=1.0, zorder=4)
-        axes.hlines(base, -0.5, len(categories) - 0.5, color=MODEL_COLOURS[k % 6], lw=0.7, zorder=3)
-    names = [_category(x) for x in categories]
-    axes.set_xticks(range(len(names)), names, rotation=90 if _upright(names) else 0)
+        axes.hlines(base, -0.5, len(categories) - 0.5, color=SERIES_COLOURS[k % 6], lw=0.7, zorder=3)
+    names = [wrapped(x if isinstance(x, str) else f"{x:g}", 14, 1) for x in categories]
+    side_by_side = 4.6 * (max(map(len, names)) + 1) * len(names) < _PANEL[0]
+    axes.set_xticks(range(len(names)), names, rotation=0 if side_by_side else 90)
     axes.set_xlim(-0.6, len(names) - 0.4)

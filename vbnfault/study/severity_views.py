@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +23,11 @@ from ..faults import Fault, Severity, from_dict, registry
 from ..pipeline import Session
 from ..pipeline.development import Development
 from ..pipeline.injection import fault_context
-from ..pipeline.spec import Draw, Pose, Rendering, SampleSpec, SceneExposure
-from ..pipeline.stages import add_stars, meter, render_view, resolve
+from ..pipeline.spec import Draw, SampleSpec
+from ..pipeline.stages import render_view, resolve
 from ..scene import config
 from . import navigation_metrics
+from .views import CleanView, RenderedView, rendered_sequence
 
 # Evaluations of a model on a view, spaced evenly in position. They are the same on all views, so that a quantile
 # over views is one of evaluated errors. Interpolation of each view's curve would even out its steps.
@@ -105,33 +106,16 @@ class ViewGroup:
     models: tuple[ModelUnderTest, ...]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class SequenceView:
-    """Hold one image of a sequence as far as no fault changes it."""
-
-    spec: SampleSpec
-    pose: Pose
-    rendering: Rendering
-    exposure: SceneExposure
-    clean: np.ndarray[Any, np.dtype[np.uint8]]
-
-    def image(self, fault: Fault | None) -> np.ndarray[Any, np.dtype[np.uint8]]:
-        """Return the image with a fault, drawn by the key of the sample, uint8[y, x, 4]; None: without any."""
-        if fault is None:
-            return self.clean
-        context = fault_context(self.pose, self.rendering, self.exposure)
-        development = Development(exposure=self.exposure, context=context, rng=self.spec.rng)
-        params = fault.draw(development.context_of(fault, {}), self.spec.rng("fault", f"{fault.fault}/0"))
-        return development.image({fault.fault: Draw(fault=fault, attempt=0, params=params)}).array
-
-    def frame(self, fault: Fault | None) -> navigation_metrics.NavigationFrame:
-        """Return the view with a fault as the metrics need it."""
-        return navigation_metrics.navigation_frame(
-            self.pose, self.rendering.truth, self.spec.camera, self.clean, self.image(fault)
-        )
+def faulted(view: CleanView, fault: Fault) -> navigation_metrics.NavigationFrame:
+    """Return a view with a fault, drawn by the key of the sample, as the metrics need it."""
+    context = fault_context(view.pose, view.rendering, view.exposure)
+    development = Development(exposure=view.exposure, context=context, rng=view.spec.rng)
+    params = fault.draw(development.context_of(fault, {}), view.spec.rng("fault", f"{fault.fault}/0"))
+    image = development.image({fault.fault: Draw(fault=fault, attempt=0, params=params)}).array
+    return replace(view.frame, image=image)
 
 
-def sequences(group: ViewGroup, metric: str, session: Session) -> Iterator[tuple[SequenceView, ...]]:
+def sequences(group: ViewGroup, metric: str, session: Session) -> Iterator[tuple[CleanView, ...]]:
     """Render the views of a group one by one; fewer than its `count` where the scene has no more.
 
     A view counts if it has a value of the metric without faults, and enough matches where matches are compared.
@@ -145,7 +129,7 @@ def sequences(group: ViewGroup, metric: str, session: Session) -> Iterator[tuple
             views = tuple(_views(session.spec(int(index)), needed, group.facing_sun))
         except VbnfaultError:  # no pose, or no track, meets the conditions
             continue
-        if views and _counts([view.frame(None) for view in views], metric):
+        if views and _counts([view.frame for view in views], metric):
             made += 1
             yield views
 
@@ -162,26 +146,15 @@ def session_of(group: ViewGroup) -> Session:
     return Session(config.load_scene(group.scene, values), source=group.scene)
 
 
-def _views(spec: SampleSpec, count: int, facing_sun: bool) -> Iterator[SequenceView]:
+def _views(spec: SampleSpec, count: int, facing_sun: bool) -> Iterator[CleanView]:
     """Render the views of a sequence; none where the Sun should be before the camera, but is not wholly visible."""
     pose = resolve(spec)
     spec = spec.at(pose)
     if facing_sun and not (pose.sun_visible_fraction == 1 and pose.L_from_C[:, 2] @ pose.sun_L > 0):
         return
-    rendering = render_view(spec, pose)
-    for k, pose_k in enumerate(navigation_metrics.sequence(spec, pose, rendering, count)):
-        spec_k = navigation_metrics.spec_of_view(spec, k)
-        rendering_k = rendering if k == 0 else render_view(spec_k, pose_k)
-        exposure = add_stars(spec_k, pose_k, rendering_k, meter(spec_k, rendering_k))
-        context = fault_context(pose_k, rendering_k, exposure)
-        development = Development(exposure=exposure, context=context, rng=spec_k.rng)
-        yield SequenceView(
-            spec=spec_k,
-            pose=pose_k,
-            rendering=rendering_k,
-            exposure=exposure,
-            clean=development.image({}).array,
-        )
+    first = RenderedView(spec=spec, pose=pose, rendering=render_view(spec, pose))
+    for view in rendered_sequence(first, count):
+        yield CleanView.of(view, view.spec.camera)
 
 
 def _counts(frames: Sequence[navigation_metrics.NavigationFrame], metric: str) -> bool:
@@ -198,11 +171,9 @@ def _counts(frames: Sequence[navigation_metrics.NavigationFrame], metric: str) -
 # --- the error as a function of severity -------------------------------------------------------------------------
 
 
-def error_of(
-    fault: Fault, views: Sequence[SequenceView], metric: str, clean: navigation_metrics.CleanTwins
-) -> float:
+def error_of(fault: Fault, views: Sequence[CleanView], metric: str, clean: navigation_metrics.CleanTwins) -> float:
     """Return the metric of a sequence of views with a fault; `clean` are their twins without any."""
-    frames = [view.frame(fault) for view in views]
+    frames = [faulted(view, fault) for view in views]
     return navigation_metrics.navigation_values(frames, [metric], clean)[metric]
 
 
@@ -278,10 +249,10 @@ class ViewWorker:
             self._session = key, session_of(group)
         return self._session[1]
 
-    def _errors(self, group: ViewGroup, views: Sequence[SequenceView]) -> dict[str, list[tuple[float, float]]]:
+    def _errors(self, group: ViewGroup, views: Sequence[CleanView]) -> dict[str, list[tuple[float, float]]]:
         """Return the values and errors of each model, by its name."""
         width_px = views[0].spec.scene.camera.width_px
-        clean = navigation_metrics.CleanTwins([v.clean for v in views], [v.frame(None).view for v in views])
+        clean = navigation_metrics.CleanTwins.of([view.frame for view in views])
         return {
             model.name: measure(model, width_px, lambda fault: error_of(fault, views, self._metric, clean))
             for model in group.models

@@ -1,8 +1,8 @@
-"""Change the camera and the Sun of a rendered view, and compute the light of the scene without straylight."""
+"""Change the camera and the Sun of a rendered view, and take it through the pipeline as far as its clean image."""
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -12,11 +12,16 @@ from numpy.typing import NDArray
 
 from ..camera import Camera
 from ..core import spectra
-from ..core.quantities import BODY, Radiance, SunInView
+from ..core.quantities import BODY, SunInView
 from ..core.sundisc import Pinhole, add_mean
 from ..faults import FaultContext
+from ..pipeline.development import Development
+from ..pipeline.exposure import meter
 from ..pipeline.injection import fault_context
+from ..pipeline.rendering import render_view
 from ..pipeline.spec import Pose, Rendering, SampleSpec, SceneExposure, SceneLight
+from ..pipeline.stars import add_stars
+from . import navigation_metrics as nav
 
 F32 = NDArray[np.float32]
 
@@ -25,35 +30,19 @@ _LIT = 0.02  # of the 99th percentile of the ground's signal, above which ground
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RenderedView:
-    """Hold a rendered view: its sample, pose and radiance."""
+    """Hold a rendered view: its sample, pose and radiance, and its number in a sequence."""
 
     spec: SampleSpec
     pose: Pose
     rendering: Rendering
+    number: int = 0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Exposed:
-    """Hold a view with the camera and the Sun of one evaluation.
+class Exposed(RenderedView):
+    """Hold a view with the camera and the Sun of one evaluation, and its exposure."""
 
-    Attributes
-    ----------
-    spec, pose, rendering, exposure
-        As the pipeline has them, with the camera and the Sun changed.
-    scene_e, direct_e
-        Expected signal of the scene, and of the Sun's direct image, without straylight, float32[channel, y, x] in
-        electrons; `direct_e` is None where the Sun is out of view.
-    lit
-        Indices of the pixels that show sunlit ground.
-    """
-
-    spec: SampleSpec
-    pose: Pose
-    rendering: Rendering
     exposure: SceneExposure
-    scene_e: F32
-    direct_e: F32 | None
-    lit: NDArray[np.intp]
 
     @property
     def camera(self) -> Camera:
@@ -61,14 +50,58 @@ class Exposed:
         return self.exposure.camera
 
     @cached_property
+    def scene_e(self) -> F32:
+        """Return the signal of the scene without straylight and Sun, float32[channel, y, x] in electrons."""
+        return _planes(self.exposure.rate.array, self.camera.exposure_s)
+
+    @cached_property
+    def direct_e(self) -> F32 | None:
+        """Return the same of the Sun's direct image; None where it is out of view."""
+        past_rims = self.exposure.rate.past_rims
+        return None if past_rims is None else _planes(past_rims, self.camera.exposure_s)
+
+    @cached_property
     def clean(self) -> F32:
         """Return the expected signal without straylight, float32[channel, y, x] in electrons."""
         return self.scene_e if self.direct_e is None else self.scene_e + self.direct_e
 
     @cached_property
+    def lit(self) -> NDArray[np.intp]:
+        """Return the indices of the pixels that show sunlit ground."""
+        per_s, semantic = self.exposure.rate.array, self.rendering.truth.semantic
+        ground = np.flatnonzero(semantic.ravel() == BODY)
+        level = per_s.reshape(-1, per_s.shape[-1])[ground].mean(axis=1)
+        return ground[level > _LIT * np.percentile(level, 99)] if len(level) else ground
+
+    @cached_property
     def context(self) -> FaultContext:
         """Return the sample as its faults see it."""
         return fault_context(self.pose, self.rendering, self.exposure)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CleanView(Exposed):
+    """Hold a view of a sequence as far as no fault changes it; both images of `frame` are its clean twin."""
+
+    frame: nav.NavigationFrame
+
+    @classmethod
+    def of(cls, view: RenderedView, nominal: Camera) -> CleanView:
+        """Return a rendered view with its exposure and its clean twin; a navigator believes the nominal camera."""
+        spec, pose, rendering = view.spec, view.pose, view.rendering
+        exposure = add_stars(spec, pose, rendering, meter(spec, rendering))
+        context = fault_context(pose, rendering, exposure)
+        clean = Development(exposure=exposure, context=context, rng=spec.rng).image({}).array
+        frame = nav.navigation_frame(pose, rendering.truth, nominal, clean, clean)
+        return cls(**vars(view), exposure=exposure, frame=frame)
+
+
+def rendered_sequence(view: RenderedView, count: int) -> Iterator[RenderedView]:
+    """Yield the views of a sequence that begins with a rendered view."""
+    yield view
+    for k, pose in enumerate(nav.sequence(view.spec, view.pose, view.rendering, count)[1:], start=1):
+        spec = nav.spec_of_view(view.spec, k)
+        yield RenderedView(spec=spec, pose=pose, rendering=render_view(spec, pose), number=k)
 
 
 # --- camera and Sun ----------------------------------------------------------------------------------------------
@@ -104,13 +137,6 @@ def _replaced(table: Any, keys: Sequence[str], value: Any) -> Any:
     return replace(table, **{first: value})
 
 
-def efficiency_key(camera: Camera) -> Hashable:
-    """Return all of the detector on which the expected electrons depend."""
-    own: Any = camera.detector
-    efficiency = own.efficiency if own.mosaic is None else own.sensor.efficiency
-    return efficiency, own.pixel_pitch_um, own.width_px, own.height_px
-
-
 def dark_e(camera: Camera) -> F32 | float:
     """Return the dark signal in electrons: of each pixel of a device with a mosaic, else the mean."""
     if camera.detector.mosaic is None:
@@ -118,7 +144,7 @@ def dark_e(camera: Camera) -> F32 | float:
     return np.asarray(camera.mosaic.device.dark_rate_e_s * np.float32(camera.exposure_s), dtype=np.float32)
 
 
-def with_sun(view: RenderedView, camera: Camera, sun: Mapping[str, float]) -> tuple[Pose, Rendering]:
+def with_sun(view: RenderedView, sun: Mapping[str, float]) -> tuple[Pose, Rendering]:
     """Return a view's pose and rendering with the Sun moved as the optics see it, and at another distance."""
     pose, rendering = view.pose, view.rendering
     if not sun:
@@ -176,34 +202,8 @@ def with_sun(view: RenderedView, camera: Camera, sun: Mapping[str, float]) -> tu
     )
 
 
-def scene_rate(camera: Camera, radiance: Radiance) -> F32:
-    """Return the electrons per second that the scene gives, without the Sun's disc, float32[y, x, channel]."""
-    scene = radiance
-    if radiance.sun is not None:
-        scene = replace(radiance, array=np.maximum(radiance.array - radiance.sun, 0), sun=None, disc=None)
-    return camera.detector.electrons_expected(camera.lens.image(scene), 1.0).array
-
-
-def sun_rate(camera: Camera, radiance: Radiance) -> F32 | None:
-    """Return the electrons per second of the Sun's direct image, float32[y, x, channel]; None out of view."""
-    if radiance.sun is None:
-        return None
-    sun = replace(radiance, array=radiance.sun, sun=None, fine=None)
-    on_sensor = camera.lens.image_of_sun(sun, camera.detector.pixel_pitch_um)
-    return camera.detector.electrons_expected(on_sensor, 1.0).array
-
-
-def planes_of(per_s: F32, seconds: float) -> F32:
+def _planes(per_s: F32, seconds: float) -> F32:
     """Return electrons, float32[channel, y, x], from electrons per second, float32[y, x, channel]."""
     planes = np.ascontiguousarray(np.moveaxis(per_s, -1, 0))
     planes *= np.float32(seconds)
     return planes
-
-
-def lit_pixels(per_s: F32, semantic: NDArray[np.uint8]) -> NDArray[np.intp]:
-    """Return the indices of the pixels that show sunlit ground."""
-    ground = np.flatnonzero(semantic.ravel() == BODY)
-    level = per_s.reshape(-1, per_s.shape[-1])[ground].mean(axis=1)
-    if not len(level):
-        return ground
-    return ground[level > _LIT * np.percentile(level, 99)]

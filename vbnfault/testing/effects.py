@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from ..detector import load_sensor
 from ..detector.chain import Device, MosaicNoise
-from ..detector.effects import Effect, Exposure, is_packaged, is_registered, order
+from ..detector.effects import Effect, Exposure, is_packaged, order, registry
 from .contract import naming, pickled
 
 _MAX_DRAWS = 100
@@ -116,7 +116,7 @@ def check_effect(
 def _check_declaration(effect: type[Effect]) -> None:
     """Check the class attributes and the fields of an effect."""
     assert "name" in effect.__dict__, "is a base class without a name"
-    assert is_registered(effect), "is not registered; another class of this name has replaced it"
+    assert effect.name in registry(), "is not registered"
     assert effect.__dict__.get("__doc__"), "has no docstring"
     try:
         order()

@@ -1,6 +1,6 @@
 """Define the effects of a detector with a mosaic, in their order: one class each, which registers itself."""
 
-from .contract import STEPS, Acts, Effect, Effects, Exposure, chain_of, is_packaged, is_registered, order, registry
+from .contract import STEPS, Acts, Effect, Effects, Exposure, chain_of, is_packaged, order, registry
 
 __all__ = [
     "STEPS",
@@ -10,7 +10,6 @@ __all__ = [
     "Exposure",
     "chain_of",
     "is_packaged",
-    "is_registered",
     "order",
     "registry",
 ]

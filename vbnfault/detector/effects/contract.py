@@ -30,7 +30,7 @@ that the wells hold, and what it adds is not clipped.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
@@ -40,7 +40,6 @@ from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationError
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
-from ...core.errors import VbnfaultError
 from ...core.registry import DeclarationError, Registry, chained, is_name
 from ...core.tables import Table, did_you_mean
 from ..individual import stream
@@ -187,11 +186,6 @@ def is_packaged(cls: type[Effect]) -> bool:
     return _REGISTRY.is_packaged(cls)
 
 
-def is_registered(cls: type[Effect]) -> bool:
-    """Return whether the name of an effect belongs to this class and not to that of another file."""
-    return _REGISTRY.holds(cls.name, cls)
-
-
 def order() -> tuple[str, ...]:
     """Return the names of all effects in the order in which they act.
 
@@ -203,7 +197,6 @@ def order() -> tuple[str, ...]:
         {name: cls.after for name, cls in classes.items()},
         [name for name, cls in classes.items() if is_packaged(cls)],
         "detector effect",
-        _REGISTRY.unused(),
     )
 
 
@@ -213,18 +206,9 @@ def chain_of(effects: Sequence[Effect]) -> tuple[Effect, ...]:
     classes = registry()
     return tuple(
         own[name] if name in own else classes[name]()
-        for name in _order_with(own)
+        for name in order()
         if name in own or is_packaged(classes[name])
     )
-
-
-def _order_with(names: Iterable[str]) -> tuple[str, ...]:
-    """Return `order()`. Raises VbnfaultError if one of the names has no place in it."""
-    places = order()
-    for name in names:
-        if name not in places:
-            raise VbnfaultError(f"detector effect {name}: its plug-in is not loaded any more; load the scene again")
-    return places
 
 
 # --- the tables of the sensor file ------------------------------------------------------------------------------
@@ -241,7 +225,7 @@ def parse(tables: Any) -> tuple[Effect, ...]:
         own = {name: _parse_effect(name, table) for name, table in tables.items()}
     else:
         raise ValueError("must be a table")
-    return tuple(own[name] for name in _order_with(own) if name in own)
+    return tuple(own[name] for name in order() if name in own)
 
 
 def _parse_effect(name: str, table: Any) -> Effect:

@@ -6,10 +6,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core import buffers
 from .. import compiled
+from ..charge import passing_dark_e
 from ..dark import Telegraph, silicon_factor
-from ..transfer import passing_dark_e
 from .contract import F32, Effect, Exposure, FaultStep
 
 
@@ -23,7 +22,7 @@ class DarkCurrent(Effect):
         """Return the electrons with dark current, without telegraph signals."""
         device, factor = exposure.device, dark_factor(exposure)
         dark_s = exposure.exposure_s * factor
-        out = np.asarray(cv2.scaleAdd(device.dark_rate_e_s, dark_s, signal, dst=buffers.empty(signal.shape)))
+        out = np.asarray(cv2.scaleAdd(device.dark_rate_e_s, dark_s, signal))
         moved = device.transfer_dark_e
         if moved is None:
             return out

@@ -8,9 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from ...core import buffers
-from ..charge import parasitic_light, smear, smear_interline
-from ..transfer import along_columns
+from ..charge import along_columns, parasitic_light, smear, smear_interline
 from .contract import F32, Effect, Exposure, FaultStep
 
 
@@ -22,7 +20,7 @@ class Response(Effect):
 
     def apply(self, signal: Any, exposure: Exposure) -> F32:
         """Return the photo-electrons of each pixel."""
-        return np.asarray(cv2.multiply(signal, exposure.device.response, dst=buffers.empty(signal.shape)))
+        return np.asarray(cv2.multiply(signal, exposure.device.response))
 
 
 class LightStep(FaultStep):

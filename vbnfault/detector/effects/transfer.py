@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 
-from ..charge import ChargeCloud, TrapSpecies, bloom, capture, cti
-from ..transfer import along_columns, along_registers
+from ..charge import ChargeCloud, TrapSpecies, along_columns, along_registers, bloom, capture, cti
 from .contract import F32, Effect, Exposure
 
 

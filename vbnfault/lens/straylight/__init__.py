@@ -15,7 +15,7 @@ Modules:
   computes how dust scatters.
 - `total` adds the veil, and returns the sum of all straylight and the remaining fraction of the direct image.
 - `scene` computes ghosts, glare and veil of everything that a render shows, with `ghost_response` (ghosts of every
-  field angle, traced once for a lens) and `scene_scatter` (glare as a convolution).
+  field angle, traced once for a lens) and `scene_convolution` (glare and diffraction).
 
 To change where ghosts are clipped, see `steps`, which lists all code that does so.
 """

@@ -5,8 +5,8 @@ Each path is a table of steps, so that the rays of all ghosts run side by side t
 of a ray is relative to the vertex of the surface that the ray has just met. If the boxes of the bundles are
 symmetric about the plane of axis and Sun, the code traces only one side of this plane.
 
-Coatings vary faster with wavelength than directions of rays: a tracer of bands has the fractions of light of every
-other nanometre and means around the wavelengths that it traces. `ghosts.GhostSpectra` compares both with few rays.
+Coatings vary faster with wavelength than directions of rays: a tracer of bands has the fractions of light at
+many wavelengths and means around the wavelengths that it traces. `ghosts.GhostSpectra` compares both with few rays.
 A route is the sequence of reflecting surfaces, which are numbered by their row in the prescription. The path of a
 route is the sequence of all surfaces that a ray meets; each of them is one step.
 
@@ -17,9 +17,8 @@ A ray is lost (clipped) outside the rim of any surface. `Tracer.rims_mm` holds t
 from __future__ import annotations
 
 import copy
-import gc
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import combinations
 from types import SimpleNamespace
@@ -125,8 +124,6 @@ class TraceOptions(TypedDict, total=False):
     centred
         Whether rays start in the middles of the cells of the box. Otherwise rays start on the lattice of the box,
         which includes the edges of the box and is rounded if `Rays.disc` is not 0.
-    light
-        If False, a tracer with only one path and one wavelength does not compute `fraction`, which is then 1.
     halved
         Whether to trace only one side of the plane of axis and Sun if all boxes are symmetric about this plane.
     stretch
@@ -135,7 +132,6 @@ class TraceOptions(TypedDict, total=False):
     """
 
     centred: bool
-    light: bool
     halved: bool
     stretch: F64
 
@@ -310,7 +306,7 @@ class Tracer:
         self.lens = lens
         self.wavelength_nm = np.atleast_1d(np.asarray(wavelength_nm, dtype=np.float64))
         self.bands = bands if bands is not None and len(bands.nm) > 1 else None
-        self.light_nm = self.wavelength_nm if self.bands is None else self.bands.sampled_nm
+        self.light_nm = self.wavelength_nm if self.bands is None else self.bands.sampled_nm(lens.spectral_step_nm)
         self._cosines = _COSINES if self.bands is None else _COSINES_OF_BANDS
         self.routes = routes(lens, reflections) if routes_ is None else tuple(routes_)
         self.sensor_mm = paraxial_properties(lens).bfd_mm
@@ -321,7 +317,6 @@ class Tracer:
         self.matrix = np.stack([m for m, _ in pairs_of]) if pairs_of else np.zeros((0, 2, 2))
         self.met = np.concatenate([met for _, met in pairs_of]) if pairs_of else np.zeros((0, 2, 2))
         self._tables = self._upload()
-        self._recorded: dict[Any, Any] = {}
         # width of the soft edge of the hood, in its radii; whoever knows the Sun's disc sets it
         self.hood_width = 1e-3
 
@@ -365,18 +360,8 @@ class Tracer:
             "medium": be.UInt32(medium.astype(np.uint32)),
             "aspheric": [be.Float(c.astype(np.float32)) for c in aspheric],
         }
-        self._last_gap_mm = float(steps.last_gap_mm[0]) if len(steps.last_gap_mm) else 0.0
         self._special = bool(len(aspheric)) or any(c != 1 for c in conic)
         self._bladed = bool(lens.surfaces[lens.stop].blades)
-        self._numbers = {
-            "gap": steps.gap_mm,
-            "curvature": curvature,
-            "eta": ratio,
-            "per_rim": per_rim,
-            "conic": conic,
-            "aspheric": aspheric,
-            "absorption": absorption[:, medium],
-        }
         tables |= self._fraction_tables(self._coated)
         be.dr.eval(tables)
         return tables
@@ -396,8 +381,6 @@ class Tracer:
         fraction[:, :, :2] += coating_loss * (self._bare - self._coated)[:, :, :2]
         other = copy.copy(self)
         other._tables = self._tables | other._fraction_tables(fraction)
-        other.__dict__.pop("_known", None)
-        other._recorded = {}
         return other
 
     @cached_property
@@ -451,15 +434,11 @@ class Tracer:
             float64[step]: width of the rim's soft edge at each step of each route, in radii of the rim. Without
             widths, margins are not computed, and rays that miss a surface or are totally reflected become nan.
         options
-            See `TraceOptions`; by default not centred, with light, halved, and without stretch.
+            See `TraceOptions`; by default not centred, halved, and without stretch.
         """
         side = np.broadcast_to(np.asarray(across, dtype=np.int64), len(rays))
-        centred, light = options.get("centred", False), options.get("light", True)
+        centred = options.get("centred", False)
         even = options.get("halved", True) and not rays.direction[:, 1].any() and not rays.box_mm[:, 1].any()
-        single = len(self.routes) == len(self.wavelength_nm) == len(rays) == 1
-        plain = width is None and not light and not even and not self._bladed and self.lens.hood is None
-        if single and plain and (centred or rays.disc is None):
-            return self._alone(rays, side, centred)
         be = backend()
         dr = be.dr
         start = self._start(rays, side, centred, even)
@@ -471,14 +450,7 @@ class Tracer:
         outside, margin = self._hood_rim(start)
         rim = (outside * outside, margin) if soft else (outside * outside,)
         ray = (start.x, start.y, none, start.dx, start.dy, start.dz, unit, *(rim * sides))
-        if len(self.routes) == len(self.wavelength_nm) == 1:
-            # one path and one wavelength: all numbers are constants of the kernel, and nothing is fetched
-            for at, sharpness, more in zip(self._known, per_width.tolist(), stretch.tolist(), strict=True):
-                step = replace(at, sharpness=sharpness, stretch=more)
-                ray = meet(step, ray, soft=soft, special=self._special, blades=self._blades, light=light)
-            last: Any = self._last_gap_mm
-        else:
-            ray, last = self._followed(ray, start, per_width, stretch, soft)
+        ray, last = self._followed(ray, start, per_width, stretch, soft)
         both = arrived(ray, last, soft)
         dr.eval(both)
         if not even:
@@ -531,42 +503,6 @@ class Tracer:
         _, *after = dr.while_loop((first, *ray), on, body, mode="symbolic")
         return tuple(after), dr.gather(be.Float, t["last"], start.route)
 
-    def _alone(self, rays: Rays, side: NDArray[np.int64], centred: bool) -> Spots:
-        """Trace the only bundle along the only path, without its light.
-
-        The kernel is recorded once and then replayed, because drjit needs as long to prepare a kernel as to run it
-        for some 10⁵ rays.
-        """
-        be = backend()
-        dr = be.dr
-        key = int(side[0]), centred
-        if key not in self._recorded:
-
-            def run(x: Any, y: Any, half_x: Any, half_y: Any, dx: Any, dy: Any, dz: Any) -> Any:
-                _, ix, iy, _ = lattice_places(side, side)
-                offset, spacing = (0.5, 2 / int(side[0])) if centred else (0.0, 2 / (int(side[0]) - 1))
-                count = dr.width(ix)
-                none, unit = dr.zeros(be.Float, count), dr.full(be.Float, 1, count)
-                x = dr.fma(half_x, (be.Float(ix) + offset) * spacing - 1, x)
-                y = dr.fma(half_y, (be.Float(iy) + offset) * spacing - 1, y)
-                ray: tuple[Any, ...] = (x, y, none, dx + none, dy + none, dz + none, unit, none)
-                for at in self._known:
-                    ray = meet(at, ray, soft=False, special=self._special, blades=self._blades, light=False)
-                return tuple(own for own, _ in arrived(ray, self._last_gap_mm, False))
-
-            self._recorded[key] = dr.freeze(run)
-        given = [dr.opaque(be.Float, float(v)) for v in (*rays.box_mm[0], *rays.direction[0])]
-        # drjit cannot record while arrays are freed, and Python's collector may free arrays of other tracers
-        collects = gc.isenabled()
-        gc.disable()
-        try:
-            spots = self._recorded[key](*given)
-        finally:
-            if collects:
-                gc.enable()
-        dr.eval(spots)
-        return Spots(rays, side, *spots)
-
     def _fetched(self, step: Any, edge: Any, beyond: Any, wavelength: Any, fractions: Any, media: Any) -> Step:
         """Return the data of one step of each lane's path, fetched from the tables."""
         be, t = backend(), self._tables
@@ -594,48 +530,12 @@ class Tracer:
             sharpness=sharpness,
             stretch=0.0 if beyond is None else dr.gather(be.Float, beyond, step),
             mirror=(word & 1) == 1,
-            onward=None,
             stop=dr.gather(be.UInt32, t["stop"], step) == 1 if self._bladed else False,
             conic=dr.gather(be.Float, t["conic"], row) if self._special else 1.0,
             aspheric=[dr.gather(be.Float, a, row) for a in t["aspheric"]],
             absorption=absorption,
             passed=passed,
         )
-
-    @cached_property
-    def _known(self) -> list[Step]:
-        """Return the data of the steps of the only path, as plain numbers."""
-        be, n = backend(), self._numbers
-        dr = be.dr
-        onward, out = 1.0, []
-        for step, row in enumerate(self.rows.tolist()):
-            word = int(self._look_up_word[step])
-
-            def passed(cosine: Any, word: int = word) -> Any:
-                at = cosine * (self._cosines - 1)
-                node = dr.minimum(be.UInt32(at), self._cosines - 2)
-                low, rise = _unpaired(self._tables["fraction"], (word >> 1) + node)
-                return dr.fma(at - be.Float(node), rise, low)
-
-            out.append(
-                Step(
-                    gap=float(n["gap"][step]),
-                    curvature=float(n["curvature"][step]),
-                    eta=float(n["eta"][0, step]),
-                    per_rim=float(n["per_rim"][step]),
-                    sharpness=1.0,
-                    stretch=0.0,
-                    mirror=bool(word & 1),
-                    onward=onward,
-                    stop=row == self.lens.stop,
-                    conic=float(n["conic"][row]),
-                    aspheric=[float(a[row]) for a in n["aspheric"]],
-                    absorption=float(n["absorption"][0, step]) if self._absorbs else None,
-                    passed=passed,
-                )
-            )
-            onward = -onward if word & 1 else onward
-        return out
 
     def _start(self, rays: Rays, across: NDArray[np.int64], centred: bool, even: bool) -> Any:
         """Return the start, route, wavelength and number of every ray, and the number of its mirror image.
@@ -694,7 +594,6 @@ class Tracer:
         The tracer always traces rays with the Sun at azimuth 0, and turns the blades of the stop back instead.
         """
         other = copy.copy(self)
-        other._recorded = {}
         rim = self.lens.surfaces[self.lens.stop]
         other._stop_turn_rad = float(np.radians(rim.rotation_deg) - azimuth_rad)
         return other

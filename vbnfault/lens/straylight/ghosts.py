@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 
 from ...core.llvm import backend
 from ...core.spectra import Bands, hat_weights
-from ..glass import D_NM
 from ..paraxial import paraxial_properties
 from ..prescription import Prescription
 from .bundles import Rays, Spots, Tracer, name_of
@@ -34,7 +34,9 @@ PEAK = 64  # rays across a box, to locate the peak
 _TOGETHER = 1 << 22  # rays traced at a time, to limit memory
 _SHARP = 1e-3  # default width of soft edges while boxes are located
 _LEAST_SPREAD = 0.25  # fraction of a ghost's image that is magnified less than `Arrivals.magnification`
-_SPECTRUM = 6  # rays across a ghost whose spectrum is computed
+# Rays across a ghost whose spectrum is computed; more if coatings have an optical thickness above `_FILMS_NM`,
+# because their reflectances vary faster with the angle.
+_SPECTRUM, _SPECTRUM_OF_FILMS, _FILMS_NM = 8, 16, 800.0
 _SPECTRUM_AT_ONCE = 1 << 20
 _LEAST_SHARE = 1e-2  # of a ghost's light in a band that a wavelength must have to be drawn in it
 _UNEVEN = 2.0  # ratio of the areas of neighbouring cells above which the image is uneven
@@ -381,7 +383,9 @@ def traced(
 class GhostSpectra:
     """Hold the light of bundles, and compute with which weights their rays add to the bands.
 
-    Few rays are enough, as only ratios count.
+    The light of every wavelength is that of the rays traced at the node before it and of those at the node behind
+    it. The weights compare it with the light of the same rays at the node, so errors of the lattice cancel, and few
+    rays are enough.
 
     Attributes
     ----------
@@ -389,13 +393,20 @@ class GhostSpectra:
         The bands; None for a tracer without.
     traced_nm
         float64[wavelength]: wavelengths of the tracer.
-    true, traced
-        Light of each bundle at `Bands.sampled_nm`, float64[bundle, n], and that which its rays carry if
-        they are traced at the wavelengths of the tracer, float64[bundle, wavelength].
+    nodes_nm
+        float64[node]: those among them at which rays were traced here.
+    light_nm
+        float64[n]: wavelengths of the true light.
+    true
+        float64[2, bundle, n]: light of each bundle, of the rays at the nodes before and behind.
+    traced
+        float64[bundle, wavelength]: light that the rays carry if they are traced at the wavelengths of the tracer.
     """
 
     bands: Bands | None
     traced_nm: F64
+    nodes_nm: F64
+    light_nm: F64
     true: F64
     traced: F64
 
@@ -403,20 +414,20 @@ class GhostSpectra:
     def of(cls, made: Tracer, rays: Rays, reach_mm: float = np.inf, step: int = 1) -> GhostSpectra:
         """Return the spectra of bundles; rays that arrive farther than `reach_mm` from the axis count less.
 
-        The light of the rays is computed at every `step`-th wavelength of the tracer and is linear between these.
+        Every `step`-th wavelength of the tracer is a node; the light of the rays is linear between the nodes.
         """
         nm, count = made.wavelength_nm, len(rays)
         if made.bands is None:
             none = np.ones((count, len(nm)))
-            return cls(bands=None, traced_nm=nm, true=none, traced=none)
-        lit = made.light_nm
-        nearest = np.rint(np.interp(lit, nm, np.arange(len(nm)))).astype(np.int64)
-        nodes = np.arange(0, len(nm), step)
-        wavelength = np.concatenate([nearest, nodes])
+            return cls(bands=None, traced_nm=nm, nodes_nm=nm, light_nm=nm, true=np.stack([none, none]), traced=none)
+        lit, nodes = made.light_nm, np.arange(0, len(nm), step)
+        across = _SPECTRUM_OF_FILMS if made.lens.film_nm > _FILMS_NM else _SPECTRUM
+        before = _interval(nm[nodes], lit)
+        wavelength = np.concatenate([nodes[before], nodes[before + 1], nodes])
         # the mean light around the tracer's wavelengths is before that of the bands
-        light = np.concatenate([np.arange(len(lit)), nodes - len(nm)])
+        light = np.concatenate([np.arange(len(lit)), np.arange(len(lit)), nodes - len(nm)])
         parts = []
-        together = max(1, _SPECTRUM_AT_ONCE // (len(light) * _SPECTRUM**2))
+        together = max(1, _SPECTRUM_AT_ONCE // (len(light) * across**2))
         for first in range(0, count, together):
             part = rays.take(np.arange(first, min(first + together, count)))
             each = replace(
@@ -424,21 +435,26 @@ class GhostSpectra:
                 wavelength=np.tile(wavelength, len(part)),
                 light=np.tile(light, len(part)),
             )
-            parts.append(_arriving(made.trace(each, _SPECTRUM, centred=True), reach_mm).reshape(len(part), -1))
+            parts.append(_arriving(made.trace(each, across, centred=True), across, reach_mm).reshape(len(part), -1))
         spectra = np.concatenate(parts) if parts else np.zeros((0, len(light)))
-        traced = np.einsum("gk,kn->gn", spectra[:, len(lit) :], hat_weights(nm[nodes], nm))
-        return cls(bands=made.bands, traced_nm=nm, true=spectra[:, : len(lit)], traced=traced)
+        *true, traced = np.split(spectra, [len(lit), 2 * len(lit)], axis=1)
+        traced = np.einsum("gk,kn->gn", traced, hat_weights(nm[nodes], nm))
+        return cls(
+            bands=made.bands, traced_nm=nm, nodes_nm=nm[nodes], light_nm=lit, true=np.stack(true), traced=traced
+        )
 
     def take(self, chosen: NDArray[Any]) -> GhostSpectra:
         """Return the spectra of some of the bundles."""
-        return replace(self, true=self.true[chosen], traced=self.traced[chosen])
+        return replace(self, true=self.true[:, chosen], traced=self.traced[chosen])
 
     def of_bands(self, wavelength: int) -> F64:
         """Return the mean true light in each band over that traced at one wavelength, float64[bundle, band]."""
-        if self.bands is None:
-            return np.ones((len(self.true), 1))
         traced = self.traced[:, wavelength, None]
-        mean = np.einsum("gn,bn->gb", self.true, _sampled(self.bands, self.bands.weights))
+        if self.bands is None:
+            return np.ones((len(traced), 1))
+        lit = self.light_nm
+        shares = _sampled(self.bands, lit, self.bands.weights)
+        mean = np.einsum("sgn,sbn->gb", self.true, _of_both(self.nodes_nm, lit, lit)[:, None] * shares)
         return np.asarray(np.where(traced > 0, mean / np.where(traced > 0, traced, 1), 1.0))
 
     def weights(self, step: int) -> F64:
@@ -448,10 +464,11 @@ class GhostSpectra:
         over the band of true light times the hat function of the wavelength, over the light of the rays.
         """
         if self.bands is None:
-            return np.ones((*self.true.shape, 1)) / self.true.shape[1]
+            return np.ones((*self.traced.shape, 1)) / self.traced.shape[1]
         # einsum, because the bits of BLAS may depend on the number of threads
-        shares = _shares(self.bands, tuple(self.traced_nm[::step].tolist()))
-        mean = np.einsum("gn,kbn->gkb", self.true, shares)
+        grids = (tuple(nm.tolist()) for nm in (self.nodes_nm, self.traced_nm[::step], self.light_nm))
+        shares = _shares(self.bands, *grids)
+        mean = np.einsum("sgn,skbn->gkb", self.true, shares)
         total = mean.sum(axis=1, keepdims=True)
         mean[mean < _LEAST_SHARE * total] = 0  # not worth the drawing
         mean *= total / np.maximum(mean.sum(axis=1, keepdims=True), 1e-300)
@@ -459,27 +476,48 @@ class GhostSpectra:
         return np.asarray(np.where(traced > 0, mean / np.where(traced > 0, traced, 1), 0))
 
 
+def _interval(nodes_nm: F64, nm: F64) -> NDArray[np.int64]:
+    """Return the index of the node before each wavelength, int64[n]."""
+    return np.clip(np.searchsorted(nodes_nm, nm, side="right") - 1, 0, len(nodes_nm) - 2)
+
+
+def _of_both(nodes_nm: F64, lit_nm: F64, at_nm: F64) -> F64:
+    """Return the weights float64[2, ...] of rays of the nodes before and behind `lit_nm` for rays at `at_nm`."""
+    before = _interval(nodes_nm, lit_nm)
+    behind = np.clip((at_nm - nodes_nm[before]) / np.diff(nodes_nm)[before], 0, 1)
+    return np.stack([1 - behind, behind])
+
+
 @lru_cache(maxsize=16)
-def _shares(bands: Bands, nodes_nm: tuple[float, ...]) -> F64:
-    """Return the weights of the sampled wavelengths in the hat function of each node, float64[node, band, n]."""
-    return _sampled(bands, bands.weights * hat_weights(np.array(nodes_nm), bands.wavelength_nm)[:, None])
+def _shares(
+    bands: Bands, nodes_nm: tuple[float, ...], traced_nm: tuple[float, ...], light_nm: tuple[float, ...]
+) -> F64:
+    """Return the weights of the wavelengths of the light in the hat function of each traced wavelength.
+
+    They are float64[2, wavelength, band, n], for the rays of the nodes before and behind each.
+    """
+    traced, light = np.array(traced_nm), np.array(light_nm)
+    hats = _sampled(bands, light, bands.weights * hat_weights(traced, bands.wavelength_nm)[:, None])
+    return _of_both(np.array(nodes_nm), light, traced[:, None])[:, :, None] * hats
 
 
-def _sampled(bands: Bands, weights: F64) -> F64:
-    """Return weights of the wavelengths of bands, float64[..., n], as weights of `Bands.sampled_nm`."""
-    return weights @ hat_weights(bands.sampled_nm, bands.wavelength_nm).T
+def _sampled(bands: Bands, light_nm: F64, weights: F64) -> F64:
+    """Return weights of the wavelengths of bands, float64[..., n], as those of values that a spline joins."""
+    if len(light_nm) == len(bands.nm):
+        return weights
+    return np.asarray(weights @ CubicSpline(light_nm, np.eye(len(light_nm)))(bands.wavelength_nm))
 
 
-def _arriving(spots: Spots, reach_mm: float) -> F64:
+def _arriving(spots: Spots, across: int, reach_mm: float) -> F64:
     """Return the mean light of the rays of each bundle that arrive near the axis, float64[bundle]."""
     be = backend()
     dr = be.dr
     away = (spots.x_mm * spots.x_mm + spots.y_mm * spots.y_mm) * dr.opaque(be.Float, reach_mm**-2)
     # where no ray passes the rims, those that nearly pass decide
     nearly = 1e-6 / (1 + spots.radius**4)
-    weight = dr.maximum((_inside(spots.radius, _SPECTRUM) + nearly) / (1 + away * away), 1e-30)
-    total = dr.block_sum(be.Float64(spots.fraction * weight), _SPECTRUM**2)
-    return np.asarray(total.numpy() / dr.block_sum(be.Float64(weight), _SPECTRUM**2).numpy())
+    weight = dr.maximum((_inside(spots.radius, across) + nearly) / (1 + away * away), 1e-30)
+    total = dr.block_sum(be.Float64(spots.fraction * weight), across**2)
+    return np.asarray(total.numpy() / dr.block_sum(be.Float64(weight), across**2).numpy())
 
 
 def fluxes_mm2(made: Tracer, rays: Rays, sun_deg: float, across: int) -> F64:
@@ -568,30 +606,3 @@ def peaks(spots: Spots, across: int, sun_deg: float) -> F64:
     highest = dr.block_reduce(dr.ReduceOp.Max, density, across**2).numpy()
     cell = 4 * rays.box_mm[:, 2] * rays.box_mm[:, 3] / across**2
     return np.asarray(highest * cell * np.cos(np.radians(sun_deg)), dtype=np.float64)
-
-
-def surface_interactions_per_second(
-    lens: Prescription, rays: int = 1_000_000, rounds: int = 5, *, light: bool = False
-) -> float:
-    """Measure how many surfaces rays meet per second straight through the lens; the median of `rounds` calls.
-
-    With `light`, the tracer also computes the fraction of the light that each surface transmits.
-    """
-    import time
-
-    made = Tracer(lens, np.array([D_NM]), routes_=[()])
-    across = int(np.ceil(np.sqrt(rays)))
-    radius = paraxial_properties(lens).entrance_pupil_diameter_mm / 2 / np.sqrt(2)
-    bundle = Rays(
-        route=np.zeros(1, dtype=np.int64),
-        wavelength=np.zeros(1, dtype=np.int64),
-        box_mm=np.array([[0.0, 0.0, radius, radius]]),
-        direction=np.array([[0.0, 0.0, 1.0]]),
-    )
-    be, seconds = backend(), []
-    for _ in range(rounds + 1):
-        start = time.perf_counter()
-        made.trace(bundle, across, light=light, halved=False)
-        be.dr.sync_thread()
-        seconds.append(time.perf_counter() - start)
-    return across * across * len(lens.surfaces) / float(np.median(seconds[1:]))

@@ -28,7 +28,7 @@ from ..prescription import Prescription
 from .bundles import Rays, Spots, TraceOptions, Tracer, name_of
 from .ghosts import Arrivals, GhostSpectra, boxes, fluxes_mm2, named, traced
 from .paraxial import Ghost, along, mean_ghost
-from .pyramid import LEVELS, Canvas, Pyramid
+from .pyramid import LEVELS, Canvas
 from .raster import PARTS, BundleDrawing, Sums, edge_kind
 from .settings import TRACED, GhostSettings, SensorGrid
 from .steps import FRINGES_END, stretched
@@ -365,10 +365,6 @@ class FlareModel:
         # the rays and cells; the sum of the levels takes the frame and, on each thread, some levels of a band
         release_unused(8 * int(np.prod(self.canvas.shape)) * self.canvas.bands)
         return sums.irradiance()
-
-    def levels(self, sun_deg: float, azimuth_deg: float = 0.0) -> Pyramid:
-        """Return the irradiance of `image` before its levels are added."""
-        return self._drawn(sun_deg, azimuth_deg, None).levels()
 
     def _drawn(self, sun_deg: float, azimuth_deg: float, only: tuple[int, int] | None) -> Sums:
         """Return the sums into which all ghosts are drawn."""

@@ -17,11 +17,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ...core.spectra import Bands, hat_weights
-from ..coating import mean_reflectance
 from ..glass import D_NM
 from ..paraxial import paraxial_properties
 from ..prescription import Prescription
-from ..rays import forward, ghost
+from ..rays import ghost, transmittance
 
 F64 = NDArray[np.float64]
 
@@ -157,42 +156,6 @@ def _media(lens: Prescription, wavelength_nm: tuple[float, ...]) -> tuple[F64, F
     for array in (index, vertex):
         array.setflags(write=False)
     return index, vertex
-
-
-def transmittance(lens: Prescription, path: Sequence[tuple[int, bool]], wavelength_nm: ArrayLike = D_NM) -> F64:
-    """Return the fraction of the light that takes a path, for normal incidence on every surface.
-
-    The result is float64 like `wavelength_nm`.
-    """
-    nm = np.asarray(wavelength_nm, dtype=np.float64)
-    index = [np.ones(nm.shape), *(surface.medium.index(nm) for surface in lens.surfaces)]
-    fraction = np.ones(nm.shape)
-    for row, mirror in path:
-        if row == len(lens.surfaces):
-            fraction = fraction * lens.sensor_reflectance
-            continue
-        films = lens.surfaces[row].coating
-        reflected = mean_reflectance(films, index[row], index[row + 1], 1.0, nm)
-        fraction = fraction * (reflected if mirror else 1 - reflected)
-    return fraction
-
-
-def axial_transmittance(lens: Prescription, wavelength_nm: ArrayLike) -> F64:
-    """Return the fraction of the axial light that coatings and glass transmit, float64[band].
-
-    It multiplies the image of a scene and the direct image of the Sun alike. It excludes reflected light. Ghosts
-    are part of that light, so they are not subtracted from the direct image a second time.
-    """
-    nodes = np.atleast_1d(np.asarray(wavelength_nm, dtype=np.float64))
-    return np.array(_axial_transmittance(lens, tuple(nodes.tolist())))
-
-
-@lru_cache(maxsize=64)
-def _axial_transmittance(lens: Prescription, wavelength_nm: tuple[float, ...]) -> tuple[float, ...]:
-    """Return `axial_transmittance`, which every exposure and every direct image of the Sun needs."""
-    nm = np.array(wavelength_nm)
-    depth = sum((s.thickness_mm * s.absorption_per_mm(nm) for s in lens.surfaces[:-1]), np.zeros(len(nm)))
-    return tuple((transmittance(lens, forward(lens), nm) * np.exp(-depth)).tolist())
 
 
 def paraxial_ghosts(

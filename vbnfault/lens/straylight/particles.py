@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import erf, j1
+from scipy.special import j1
 
 from ...core.array_files import ArrayFiles, code_hash
 from ...core.errors import InputError
@@ -54,23 +54,6 @@ def particle_count(level: float, diameter_um: ArrayLike) -> F64:
     if level < 1:
         return np.zeros(log.shape)
     return np.asarray(10 ** (_CC1246_SLOPE * (np.log10(level) ** 2 - log**2)))
-
-
-def obscured_fraction(cleanliness_level: float) -> float:
-    """Return the fraction of a surface that spheres of the standard's sizes cover.
-
-    The sizes run from 1 µm to `cleanliness_level` in µm; 0.1 m² has one particle larger than this level.
-    """
-    level = float(checked("cleanliness_level", cleanliness_level, *CLEANLINESS_LIMITS))
-    if level <= _SMALLEST_UM:
-        return 0.0
-    # ∫ π/4 D² (-dN/dD) dD with N = exp(c (U² - u²)), u = ln D: integrate by parts, then complete the square
-    c, top = _CC1246_SLOPE / np.log(10), np.log(level)
-    root = np.sqrt(c)
-    inner = np.sqrt(np.pi) / (2 * root) * np.exp(1 / c + c * top**2)
-    inner *= erf(root * (top - 1 / c)) + erf(1 / root)
-    covered = np.exp(c * top**2) - np.exp(2 * top) + 2 * inner
-    return float(np.pi / 4 * covered / _CC1246_AREA_UM2)
 
 
 def scattered_intensity(size_parameter: ArrayLike, cosine: ArrayLike, *, index: complex = DUST_INDEX) -> F64:
@@ -213,10 +196,10 @@ def particle_bsdf(
     Raises
     ------
     InputError
-        The level is outside 0 (clean) to 1000, or the wavelength outside 250 to 2500 nm.
+        The level is outside 0 (clean) to 1000.
     """
     level = float(checked("cleanliness_level", cleanliness_level, *CLEANLINESS_LIMITS))
-    intensity, _ = _dust(level, float(checked("wavelength_nm", wavelength_nm, *RANGE_NM)), index)
+    intensity, _ = _dust(level, float(wavelength_nm), index)
     b = np.abs(np.asarray(beta, dtype=np.float64))
     if level <= _SMALLEST_UM:
         return np.zeros(b.shape)
@@ -233,4 +216,4 @@ def particle_scatter_fraction(
 ) -> float:
     """Return the fraction of light that the particles of `particle_bsdf` scatter forwards."""
     level = float(checked("cleanliness_level", cleanliness_level, *CLEANLINESS_LIMITS))
-    return _dust(level, float(checked("wavelength_nm", wavelength_nm, *RANGE_NM)), index)[1]
+    return _dust(level, float(wavelength_nm), index)[1]

@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core import buffers
 from ...core.llvm import backend
 
 F32 = NDArray[np.float32]
@@ -43,55 +41,24 @@ class Canvas:
         return np.concatenate([[0], np.cumsum(self.sizes.prod(axis=1) * self.bands)])
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Pyramid:
-    """Hold the irradiance of all ghosts in levels, float32[band, y, x] each, from the finest to the coarsest."""
-
-    canvas: Canvas
-    levels: tuple[F32, ...]
-
-    @cached_property
-    def flux_mm2(self) -> F64:
-        """Return the flux in the frame, float64[band]; coarse levels end at whole pixels of their own."""
-        flux = np.zeros(self.canvas.bands)
-        for k, level in enumerate(self.levels):
-            inside = level[:, MARGIN : level.shape[1] - MARGIN, MARGIN : level.shape[2] - MARGIN]
-            flux += inside.sum(axis=(1, 2), dtype=np.float64) * 4**k
-        return np.asarray(flux * self.canvas.pitch_mm**2)
-
-    @property
-    def irradiance(self) -> F32:
-        """Return the sum of all levels, float32[band, y, x]."""
-        return summed(self.canvas, self.levels)
-
-
-def summed(canvas: Canvas, levels: Sequence[NDArray[Any]], unit: float | None = None) -> F32:
+def summed(canvas: Canvas, levels: Sequence[NDArray[np.int64]], unit: float) -> F32:
     """Return the sum of levels of resolution, each resized to the frame, float32[layer, y, x].
 
-    Parameters
-    ----------
-    canvas
-        The frame.
-    levels
-        float32[layer, y, x] of each level, or int64 in units of `unit`.
-    unit
-        Value of an integer of 1.
+    `levels` are int64[layer, y, x] each; `unit` is the value of an integer of 1.
     """
-    out = buffers.empty((len(levels[0]), *canvas.shape))
+    out = np.empty((len(levels[0]), *canvas.shape), np.float32)
 
     def resize(layer: int) -> None:
         """Resize and add the levels of one layer, from the coarsest to the finest."""
         below: F32 | None = None
         for level in range(LEVELS - 1, -1, -1):
             height, width = (int(v) for v in canvas.sizes[level])
-            here = buffers.empty((height, width))
             # layer by layer, because a copy of all levels takes 45 MB for 1024 pixels
-            np.multiply(levels[level][layer], 1 if unit is None else unit, out=here, dtype=np.float32)
+            here = np.multiply(levels[level][layer], unit, dtype=np.float32)
             if below is not None:
                 # folds end in steps, which pixel centres sample unevenly
                 calm = cv2.GaussianBlur(below, (3, 3), _CALM_SIGMA)
-                bigger = buffers.empty((2 * calm.shape[0], 2 * calm.shape[1]))
-                cv2.resize(calm, None, dst=bigger, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)
+                bigger = cv2.resize(calm, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)
                 # pixel 0 of a level covers two pixels of the finer level, -M·2 + M and the next
                 here += bigger[MARGIN : MARGIN + height, MARGIN : MARGIN + width]
             below = here

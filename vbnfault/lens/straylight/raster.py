@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from ...core.llvm import backend
 from .bundles import Spots, lattice_places, rounded
-from .pyramid import LEVELS, MARGIN, Canvas, Pyramid, summed
+from .pyramid import LEVELS, MARGIN, Canvas, summed
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -262,24 +262,17 @@ class Sums:
 
         return add
 
-    def levels(self) -> Pyramid:
-        """Return the sums of every level and band."""
-        levels = tuple(np.multiply(part, 1 / _UNITS, dtype=np.float32, order="C") for part in self._parts())
-        return Pyramid(canvas=self.canvas, levels=levels)
-
     def irradiance(self) -> F32:
         """Return the sum of all levels, float32[band, y, x]."""
-        return summed(self.canvas, self._parts(), 1 / _UNITS)
-
-    def _parts(self) -> list[NDArray[np.int64]]:
-        """Return the integer sums of every level, int64[band, y, x]; the bands of a pixel are neighbours."""
+        # the bands of a pixel are neighbours
         canvas, total = self.canvas, self._total.numpy().view(np.int64)
-        return [
+        levels = [
             total[canvas.starts[level] : canvas.starts[level + 1]]
             .reshape(*canvas.sizes[level], canvas.bands)
             .transpose(2, 0, 1)
             for level in range(LEVELS)
         ]
+        return summed(canvas, levels, 1 / _UNITS)
 
 
 def _shared_out(work: NDArray[np.uint32]) -> NDArray[np.intp]:

@@ -17,14 +17,12 @@ from scipy.special import exprel
 
 from ...core.spectra import Bands
 from ..footprint import disc_overlap
-from ..glass import RANGE_NM
 from ..paraxial import paraxial_properties
 from ..prescription import Prescription
-from ..rays import forward
-from ..thin import beyond_frame
-from .paraxial import along, axial_transmittance, mirrors
+from ..rays import axial_transmittance, forward
+from ..thin import beyond_frame, cos4_map
+from .paraxial import along, mirrors
 from .particles import CLEANLINESS_LIMITS, checked, particle_bsdf, particle_scatter_fraction
-from .pyramid import in_layers
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -35,9 +33,10 @@ REFERENCE_NM = 550.0  # wavelength at which roughness and the Harvey knee are qu
 ROUGHNESS_NM_LIMITS = (0.0, 50.0)
 ROUGHNESS_NM, KNEE, SLOPE = 1.0, 0.01, -1.5  # assumed: a good polish, and usual values for its scatter
 
-_LOOKUP = 1 << 16
 _OFFSETS: F64 = np.geomspace(1e-6, 2.0, 1025)
-_STEEPEST_DEG = 89.9
+_LOOKUP = 1 << 16
+# values of ln(offset²), too close together to be visible in an image
+_STEPS: F64 = np.linspace(2 * np.log(_OFFSETS[0]), 2 * np.log(_OFFSETS[-1]), _LOOKUP)
 _DISC = 65  # points across a beam
 _AROUND = 360  # azimuths about the source, for the flux outside the frame
 
@@ -103,10 +102,9 @@ class Harvey:
         Raises
         ------
         InputError
-            The roughness is outside 0 to 50 nm, L outside 1e-5 to 1, or S outside -4 to 0.
+            The roughness is outside 0 to 50 nm.
         """
         sigma = float(checked("roughness_nm", roughness_nm, *ROUGHNESS_NM_LIMITS))
-        L, S = float(checked("L", L, 1e-5, 1.0)), float(checked("S", S, -4.0, 0.0))
         total = (2 * np.pi * index_step * sigma / wavelength_nm) ** 2
         return cls(b0=float(total / cls(b0=1.0, L=L, S=S).tis), L=L, S=S)
 
@@ -164,49 +162,10 @@ class VeilingGlare:
     glare_total_fraction: F64
 
     @cached_property
-    def _lookup(self) -> tuple[float, float, F32]:
-        """Return start and step of ln(offset²), and the irradiance at these steps.
-
-        The step of 4e-4 is too small to be visible in an image.
-        """
-        steps = np.linspace(2 * np.log(self.offset[0]), 2 * np.log(self.offset[-1]), _LOOKUP)
-        rows = [np.interp(steps, 2 * np.log(self.offset), row) for row in self.irradiance]
-        return steps[0], float(steps[1] - steps[0]), np.array(rows, dtype=np.float32)
-
-    def image(self, sun_xy_mm: tuple[float, float], shape: tuple[int, int], pitch_mm: float) -> F32:
-        """Return the irradiance of the glare over the source's at the entrance, float32[band, y, x].
-
-        The middle of the frame lies on the axis; x points to the right, y down. `sun_xy_mm` is the position of the
-        source's image, which may lie outside the frame. At this position the glare is finite but has no meaning,
-        because the direct image is much brighter. The result does not include the cos⁴ of a pixel's field angle.
-        """
-        index = self.samples(sun_xy_mm, shape, pitch_mm)
-        table = self.table
-        out = np.empty((len(table), *shape), dtype=np.float32)
-        in_layers(lambda band: np.take(table[band], index, out=out[band], mode="clip"), len(table))
-        return out
-
-    @property
     def table(self) -> F32:
-        """Return the irradiance at the steps to which `samples` refers, float32[band, step]."""
-        return self._lookup[2]
-
-    def samples(self, sun_xy_mm: tuple[float, float], shape: tuple[int, int], pitch_mm: float) -> NDArray[np.intp]:
-        """Return the step of `table` at each pixel of a frame, [y, x]; it depends on the focal length alone."""
-        start, step, _ = self._lookup
-        height, width = shape
-        x = ((np.arange(width) - (width - 1) / 2) * pitch_mm / self.efl_mm).astype(np.float32)
-        y = ((np.arange(height) - (height - 1) / 2) * pitch_mm / self.efl_mm).astype(np.float32)[:, None]
-        sun = np.asarray(sun_xy_mm, dtype=np.float64) / self.efl_mm
-        sine = (sun / np.sqrt(1 + sun @ sun)).astype(np.float32)
-        per_length = 1 / np.sqrt(1 + x * x + y * y)
-        position = (x * per_length - sine[0]) ** 2
-        position += (y * per_length - sine[1]) ** 2
-        np.log(np.maximum(position, np.float32(self.offset[0] ** 2), out=position), out=position)
-        position -= np.float32(start)
-        position *= np.float32(1 / step)
-        position += np.float32(0.5)
-        return np.clip(position.astype(np.intp), 0, _LOOKUP - 1)
+        """Return the irradiance at the steps of a `GlareLayout`, float32[band, step]."""
+        rows = [np.interp(_STEPS, 2 * np.log(self.offset), row) for row in self.irradiance]
+        return np.array(rows, dtype=np.float32)
 
     @property
     def kept_of_single(self) -> F64:
@@ -217,18 +176,67 @@ class VeilingGlare:
         """
         return np.asarray(exprel(-self.glare_total_fraction))
 
-    def beyond_mm2(self, sun_xy_mm: tuple[float, float], shape: tuple[int, int], pitch_mm: float) -> F64:
+    def beyond_mm2(self, layout: GlareLayout) -> F64:
         """Return the flux on the sensor plane outside the frame, float64[band] in mm².
 
         The flux is divided by the source's irradiance at the entrance. The flux includes the cos⁴ of the field
-        angle, which `image` omits.
+        angle, which `table` omits.
         """
-        slope = tuple(float(v) / self.efl_mm for v in sun_xy_mm)
+        shape, pitch_mm = layout.shape, layout.pitch_mm
+        slope = tuple(float(v) / self.efl_mm for v in layout.sun_xy_mm)
         half_slope = (shape[1] / 2 * pitch_mm / self.efl_mm, shape[0] / 2 * pitch_mm / self.efl_mm)
         missing = _missing(slope, tuple(self.offset.tolist()), half_slope)
         # E dA = E(β) cos⁴θ dA = E(β) f² d²β
         rings = 2 * np.pi * (self.efl_mm * self.offset) ** 2 * missing
         return np.asarray(np.trapezoid(self.irradiance * rings, x=np.log(self.offset), axis=1))
+
+
+@dataclass(frozen=True)
+class GlareLayout:
+    """Describe how the table of a source's glare is laid out on the sensor; roughness and dust do not change it.
+
+    The middle of the frame lies on the axis; x points to the right, y down. `sun_xy_mm` is the position of the
+    source's image, which may lie outside the frame. At this position the glare is finite but has no meaning,
+    because the direct image is much brighter.
+    """
+
+    efl_mm: float
+    sun_xy_mm: tuple[float, float]
+    shape: tuple[int, int]
+    pitch_mm: float
+
+    @cached_property
+    def steps(self) -> NDArray[np.int32]:
+        """Return the step of the table at each pixel, int32[y, x]."""
+        start, step = _STEPS[0], float(_STEPS[1] - _STEPS[0])
+        height, width = self.shape
+        x = ((np.arange(width) - (width - 1) / 2) * self.pitch_mm / self.efl_mm).astype(np.float32)
+        y = ((np.arange(height) - (height - 1) / 2) * self.pitch_mm / self.efl_mm).astype(np.float32)[:, None]
+        sun = np.asarray(self.sun_xy_mm, dtype=np.float64) / self.efl_mm
+        sine = (sun / np.sqrt(1 + sun @ sun)).astype(np.float32)
+        per_length = 1 / np.sqrt(1 + x * x + y * y)
+        position = (x * per_length - sine[0]) ** 2
+        position += (y * per_length - sine[1]) ** 2
+        np.log(np.maximum(position, np.float32(_OFFSETS[0] ** 2), out=position), out=position)
+        position -= np.float32(start)
+        position *= np.float32(1 / step)
+        position += np.float32(0.5)
+        return np.clip(position.astype(np.int32), 0, _LOOKUP - 1)
+
+    @property
+    def cos4(self) -> F32:
+        """Return cos⁴ of the field angle of every pixel, float32[y, x], a factor on the light of the table."""
+        return cos4_map(self.shape, self.efl_mm / self.pitch_mm)
+
+    @cached_property
+    def area_mm2(self) -> F64:
+        """Return the pixels' area times `cos4` for each step, float64[step]."""
+        return np.bincount(self.steps.ravel(), weights=self.cos4.ravel()).astype(np.float64) * self.pitch_mm**2
+
+    def flux_mm2(self, table: F32) -> F64:
+        """Return the flux in the frame of a table float32[band, step], float64[band]."""
+        # not a product of BLAS, whose bits may depend on the number of threads
+        return np.einsum("bs,s->b", table[:, : len(self.area_mm2)].astype(np.float64), self.area_mm2)
 
 
 @lru_cache(maxsize=4)
@@ -378,63 +386,39 @@ def _lit_at(lens: Prescription, slopes: tuple[float, ...]) -> F64:
     return np.stack([np.cos(a) * _lit(lens, float(np.degrees(a))) for a in angle])
 
 
-def _surfaces_of_bands(
-    lens: Prescription, wavelength_nm: ArrayLike | Bands, cleanliness: Cleanliness
-) -> list[_Surfaces]:
-    """Return the scatter of a lens's surfaces at each wavelength, or at the nodes of bands."""
-    nodes = wavelength_nm.nodes_nm if isinstance(wavelength_nm, Bands) else wavelength_nm
-    return [
-        _surfaces(lens, float(nm), cleanliness) for nm in np.atleast_1d(checked("wavelength_nm", nodes, *RANGE_NM))
-    ]
+def _surfaces_of_bands(lens: Prescription, bands: Bands, cleanliness: Cleanliness) -> list[_Surfaces]:
+    """Return the scatter of a lens's surfaces at the nodes of bands."""
+    return [_surfaces(lens, nm, cleanliness) for nm in bands.nodes_nm.tolist()]
 
 
-def _passed(lens: Prescription, wavelength_nm: ArrayLike | Bands, scattered: F64) -> F64:
+def _passed(lens: Prescription, bands: Bands, scattered: F64) -> F64:
     """Return the scattered light behind the lens, float64[band, ...]; `scattered` are its values over T.
 
     Scatter varies slowly with wavelength, T as fast as coatings do.
     """
-    if not isinstance(wavelength_nm, Bands):
-        return (axial_transmittance(lens, wavelength_nm) * scattered.T).T
-    transmitted = axial_transmittance(lens, wavelength_nm.wavelength_nm)
-    return (wavelength_nm.mean(transmitted) * wavelength_nm.behind(transmitted).smooth_mean(scattered).T).T
+    transmitted = axial_transmittance(lens, bands.wavelength_nm)
+    return (bands.mean(transmitted) * bands.behind(transmitted).smooth_mean(scattered).T).T
 
 
 def veiling_glare(
-    lens: Prescription, *, sun_deg: float, wavelength_nm: ArrayLike | Bands, cleanliness: Cleanliness = POLISHED
+    lens: Prescription, bands: Bands, *, sun_deg: float, cleanliness: Cleanliness = POLISHED
 ) -> VeilingGlare:
-    """Return the light of a far point source that a lens's surfaces scatter onto the sensor.
+    """Return the light of a far point source, 0 to 89.9° from the axis, that a lens's surfaces scatter.
 
-    Parameters
-    ----------
-    sun_deg
-        Angle of the source from the axis, 0 to 89.9.
-    wavelength_nm
-        float64[band], or bands.
-    cleanliness
-        What scatters on the surfaces.
+    `cleanliness` is what scatters on the surfaces.
     """
-    bands = _surfaces_of_bands(lens, wavelength_nm, cleanliness)
-    angle = float(checked("sun_deg", sun_deg, 0.0, _STEEPEST_DEG))
-    lit = np.cos(np.radians(angle)) * _lit(lens, angle)[:, None]
+    lit = np.cos(np.radians(sun_deg)) * _lit(lens, sun_deg)[:, None]
+    of_nodes = [at.irradiance(_OFFSETS, lit) for at in _surfaces_of_bands(lens, bands, cleanliness)]
     return VeilingGlare(
         offset=_OFFSETS,
-        irradiance=_passed(lens, wavelength_nm, np.stack([band.irradiance(_OFFSETS, lit) for band in bands])),
+        irradiance=_passed(lens, bands, np.stack(of_nodes)),
         efl_mm=paraxial_properties(lens).efl_mm,
-        glare_total_fraction=-np.log1p(-scattered_fraction(lens, wavelength_nm, cleanliness=cleanliness)),
+        glare_total_fraction=-np.log1p(-scattered_fraction(lens, bands, cleanliness)),
     )
 
 
-def glare_kernels(
-    lens: Prescription, slope: F64, *, wavelength_nm: ArrayLike | Bands, cleanliness: Cleanliness = POLISHED
-) -> tuple[F64, F64]:
-    """Return the glare of far point sources at many field angles.
-
-    Parameters
-    ----------
-    slope
-        float64[angle]: tangents of the field angles.
-    wavelength_nm, cleanliness
-        As in `veiling_glare`.
+def glare_kernels(lens: Prescription, bands: Bands, slope: F64, cleanliness: Cleanliness) -> tuple[F64, F64]:
+    """Return the glare of far point sources at many field angles, whose tangents are `slope` float64[angle].
 
     Returns
     -------
@@ -443,37 +427,14 @@ def glare_kernels(
         As in `VeilingGlare`; the cos⁴ of a pixel's field angle is not included.
     """
     lit = _lit_at(lens, tuple(np.asarray(slope, dtype=np.float64).tolist()))
-    bands = _surfaces_of_bands(lens, wavelength_nm, cleanliness)
-    kernels = np.stack([np.einsum("aj,js->as", lit, band.of_each(_OFFSETS)) for band in bands])
-    return _OFFSETS, _passed(lens, wavelength_nm, kernels)
+    of_nodes = [at.of_each(_OFFSETS) for at in _surfaces_of_bands(lens, bands, cleanliness)]
+    return _OFFSETS, _passed(lens, bands, np.stack([np.einsum("aj,js->as", lit, each) for each in of_nodes]))
 
 
-def scattered_fraction(
-    lens: Prescription, wavelength_nm: ArrayLike | Bands, *, cleanliness: Cleanliness = POLISHED
-) -> F64:
-    """Return the fraction of the transmitted light that a lens's surfaces scatter, 1 - exp(-Σ TIS), float64[band].
-
-    Parameters as in `veiling_glare`.
-    """
-    single = np.array([band.tis for band in _surfaces_of_bands(lens, wavelength_nm, cleanliness)])
-    fraction = -np.expm1(-single)
-    return wavelength_nm.smooth_mean(fraction) if isinstance(wavelength_nm, Bands) else fraction
-
-
-def point_source_transmittance(
-    lens: Prescription, sun_deg: ArrayLike, *, wavelength_nm: ArrayLike, cleanliness: Cleanliness = POLISHED
-) -> F64:
-    """Return scattered irradiance in the middle of the sensor over a far source's at the entrance.
-
-    The result is float64[band, angle]. Angles lie inside or outside the field, 0 to 89.9°. Outside the
-    field, only surfaces that the source's rays still reach contribute. Ghosts, mount and baffle are not included.
-    The parameters are those of `veiling_glare`.
-    """
-    angles = np.atleast_1d(checked("sun_deg", sun_deg, 0.0, _STEEPEST_DEG))
-    lit = np.stack([np.cos(np.radians(a)) * _lit(lens, float(a)) for a in angles], axis=1)
-    bands = _surfaces_of_bands(lens, wavelength_nm, cleanliness)
-    scattered = np.stack([band.irradiance(np.sin(np.radians(angles)), lit) for band in bands])
-    return _passed(lens, wavelength_nm, scattered)
+def scattered_fraction(lens: Prescription, bands: Bands, cleanliness: Cleanliness = POLISHED) -> F64:
+    """Return the fraction of the transmitted light that surfaces scatter, 1 - exp(-Σ TIS), float64[band]."""
+    single = np.array([at.tis for at in _surfaces_of_bands(lens, bands, cleanliness)])
+    return bands.smooth_mean(-np.expm1(-single))
 
 
 # --- a baffle ---------------------------------------------------------------------------------------------------
@@ -507,19 +468,10 @@ def baffle_transmission(
     The fraction is the overlap of the entrance with the tube's mouth, which is shifted by length × tan(angle). The
     fraction is never below `vane_attenuation`. The default, 1e-6, is assumed; good two-stage baffles reach 1e-9
     (Haghshenas & Johari 2014, Proc. SPIE 9264, 92641R). A length of 0 means no baffle. The result is float64 like
-    `sun_deg`.
-
-    Raises
-    ------
-    InputError
-        The tube is narrower than the entrance.
+    `sun_deg`. A tube is at least as wide as the entrance.
     """
-    angle = checked("sun_deg", sun_deg, 0.0, 180.0)
-    length = float(checked("length_mm", length_mm, 0.0, 1e6))
-    small = float(checked("entrance_radius_mm", entrance_radius_mm, 1e-6, 1e6))
-    large = float(checked("radius_mm", radius_mm, small, np.inf))
-    least = float(checked("vane_attenuation", vane_attenuation, 0.0, 1.0))
-    if length == 0 or np.isinf(large):
+    angle, small = np.asarray(sun_deg, dtype=np.float64), entrance_radius_mm
+    if length_mm == 0 or np.isinf(radius_mm):
         return np.ones(angle.shape)
-    area = disc_overlap(length * np.tan(np.radians(np.minimum(angle, 90.0))), small, large)
-    return np.clip(area / (np.pi * small**2), least, 1.0)
+    area = disc_overlap(length_mm * np.tan(np.radians(np.minimum(angle, 90.0))), small, radius_mm)
+    return np.clip(area / (np.pi * small**2), vane_attenuation, 1.0)

@@ -5,8 +5,7 @@ direction, where dA / f² is the area of a pixel of the render in focal lengths.
 in the radiance L, so that it is computed from responses that depend on the lens alone:
 
 - ghosts by `ghost_response`, in polar cells;
-- glare by `scene_scatter` and the light that the stop diffracts (starburst) by `scene_diffraction`, as
-  convolutions over direction cosines;
+- glare and the light that the stop diffracts (starburst) by `scene_convolution`, over direction cosines;
 - the veil of mount, barrel and edges by its closed form (`total`), from the flux that enters the lens.
 
 Sources out of the field are in coarse renders around the first one (`surrounding_grids`), each four times as wide
@@ -34,14 +33,13 @@ from ...core.spectra import Bands
 from ..interface import Lens
 from ..paraxial import paraxial_properties
 from ..prescription import Prescription
+from ..rays import axial_transmittance
 from ..thin import cos4_map
 from .ghost_response import GhostResponse, PolarCells, ghost_response
 from .irradiance import disc_samples
-from .paraxial import axial_transmittance
-from .scatter import baffle_transmission, glare_kernels, hood_transmission, scattered_fraction
-from .scene_diffraction import starburst_of_source, wing_spectra
-from .scene_scatter import DirectionGrid, SeparatedKernel, separated
-from .settings import Baffle, SensorGrid, StraylightSettings
+from .scatter import glare_kernels, hood_transmission, scattered_fraction
+from .scene_convolution import DirectionGrid, SeparatedKernel, separated, starburst_of_source, wing_spectra
+from .settings import SensorGrid, StraylightSettings
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -272,9 +270,8 @@ class SceneInLens:
         light = sum(self._places(grid).polar @ irradiance.T for grid, irradiance in sources)
         light = light.reshape(len(cells.slopes), cells.azimuths, len(weights.T))
         # rays of ghosts meet the hood themselves
-        light *= lit_fraction(self.lens, self.settings.baffle, np.array(cells.slopes)).astype(np.float32)[
-            :, None, None
-        ]
+        past_baffle = self.settings.baffle.lit_fraction(self.lens, np.array(cells.slopes))
+        light *= past_baffle.astype(np.float32)[:, None, None]
         return response.image(light, weights, self.sensor)
 
     def glare(self, sources: Sequence[Sources], weights: F64) -> F32:
@@ -374,7 +371,7 @@ class SceneInLens:
         """Return the glare of sources on a grid, with all losses but those at the baffle."""
         slope = np.tan(np.linspace(0, np.arctan(self._places(grid).slope.max()), _ANGLES))
         cleanliness, bands = self.settings.cleanliness, self.bands
-        offset, kernels = glare_kernels(self.lens, slope, wavelength_nm=bands, cleanliness=cleanliness)
+        offset, kernels = glare_kernels(self.lens, bands, slope, cleanliness)
         own = bands.mean(axial_transmittance(self.lens, bands.wavelength_nm))
         gain = bands.mean(self.passed) / own * self._kept_of_single
         return separated(kernels * gain[:, None, None], slope, offset)
@@ -383,13 +380,13 @@ class SceneInLens:
     def _kept_of_single(self) -> F64:
         """Return the factor of `VeilingGlare.kept_of_single`, float64[band]."""
         bands = self.bands.behind(self.passed)
-        fraction = scattered_fraction(self.lens, bands, cleanliness=self.settings.cleanliness)
+        fraction = scattered_fraction(self.lens, bands, self.settings.cleanliness)
         single = -np.log1p(-fraction)
         return np.where(single > 0, fraction / np.where(single > 0, single, 1), 1.0)
 
     def _lit(self, slope: F64) -> F64:
         """Return the fraction of the lens's entrance that sources light through the baffle and past the hood."""
-        past_baffle = lit_fraction(self.lens, self.settings.baffle, slope)
+        past_baffle = self.settings.baffle.lit_fraction(self.lens, slope)
         return np.minimum(past_baffle, hood_transmission(self.lens, slope))
 
 
@@ -414,18 +411,6 @@ def in_channels(rates: F64, nodes_nm: F64) -> tuple[Bands, F64, F64]:
         lines.append(line)
         values.append(np.trapezoid(line, nm, axis=1)[:, None] * at_ends)
     return Bands.of(nm, np.concatenate(lines)), np.concatenate(values), np.repeat(np.eye(len(rates)), 2, axis=1)
-
-
-def lit_fraction(lens: Prescription, baffle: Baffle, slope: F64) -> F64:
-    """Return the fraction of a lens's entrance that sources light through a baffle, float64 like their `slope`."""
-    if baffle.length_mm <= 0:
-        return np.ones(slope.shape)
-    return baffle_transmission(
-        np.degrees(np.arctan(slope)),
-        length_mm=baffle.length_mm,
-        radius_mm=baffle.radius_mm,
-        entrance_radius_mm=min(lens.surfaces[0].semi_diameter_mm, baffle.radius_mm),
-    )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from .scatter import POLISHED, Cleanliness
+from ..prescription import Prescription
+from .scatter import POLISHED, Cleanliness, baffle_transmission
 
 F64 = NDArray[np.float64]
 
@@ -82,6 +83,20 @@ class Baffle:
 
     length_mm: float = 0.0
     radius_mm: float = 0.0
+
+    def lit_fraction(self, lens: Prescription, slope: ArrayLike) -> F64:
+        """Return the fraction of a lens's entrance that sources light through the tube, float64 like their `slope`.
+
+        A tube narrower than the lens is itself the entrance.
+        """
+        if self.length_mm <= 0:
+            return np.ones(np.shape(slope))
+        return baffle_transmission(
+            np.degrees(np.arctan(slope)),
+            length_mm=self.length_mm,
+            radius_mm=self.radius_mm,
+            entrance_radius_mm=min(lens.surfaces[0].semi_diameter_mm, self.radius_mm),
+        )
 
 
 NO_BAFFLE = Baffle()

@@ -39,7 +39,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import cv2
@@ -57,129 +58,21 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 _EDGE_POINTS = 2049  # points along the edge of one blade, or around a round rim
-_SUPERSAMPLING = 4  # finer samples along each side of a sample
-_GOLDEN_RAD = np.pi * (3 - np.sqrt(5))
 _FARTHEST = 2.0  # largest distance between two directions, in direction cosines
 _MIX_ERROR = 3e-3  # largest error of a mix of fewer tables, relative to the mean of the bands
 _STRIP = 64  # rows of the frame that are computed at a time
-_ROW_BLUR = 0.5  # blur of fringes along the radius, in rows of the table
 _NARROW = 1 / 8  # ratio of the disc's radius to the distance below which sin φ = φ across a spike
 _WING_SUNS = 12.0  # distance from an edge's normal, in radii of the disc, beyond which cot² is not averaged
 _WING_STEP, _WING_POINTS, _WING_COLUMNS = 0.05, 1200, 241
 _STRAIGHT_PER_MM = 1e-9
 _LEAST_CORNER_RAD = 1e-3
-_HANKEL_POINTS = 4096
-_DISC_POINTS = 32
-_GRAIN_POINTS = 2048
 _OUTER_STEPS = 16  # angles of the table that are averaged into one for the flux outside the frame
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class StopDefects:
-    """Describe opaque grains of dust and opaque scratches on the stop.
-
-    The fields are float64 arrays with one value for each grain or each scratch. Lengths are in mm in the plane of
-    the stop. The angle of a scratch counts from +x towards +y. Raises InputError if a value is out of range or if
-    the arrays of the scratches differ in length.
-    """
-
-    grain_diameter_mm: F64 = field(default_factory=lambda: np.zeros(0))
-    scratch_length_mm: F64 = field(default_factory=lambda: np.zeros(0))
-    scratch_width_mm: F64 = field(default_factory=lambda: np.zeros(0))
-    scratch_angle_rad: F64 = field(default_factory=lambda: np.zeros(0))
-
-    def __post_init__(self) -> None:
-        """Convert all fields to float64 arrays and check them."""
-        for f in fields(self):
-            values = np.asarray(getattr(self, f.name), dtype=np.float64)
-            object.__setattr__(self, f.name, values)
-            least = -np.inf if f.name.endswith("rad") else 0.0
-            if values.ndim != 1 or not np.isfinite(values).all() or not (values > least).all():
-                raise InputError(f"{f.name} = {values.tolist()}: must be a list of finite numbers above {least:g}")
-        count = len(self.scratch_length_mm)
-        for name in ("scratch_width_mm", "scratch_angle_rad"):
-            if len(getattr(self, name)) != count:
-                length = len(getattr(self, name))
-                raise InputError(f"{name}: {length} values: must be as many as scratch_length_mm, {count}")
-
-    def scaled(self, factor: float) -> StopDefects:
-        """Return the defects with every length multiplied by a factor."""
-        return StopDefects(
-            grain_diameter_mm=self.grain_diameter_mm * factor,
-            scratch_length_mm=self.scratch_length_mm * factor,
-            scratch_width_mm=self.scratch_width_mm * factor,
-            scratch_angle_rad=self.scratch_angle_rad,
-        )
-
-
-# --- a point source ---------------------------------------------------------------------------------------------
-
-
-def fraunhofer_psf(
-    stop: Surface,
-    entrance_diameter_mm: float,
-    focal_length_mm: float,
-    wavelength_nm: float,
-    *,
-    samples: int = 1024,
-    across: int = 256,
-    defects: StopDefects | None = None,
-) -> tuple[F64, float]:
-    """Return the point spread function of a stop for a point source, and the pitch of its samples on the sensor.
-
-    The function is float64[samples, samples] with sum 1. Its x axis points to the right, its y axis points down,
-    and its middle is the sample [samples // 2, samples // 2]. `across` samples span the entrance pupil. The pitch
-    in mm is λ f `across` / (`samples` · diameter). The frame reaches `across` / 2 times λ f / diameter from the
-    middle. The lengths of the defects are in mm in the plane of the stop; the code distributes the defects evenly
-    over the stop.
-    """
-    if not 8 <= across <= samples:
-        raise InputError(f"across = {across}: must be from 8 to samples = {samples}")
-    fine = across * _SUPERSAMPLING
-    pitch = 2.0 / fine  # in semi-diameters of the stop
-    side = (np.arange(fine) + 0.5) * pitch - 1
-    x, y = side[None, :], side[:, None]
-    open_ = (np.hypot(x, y) * stop.semi_diameter_mm <= stop.rim_mm(np.arctan2(y, x))).astype(np.float64)
-    if defects is not None:
-        _block(open_, x, y, defects.scaled(1 / stop.semi_diameter_mm), pitch)
-    mask = np.zeros((samples, samples))
-    mask[:across, :across] = open_.reshape(across, _SUPERSAMPLING, across, _SUPERSAMPLING).mean(axis=(1, 3))
-    # the mean over each sample dims the far field, so divide by the transform of that mean
-    turn = np.pi * np.fft.fftshift(np.fft.fftfreq(samples)) + 1e-12
-    mean = np.sin(turn) / (_SUPERSAMPLING * np.sin(turn / _SUPERSAMPLING))
-    power = np.abs(np.fft.fftshift(np.fft.fft2(mask)) / (mean * mean[:, None])) ** 2
-    return power / power.sum(), wavelength_nm * 1e-6 * focal_length_mm * across / (samples * entrance_diameter_mm)
-
-
-def _block(open_: F64, x: NDArray[Any], y: NDArray[Any], defects: StopDefects, pitch: float) -> None:
-    """Close the area of a pupil that defects cover, in place; partly covered samples are partly closed."""
-
-    def within(half: float, distance: F64) -> F64:
-        """Return the fraction of each sample that lies within a half width."""
-        inside = np.minimum(distance + pitch / 2, half) - np.maximum(distance - pitch / 2, -half)
-        return np.clip(inside / pitch, 0, 1)
-
-    grains, scratches = defects.grain_diameter_mm, defects.scratch_length_mm
-    count = len(grains) + len(scratches)
-    # a sunflower's arrangement keeps the defects apart and off the rim; the longest defect is in the middle
-    seed = np.argsort(np.argsort(-np.concatenate([grains, scratches]), kind="stable"), kind="stable")
-    radius = 0.85 * np.sqrt(seed / max(count, 1))
-    positions = radius * np.cos(seed * _GOLDEN_RAD), radius * np.sin(seed * _GOLDEN_RAD)
-    for k, (px, py) in enumerate(zip(*positions, strict=True)):
-        if k < len(grains):
-            cover = within(grains[k] / 2, np.hypot(x - px, y - py))
-        else:
-            s = k - len(grains)
-            c, n = np.cos(defects.scratch_angle_rad[s]), np.sin(defects.scratch_angle_rad[s])
-            along, beside = c * (x - px) + n * (y - py), c * (y - py) - n * (x - px)
-            cover = within(scratches[s] / 2, along) * within(defects.scratch_width_mm[s] / 2, beside)
-        open_ *= 1 - cover
 
 
 # --- the Sun's disc ---------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True)
 class StarburstFrame:
     """Describe where and in which bands a starburst is computed.
 
@@ -199,7 +92,7 @@ class StarburstFrame:
     sensor: SensorGrid
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True)
 class Starburst:
     """Compute the light that diffraction at a stop spreads over the sensor, averaged over the Sun's disc.
 
@@ -214,8 +107,8 @@ class Starburst:
         Focal length, and radius of the paraxial entrance pupil.
     sun_radius_rad
         Angular radius of the disc.
-    stop, defects
-        Surface of the stop, which has the outline, and the stop's defects in mm in the entrance pupil.
+    stop
+        Surface of the stop, which has the outline.
     radii, angles
         Numbers of rows and columns of the polar table. The rows are logarithmic in the distance |u - u_sun|, up to
         2. The columns cover half a turn, because |A(-k)| = |A(k)|.
@@ -225,10 +118,8 @@ class Starburst:
     pupil_radius_mm: float
     sun_radius_rad: float
     stop: Surface
-    defects: StopDefects
     radii: int
     angles: int
-    _memo: dict[Any, tuple[F32, F32]] = field(default_factory=dict, init=False, repr=False)
 
     def image(self, frame: StarburstFrame) -> F32:
         """Return the irradiance on the sensor over the Sun's irradiance at the entrance, float32[band, y, x].
@@ -237,18 +128,7 @@ class Starburst:
         value from just outside the disc; the direct image, which other code draws, is brighter.
         """
         tables, mix = self._tables(frame)
-        return self._remapped(frame, tables, None if len(tables) == len(mix) else mix)
-
-    def layers(self, frame: StarburstFrame) -> tuple[F32, F64]:
-        """Return the few layers of which `image` is the sum, float32[layer, y, x], and their weights in each band.
-
-        The weights are float64[band, layer].
-        """
-        tables, mix = self._tables(frame)
-        return self._remapped(frame, tables, None), mix.astype(np.float64)
-
-    def _remapped(self, frame: StarburstFrame, tables: F32, mix: F32 | None) -> F32:
-        """Return the tables on the sensor, or their sums with the weights `mix`, float32[table or band, y, x]."""
+        plain = len(tables) == len(mix)  # a table for each band
         (height, width), pitch_mm = frame.sensor.shape, frame.sensor.pitch_mm
         f, sigma, nearest = self.efl_mm, self.sun_radius_rad, self._sines(pitch_mm)[0]
         sun = np.asarray(frame.sun_xy_mm, dtype=np.float64) / f
@@ -256,7 +136,7 @@ class Starburst:
         sun_u, sun_v = (np.float32(s * sun_cos) for s in sun)
         per_log = np.float32(0.5 * (self.radii - 1) / np.log(_FARTHEST / nearest))
         x = ((np.arange(width) - (width - 1) / 2) * pitch_mm / f).astype(np.float32)[None, :]
-        out = np.empty((len(tables) if mix is None else len(mix), height, width), dtype=np.float32)
+        out = np.empty((len(mix), height, width), dtype=np.float32)
         part = np.empty((len(tables), min(_STRIP, height), width), dtype=np.float32)
         for top in range(0, height, _STRIP):  # the arrays of a strip stay in the cache
             strip = out[:, top : top + _STRIP]
@@ -271,18 +151,19 @@ class Starburst:
             gain = cosine * cosine * np.float32(sun_cos / f**2) / (apart - np.float32(sigma**2))
             angle = np.arctan2(np.abs(dv), np.copysign(du, du * dv)) * np.float32(self.angles / np.pi)
             row = (np.log(apart) - np.float32(2 * np.log(nearest))) * per_log
-            layers = strip if mix is None else part[:, : strip.shape[1]]
+            layers = strip if plain else part[:, : strip.shape[1]]
             for layer, table in zip(layers, tables, strict=True):
                 cv2.remap(table, angle, row, cv2.INTER_LINEAR, dst=layer, borderMode=cv2.BORDER_REPLICATE)
                 layer *= gain
-            if mix is not None:
+            if not plain:
                 _mixed(layers, mix, strip)
         return out
 
     def layers_at(self, frame: StarburstFrame, u: F32, v: F32) -> tuple[F32, F64]:
-        """Return |A|² / λ² in mm² at the distances (u, v) in direction cosines, and weights, both as `layers`.
+        """Return layers of |A|² / λ² in mm² at the distances (u, v) in direction cosines, and their weights.
 
-        `u` and `v` are float32 that broadcast to [y, x]. Inside the disc the value is that just outside.
+        `u` and `v` are float32 that broadcast to [y, x]. Inside the disc the value is that just outside. The
+        weights are float64[band, layer].
         """
         tables, mix = self._tables(frame)
         nearest = self._sines(frame.sensor.pitch_mm)[0]
@@ -337,15 +218,15 @@ class Starburst:
         The tables are float32[table, radius, angle + 1], where the last angle repeats the first; the weights are
         float32[band, table].
         """
-        pitch_mm = frame.sensor.pitch_mm
-        key = frame.bands, pitch_mm
-        tables = self._memo.get(key)
-        if tables is None:
-            bands = [(frame.bands.wavelength_nm, weight) for weight in frame.bands.weights]
-            tables = _fewest(_polar(self, self._sines(pitch_mm), bands, pitch_mm / self.efl_mm / np.sqrt(12)))
-            self._memo.clear()
-            self._memo[key] = tables
-        return tables
+        return _tables_of(self, frame.bands, frame.sensor.pitch_mm)
+
+
+@lru_cache(maxsize=4)
+def _tables_of(burst: Starburst, bands: Bands, pitch_mm: float) -> tuple[F32, F32]:
+    """Return `Starburst._tables`, which samples of a view share."""
+    weights = [(bands.wavelength_nm, weight) for weight in bands.weights]
+    pixel_rad = pitch_mm / burst.efl_mm / np.sqrt(12)
+    return _fewest(_polar(burst, burst._sines(pitch_mm), weights, pixel_rad))
 
 
 def _mixed(layers: F32, mix: F32, out: F32) -> None:
@@ -356,17 +237,10 @@ def _mixed(layers: F32, mix: F32, out: F32) -> None:
             cv2.scaleAdd(layer, float(weight), band, dst=band)
 
 
-def starburst(
-    lens: Prescription,
-    *,
-    sun_radius_rad: float,
-    defects: StopDefects | None = None,
-    radii: int = 224,
-    angles: int = 4096,
-) -> Starburst:
-    """Return the starburst of a lens; the lengths of `defects` are in mm in the plane of the stop.
+def starburst(lens: Prescription, *, sun_radius_rad: float, table: tuple[int, int] = (224, 4096)) -> Starburst:
+    """Return the starburst of a lens.
 
-    The tables of the starburst have `radii` × `angles` values. The defaults are fine enough for frames up to 1500
+    The tables of the starburst have `table` radii and angles. The defaults are fine enough for frames up to 1500
     pixels wide.
 
     Raises
@@ -374,18 +248,17 @@ def starburst(
     InputError
         A value is out of range.
     """
+    radii, angles = table
     if not 0 < sun_radius_rad < 0.5:
         raise InputError(f"sun_radius_rad = {sun_radius_rad!r}: must be above 0 and below 0.5")
     if radii < 16 or angles < 64 or angles % 2:
-        raise InputError(f"radii = {radii}, angles = {angles}: must be 16 or more, and even and 64 or more")
-    stop, optics = lens.surfaces[lens.stop], paraxial_properties(lens)
-    radius = optics.entrance_pupil_diameter_mm / 2
+        raise InputError(f"table = {table}: must be 16 or more radii, and an even number of angles, 64 or more")
+    optics = paraxial_properties(lens)
     return Starburst(
         efl_mm=optics.efl_mm,
-        pupil_radius_mm=radius,
+        pupil_radius_mm=optics.entrance_pupil_diameter_mm / 2,
         sun_radius_rad=sun_radius_rad,
-        stop=stop,
-        defects=(defects or StopDefects()).scaled(radius / stop.semi_diameter_mm),
+        stop=lens.surfaces[lens.stop],
         radii=radii,
         angles=angles,
     )
@@ -431,7 +304,6 @@ def _polar(burst: Starburst, sine: F64, bands: Sequence[tuple[F64, F64]], pixel_
     order = 2 * np.arange(burst.angles // 2 + 1)  # odd orders cancel: light takes both directions of a normal
     excess = sine**2 - burst.sun_radius_rad**2
     chord = _chord(sine, burst.sun_radius_rad, pixel_rad, burst.angles)
-    grains = _grains(burst, sine, bands, pixel_rad)
     mm = np.array([nm @ weight for nm, weight in bands]) * 1e-6
     square = np.array([nm**2 @ weight for nm, weight in bands]) * 1e-12
 
@@ -458,9 +330,7 @@ def _polar(burst: Starburst, sine: F64, bands: Sequence[tuple[F64, F64]], pixel_
         for node, corner in zip(nodes, corners, strict=True):  # Lagrange's polynomials
             others = nodes[nodes != node]
             total[:, repeats] += square[k] * np.prod((mm[k] - others) / (node - others)) * corner
-        total[:, 0] += excess * grains[k]
         out[k, :, :-1] = np.fft.irfft(total, n=burst.angles, norm="forward")
-    _add_scratches(out, chord, burst, sine, bands, pixel_rad)
     out[..., -1] = out[..., 0]
     return np.asarray(np.maximum(out, 0, out=out))
 
@@ -468,8 +338,7 @@ def _polar(burst: Starburst, sine: F64, bands: Sequence[tuple[F64, F64]], pixel_
 def _fewest(tables: F32) -> tuple[F32, F32]:
     """Return the smallest number of tables that represents all bands, and the weight of each table in each band.
 
-    The light of a rim grows with λ, and the light of corners grows with λ². Two tables are therefore nearly enough,
-    unless defects show fringes.
+    The light of a rim grows with λ, and the light of corners grows with λ². Two tables are therefore nearly enough.
     """
     sample = tables[:, ::2, ::5].reshape(len(tables), -1).astype(np.float64)
     sample /= np.maximum(sample.mean(axis=0), 1e-30)
@@ -577,68 +446,3 @@ def _wing_means(
         square, single = -integral(1j * y[None, None]), integral(np.ones((1, 1, len(y)), dtype=np.complex128))
     shape = (len(wavelength_mm), len(sine), 2 * len(q) - 1)
     return [np.ascontiguousarray(np.broadcast_to(mean, shape)) for mean in (single, square)]
-
-
-def _add_scratches(
-    tables: F32, chord: F64, burst: Starburst, sine: F64, bands: Sequence[tuple[F64, F64]], pixel_rad: float
-) -> None:
-    """Add the light of scratches to the tables of `_polar`, in place.
-
-    A scratch of width w has two long edges. The interference fringes of these edges, 4 sin²(kw / 2) =
-    2 - 2 cos(kw), are wide enough to be visible. The autocorrelation over the finite length of a scratch is a
-    triangle, and therefore the spike is wider.
-    """
-    defects = burst.defects
-    order = 2 * np.arange(burst.angles // 2 + 1)
-    blur = _ROW_BLUR * np.log(sine[1] / sine[0])
-    mean_k0_per_mm = 2e6 * np.pi / np.mean([nm @ weight for nm, weight in bands])
-    # Gauss points of the disc, which is projected onto a line; the weights include 1/k²
-    turn = np.arange(1, _DISC_POINTS + 1) * np.pi / (_DISC_POINTS + 1)
-    offset = burst.sun_radius_rad * np.cos(turn)
-    disc_weight = np.sin(turn) ** 2 / (sine[:, None] + offset) ** 2
-    disc_weight /= disc_weight.sum(axis=1, keepdims=True)
-    for length, width, angle in zip(
-        defects.scratch_length_mm, defects.scratch_width_mm, defects.scratch_angle_rad, strict=True
-    ):
-        triangle = np.maximum(1 - order / (sine[:, None] * mean_k0_per_mm * length), 0)
-        spike = chord * triangle * np.exp(-1j * order * (angle + np.pi / 2))
-        spike = np.fft.irfft(spike, n=burst.angles, norm="forward").astype(np.float32)
-        for table, (nm, weight) in zip(tables, bands, strict=True):
-            per_rad = 2e6 * np.pi / nm * width
-            wave = np.exp(1j * sine[:, None] * per_rad) * (disc_weight @ np.exp(1j * offset[:, None] * per_rad))
-            wave *= np.exp(-((sine[:, None] * per_rad * blur) ** 2 + (per_rad * pixel_rad) ** 2) / 2)
-            strength = 2 * length / np.pi * ((1 - wave.real) @ (weight * nm)) * (1e-6 / (4 * np.pi**2))
-            table[:, :-1] += strength.astype(np.float32)[:, None] * spike
-
-
-def _grains(burst: Starburst, sine: F64, bands: Sequence[tuple[F64, F64]], pixel_rad: float) -> F64:
-    """Return |A|² / λ² of all grains, float64[band, radius].
-
-    The code adds the autocorrelations of all grains, averages the sum over the band, multiplies it by the coherence
-    of the disc, and takes the Hankel transform.
-    """
-    from scipy.fft import fht
-    from scipy.ndimage import gaussian_filter1d
-    from scipy.special import j1
-
-    diameter = burst.defects.grain_diameter_mm
-    out = np.zeros((len(bands), len(sine)))
-    if not len(diameter):
-        return out
-    fraction = np.geomspace(1e-6, 1.0, _GRAIN_POINTS)
-    lag_mm = fraction * diameter.max()
-    autocorrelation = np.zeros(len(lag_mm))
-    for d, count in zip(*np.unique(diameter, return_counts=True), strict=True):
-        x = np.minimum(lag_mm / d, 1)
-        autocorrelation += count * d**2 / 2 * (np.arccos(x) - x * np.sqrt(1 - x * x))
-    y = np.geomspace(1e-4, 1e8, _HANKEL_POINTS)
-    step = np.log(y[1] / y[0])
-    s = y * burst.sun_radius_rad
-    coherence = 2 * j1(s) / s * np.exp(-((y * pixel_rad) ** 2) / 2)
-    for k, (nm, weight) in enumerate(bands):
-        lags = np.log(y)[:, None] + np.log(nm * (1e-6 / (2 * np.pi)))
-        mean = np.interp(lags, np.log(lag_mm), autocorrelation, right=0.0) @ weight
-        spectrum = fht(mean * coherence * y, step, mu=0.0)
-        spectrum = gaussian_filter1d(spectrum, _ROW_BLUR * np.log(sine[1] / sine[0]) / step)
-        out[k] = np.interp(np.log(sine), -np.log(y[::-1]), spectrum * y[::-1]) / (2 * np.pi)
-    return out

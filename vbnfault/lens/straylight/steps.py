@@ -22,8 +22,8 @@ The tracers of exact and of paraxial rays do not share more than `StopBlades`: o
 radii and margins of lost rays, the other with radii, and a common form would change the last bits of either.
 
 The image of the scene and the Sun's direct image do not use these two modules. Their rays are clipped in
-`lens.rays.trace`, and `lens.mapping.relative_radii` passes the result to `lens.spots` (image) and `lens.footprint`
-(dust).
+`lens.rays.trace`, and `lens.mapping.relative_radii` passes the result to `lens.point_spread` (image) and to
+`lens.beams` (dust).
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ FRINGES_END = 7.0
 class Step:
     """Hold the data of one step, which is the next surface of a path.
 
-    The values are plain numbers, or device arrays with one value for each lane.
+    The values are device arrays with one value for each lane, or a number that is the same for all.
 
     Attributes
     ----------
@@ -66,8 +66,6 @@ class Step:
         By which fraction the part of the margin beyond `FRINGES_END` is lengthened.
     mirror, stop
         Whether the ray is reflected, and whether the surface is the stop.
-    onward
-        Sign of dz before the surface; None if the sign differs between lanes.
     absorption
         Absorption coefficient per mm before the surface; None if no medium absorbs.
     passed
@@ -81,7 +79,6 @@ class Step:
     sharpness: Any
     stretch: Any
     mirror: Any
-    onward: Any
     stop: Any
     conic: Any
     aspheric: list[Any]
@@ -138,7 +135,7 @@ class StopBlades:
 
 
 def meet(
-    step: Step, ray: Sequence[Any], *, soft: bool, special: bool, blades: StopBlades | None, light: bool = True
+    step: Step, ray: Sequence[Any], *, soft: bool, special: bool, blades: StopBlades | None
 ) -> tuple[Any, ...]:
     """Advance rays to the next surface of their path, refract or reflect them there, and clip them at its rim.
 
@@ -154,13 +151,11 @@ def meet(
         Whether any surface is a conic or an asphere.
     blades
         Shape of the stop; None if the stop is round.
-    light
-        Whether the transmitted fraction is computed.
     """
     dr = backend().dr
     *_, dx, dy, dz, fraction = ray[:7]
     c, eta, mirror = step.curvature, step.eta, step.mirror
-    sense = dr.copysign(1, dz) if step.onward is None else step.onward
+    sense = dr.copysign(1, dz)
 
     def real(square: Any) -> Any:
         """Return the root of a square that is negative for lost rays."""
@@ -169,14 +164,13 @@ def meet(
         return dr.sqrt(dr.maximum(square, 0) if soft else square)
 
     hit = (_on_conic if special else _on_sphere)(step, ray, sense, real)
-    if light and step.absorption is not None:
+    if step.absorption is not None:
         fraction = fraction * dr.exp(-step.absorption * dr.abs(hit.length))
     # square of the cosine of refraction; negative for total reflection
     left = dr.fma(eta * eta, hit.cosine * hit.cosine, 1 - eta * eta)
     out_cosine = real(left)
-    if light:
-        passed = step.passed(dr.clip(dr.select(eta > 1, out_cosine, hit.cosine), 0, 1))
-        fraction = fraction * dr.select((left < 0) & mirror, 1, passed)
+    passed = step.passed(dr.clip(dr.select(eta > 1, out_cosine, hit.cosine), 0, 1))
+    fraction = fraction * dr.select((left < 0) & mirror, 1, passed)
     turn = hit.facing * dr.select(mirror, 2 * hit.cosine, dr.fma(eta, hit.cosine, -out_cosine))
     keep = dr.select(mirror, 1, eta)
     onward = dr.select(mirror, -sense, sense)

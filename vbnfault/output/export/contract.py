@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -74,14 +75,17 @@ class Closing:
 class Format(ABC):
     """Write samples of a store in the format of other tools. A class with a `name` registers itself.
 
+    The docstring of the class is what the card says: its first line names the format and what is written, for the
+    help, too; the rest, in Markdown, says which files there are and how to read them.
+
     A format of one file and more for each sample defines `files`; one that joins samples in a file defines
     `write_part`. `finish` writes what follows from all samples, such as an index. An object holds no state: parts
     are written by several threads, in any order.
     """
 
     name: ClassVar[str] = ""
-    summary: ClassVar[str] = ""  # one sentence for the help
-    usage: ClassVar[Sequence[str]] = ()  # lines of Markdown for the card: the files, and how to read them
+    summary: ClassVar[str] = ""  # the first line of the docstring
+    usage: ClassVar[Sequence[str]] = ()  # its other lines
     media_type: ClassVar[str] = "image/png"  # of the files in which the images are
     pattern: ClassVar[str] = "**/*.png"  # which matches the names of these files
     has_instances: ClassVar[bool] = False  # whether masks become instances, of which small ones may be left out
@@ -96,6 +100,9 @@ class Format(ABC):
 
     def __init_subclass__(cls, **keywords: Any) -> None:
         super().__init_subclass__(**keywords)
+        if cls.__dict__.get("__doc__") and "summary" not in cls.__dict__:
+            first, *rest = inspect.cleandoc(str(cls.__doc__)).splitlines()
+            cls.summary, cls.usage = first, rest[1:]
         if cls.name:
             if not is_name(cls.name):
                 raise TypeError(f"{cls.__qualname__}: name = {cls.name!r}: must be lower-case letters and digits")

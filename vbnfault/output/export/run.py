@@ -7,7 +7,7 @@ import json
 import os
 import threading
 from collections.abc import Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,15 +20,14 @@ from ...core.errors import InputError, VbnfaultError, shown
 from ...core.path_checks import path_of, real
 from ...core.quantities import Sample
 from ...core.tables import did_you_mean
-from ...dataset.card import to_json
+from ...dataset.card import described, to_json
 from ...dataset.croissant import columns, croissant, image_records
 from ...dataset.lock import locked
 from ...dataset.progress import Progress
 from ...dataset.statistics import Statistics, statistics
 from ...store import EFFECT_RULE, MASK_RULES, SPLITS, STRATA, Store, Url, disk, mask_union, open_store
 from ..json_files import plain
-from .card import export_card
-from .contract import ExportPart, Finished, Format, formats
+from .contract import Closing, ExportPart, Finished, Format, formats
 from .folder import Folder
 
 SAMPLES = "samples.jsonl"
@@ -211,36 +210,22 @@ def _write_parts(
     masks: str,
 ) -> int:
     """Write the parts that are not finished yet, and return how many samples that were."""
-    missing = []
-    for part in parts:
-        if folder.has_part(part.number):
-            for _ in part.samples:
-                bar.advance(False)
-        else:
-            missing.append(part)
     stop = threading.Event()
-    running: set[Future[ExportPart]] = set()
-    pool = ThreadPoolExecutor(workers)
+
+    def write(part: ExportPart) -> tuple[ExportPart, bool]:
+        is_new = not folder.has_part(part.number)
+        return (_write_part(store, kind, part, folder, stop, masks) if is_new else part), is_new
+
+    pool, written = ThreadPoolExecutor(workers), 0
     try:
-        for part in missing:
-            running.add(pool.submit(_write_part, store, kind, part, folder, stop, masks))
-            if len(running) >= workers:
-                running = _finished_of(running, bar)
-        while running:
-            running = _finished_of(running, bar)
+        for part, is_new in pool.map(write, parts):
+            written += is_new * len(part.samples)
+            for _ in part.samples:
+                bar.advance(is_new)
     finally:
         stop.set()
         pool.shutdown(wait=True, cancel_futures=True)
-    return sum(len(part.samples) for part in missing)
-
-
-def _finished_of(running: set[Future[ExportPart]], bar: Progress) -> set[Future[ExportPart]]:
-    """Wait for a part, count its samples, and return what still runs. Raises what writing the part has raised."""
-    done, rest = wait(running, return_when=FIRST_COMPLETED)
-    for future in done:
-        for _ in future.result().samples:
-            bar.advance(True)
-    return rest
+    return written
 
 
 def _write_part(
@@ -305,11 +290,50 @@ def _finish(store: Store, kind: Format, parts: Sequence[ExportPart], folder: Fol
     numbers = statistics(store)
     folder.put(
         [
-            ("README.md", export_card(store, kind, closing, numbers, masks).encode()),
+            ("README.md", _card(store, kind, closing, numbers, masks).encode()),
             ("croissant.json", to_json(_croissant(store, kind, digest.hexdigest(), numbers, masks)).encode()),
         ]
     )
     return tuple(closing.warnings)
+
+
+_ABOUT_MASKS = {
+    "footprint": ("- Masks: `footprint`. `mask` is that of the store, by the rules of the table below.",),
+    "effect": (
+        f"- Masks: `effect`. What is called `mask` here is `mask_effect` of the store, not the footprint of the "
+        f"table below: {EFFECT_RULE}. `mask_any` unites these masks and what several "
+        "faults change together.",
+    ),
+}
+
+
+def _card(store: Store, kind: Format, closing: Closing, numbers: Statistics, masks: str) -> str:
+    """Return the card of an export as Markdown; `masks`: footprint or effect."""
+    title = store.attributes.get("title") or "untitled dataset"
+    front = ["---", *closing.front, "---", ""] if closing.front else []
+    lines = [
+        *front,
+        f"# {title}, exported as {kind.name}",
+        "",
+        *([str(store.attributes["description"]), ""] if store.attributes.get("description") else []),
+        f"{store.samples} samples of {store.spec.width} x {store.spec.height} px: {kind.summary}",
+        "",
+        "## Files",
+        "",
+        *kind.usage,
+        *closing.lines,
+        *(_ABOUT_MASKS[masks] if "mask_effect" not in kind.layers(store.spec) else ()),
+        "- `samples.jsonl`: one line of JSON for each sample, with its file, its split, the names of "
+        "its faults, pose, "
+        "Sun, exposure, and every drawn parameter of every fault.",
+        "- `croissant.json`: this description for programs (Croissant 1.0). `export.json`: what was exported.",
+        "",
+        "The order of the classes is that of the table below. The intensity channel is: "
+        f"{store.attributes.get('intensity_channel', 'luminance of RGB')}.",
+        "",
+        *described(store, numbers),
+    ]
+    return "\n".join(lines) + "\n"
 
 
 _COLUMNS = {

@@ -1,9 +1,7 @@
 """Serve a store and the page that shows it, on this machine alone.
 
-The page reads full images by byte ranges of the store's own files with zarrita.js. Three things come from here
-instead: the columns of the listing (one request for all samples, where Zarr would need one for each shard), small
-images of the grid (a browser would have to decode each full image), and layers whose codec or data type the browser
-lacks.
+The page gets the columns of the listing in one request for all samples, small images for its grid, and layers of a
+sample as plain numbers, decoded and compared with their checksums.
 
 The server listens on the loopback interface only. It refuses requests whose header `Host` names another machine, so
 that no page of the web can reach it by a name that resolves to this address, and answers only reading requests.
@@ -11,20 +9,15 @@ that no page of the web can reach it by a name that resolves to this address, an
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
-import re
-import socket
 import sys
 import threading
-import time
 from collections.abc import Callable
 from functools import cached_property, lru_cache
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import resources
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -32,7 +25,7 @@ from numpy.typing import NDArray
 
 from ...core import images
 from ...core.errors import InputError, VbnfaultError
-from ...store import MOST_DOCUMENT_BYTES, SCALARS, SEMANTIC, SPLITS, STRATA, ShardReader, Store
+from ...store import SCALARS, SEMANTIC, SPLITS, STRATA, ShardReader, Store
 from ..contact_sheet import COLOURS, abbreviations, overlay, resized, resized_mask
 from .listing import Listing
 
@@ -40,8 +33,6 @@ _PAGE = {
     "": ("index.html", "text/html; charset=utf-8"),
     "view.js": ("view.js", "text/javascript; charset=utf-8"),
     "layers.js": ("layers.js", "text/javascript; charset=utf-8"),
-    "blosc.js": ("blosc.js", "text/javascript; charset=utf-8"),
-    "zarrita.js": ("zarrita.js", "text/javascript; charset=utf-8"),
     "view.css": ("view.css", "text/css; charset=utf-8"),
 }
 # nothing of the page comes from elsewhere, and no other page may hold it
@@ -51,15 +42,9 @@ _HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
 }
-_RANGE = re.compile(r"bytes=(?:(\d+)-(\d*)|-(\d+))")
-_LAST = 2**62  # no file has so many bytes
 _SIDES_PX = (160, 240, 320)  # of the small images
 _JPEG_QUALITY = 82
 _ROOTS = np.sqrt(255 * np.arange(256)).round().astype(np.uint8)  # black and white stay as they are
-_COORDINATES = ("fault", "channel", "sample", "layer")
-_MOST_OF_COORDINATE = 1 << 20  # bytes of a chunk
-# A connection that has sent no whole request for so long is closed, and so is one too many: a page opens six.
-_SECONDS_TO_ASK, _MOST_CONNECTIONS = 20.0, 64
 _MOST_SMALL = 3000  # small images that are kept, of some 10 kB each
 _KEPT_S = 60
 _PORT_OF_HTTP = 80
@@ -119,7 +104,7 @@ class Viewer:
     # --- what is served -------------------------------------------------------------------------------------
 
     def answer(self, path: str, query: dict[str, str]) -> tuple[bytes, str, str]:
-        """Return body, kind and cache time of a request that is not for a file of the store. Raises Missing."""
+        """Return body, kind and cache time of a request. Raises Missing."""
         if path in _PAGE:
             name, kind = _PAGE[path]
             return resources.files(__package__).joinpath("page", name).read_bytes(), kind, "no-cache"
@@ -227,7 +212,7 @@ class Viewer:
         return out
 
     def layer(self, rest: str) -> bytes:
-        """Return the decoded bytes of a layer of a sample, little-endian: for browsers that cannot decode it."""
+        """Return the decoded bytes of a layer of a sample, little-endian: as a browser's typed arrays hold them."""
         name, _, index = rest.partition("/")
         pixels = self.pixels(name, _index(index, self.store.samples))
         return pixels.astype(pixels.dtype.newbyteorder("<"), copy=False).tobytes()
@@ -262,57 +247,6 @@ class Viewer:
             rgb = overlay(rgb, small, [bool(mask.any()) for mask in small], localised)
         return images.encoded(rgb, ".jpg", _JPEG_QUALITY)
 
-    def part(self, name: str, header: str | None) -> tuple[bytes, str]:
-        """Return a part of a file of the store, and which part it is as the header `Content-Range` says it.
-
-        `header`: the header `Range`, None for the whole file. The second value is "" for an object store, which
-        does not tell the size. Raises Missing if there is no such file, ValueError if the range is none.
-        """
-        most_bytes = self._most_bytes(name)
-        asked = _RANGE.fullmatch(header or "bytes=0-")
-        if asked is None:
-            raise ValueError(header)
-        first, last, suffix = (min(int(group), _LAST) if group else None for group in asked.groups())
-        if suffix == 0:
-            raise ValueError(header)
-        files, end = self.store.files, b""
-
-        def choose(tail: bytes) -> list[tuple[int, int]]:
-            nonlocal end
-            end = tail
-            return [] if suffix is not None else [(first or 0, min((last or 0) - (first or 0) + 1, most_bytes))]
-
-        try:
-            if header is None or (suffix is None and last is None):
-                body = files.read(name, most_bytes)[first or 0 :]
-            elif suffix is None and (last or 0) < (first or 0):
-                raise ValueError(header)
-            else:
-                parts = files.read_parts(name, min(suffix or 1, most_bytes), choose)
-                body = parts[0][1] if parts else end
-            if header is not None and not body:
-                raise ValueError(header)
-            size = self._size(name)
-        except OSError as error:
-            raise Missing from error
-        start = (size or 0) - len(body) if suffix is not None else first or 0
-        return body, "" if size is None else f"bytes {start}-{start + len(body) - 1}/{size}"
-
-    def _size(self, name: str) -> int | None:
-        """Return the size of a file of the store in bytes, None in an object store."""
-        return (self.store.path / name).stat().st_size if isinstance(self.store.path, Path) else None
-
-    def _most_bytes(self, name: str) -> int:
-        """Return the most bytes of a file that is served: a document, or a chunk of an array. Raises Missing."""
-        is_chunk = "/c/" in name
-        array, _, rest = name.partition("/c/") if is_chunk else name.rpartition("/")
-        known = {"", *self.store.spec.arrays, *_COORDINATES}
-        if array not in known or not re.fullmatch(r"\d{1,9}(?:/\d{1,9}){0,5}" if is_chunk else r"zarr\.json", rest):
-            raise Missing
-        if not is_chunk:
-            return MOST_DOCUMENT_BYTES
-        return self.store.most_bytes(array) if array in self.store.spec.arrays else _MOST_OF_COORDINATE
-
 
 def _index(text: str, samples: int) -> int:
     """Return the index of a sample. Raises Missing if there is no such sample."""
@@ -345,38 +279,9 @@ def _json(value: Any) -> bytes:
 
 
 class _Server(ThreadingHTTPServer):
-    """Serve a few connections, and close those that ask for nothing."""
+    """Serve each connection in a thread that ends with the process."""
 
     daemon_threads = True
-
-    def __init__(self, *given: Any) -> None:
-        self.asking: dict[socket.socket, float] = {}  # since when a connection is waited for
-        self._open = threading.BoundedSemaphore(_MOST_CONNECTIONS)
-        super().__init__(*given)
-
-    def process_request(self, request: Any, client_address: Any) -> None:
-        """Answer a connection in a thread; close it where there are too many."""
-        if not self._open.acquire(blocking=False):
-            self.shutdown_request(request)
-            return
-        super().process_request(request, client_address)
-
-    def process_request_thread(self, request: Any, client_address: Any) -> None:
-        """Answer a connection."""
-        try:
-            super().process_request_thread(request, client_address)
-        finally:
-            self.asking.pop(request, None)
-            self._open.release()
-
-    def service_actions(self) -> None:
-        """Close, again and again, the connections whose request does not arrive."""
-        now = time.monotonic()
-        for connection, since in [*self.asking.items()]:
-            if now - since > _SECONDS_TO_ASK:
-                self.asking.pop(connection, None)
-                with contextlib.suppress(OSError):
-                    connection.shutdown(socket.SHUT_RDWR)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Print nothing of a connection that ended early."""
@@ -394,14 +299,8 @@ class _Handler(BaseHTTPRequestHandler):
     server_version, sys_version = "vbnfault", ""
     disable_nagle_algorithm = True
 
-    def handle_one_request(self) -> None:
-        """Answer a request, which must arrive in time."""
-        self.server.asking[self.connection] = time.monotonic()  # type: ignore[attr-defined]
-        super().handle_one_request()
-
     def do_GET(self) -> None:
         """Answer a request."""
-        self.server.asking.pop(self.connection, None)  # type: ignore[attr-defined]
         self._reply(*self._answered())
 
     do_HEAD = do_GET
@@ -418,8 +317,6 @@ class _Handler(BaseHTTPRequestHandler):
             return HTTPStatus.FORBIDDEN, b"this server answers this machine only", {}
         path, _, query = self.path.partition("?")
         try:
-            if path.startswith("/store/"):
-                return self._file(path.removeprefix("/store/"))
             pairs = dict(pair.partition("=")[::2] for pair in query.split("&"))
             body, kind, cache = self.viewer.answer(path.lstrip("/"), pairs)
             return HTTPStatus.OK, body, {"Content-Type": kind, "Cache-Control": cache}
@@ -427,19 +324,6 @@ class _Handler(BaseHTTPRequestHandler):
             return HTTPStatus.NOT_FOUND, b"not found", {}
         except VbnfaultError as error:  # damaged, or not finished: the page shows the sentence
             return HTTPStatus.UNPROCESSABLE_ENTITY, str(error).encode(), {"Content-Type": "text/plain"}
-
-    def _file(self, name: str) -> tuple[int, bytes, dict[str, str]]:
-        """Return status, body and headers of a file of the store."""
-        header = self.headers.get("Range")
-        try:
-            body, which = self.viewer.part(name, header)
-        except ValueError:
-            return HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE, b"", {}
-        kind = "application/json" if name.endswith(".json") else "application/octet-stream"
-        headers = {"Accept-Ranges": "bytes", "Content-Type": kind, "Cache-Control": "no-store"}
-        if header is None:
-            return HTTPStatus.OK, body, headers
-        return HTTPStatus.PARTIAL_CONTENT, body, {**headers, **({"Content-Range": which} if which else {})}
 
     def _reply(self, status: int, body: bytes, headers: dict[str, str]) -> None:
         """Send an answer."""

@@ -6,7 +6,7 @@ import json
 from collections.abc import Collection, Iterable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, TextIO
+from typing import Any, TextIO
 
 from .... import __version__
 from ....core.quantities import Sample
@@ -20,27 +20,23 @@ MOST_INSTANCES = 1000
 
 
 class Coco(Format):
-    """Write images and, for each split, the instances of the masks as COCO run lengths."""
+    """COCO: 8 bit PNG images, and a JSON file of instances with run-length masks for each split.
+
+    - `images/SPLIT/NUMBER.png`: R, G, B of the image, 8 bits a channel. The number is the index of the sample
+      in the store, and the image's `id`.
+    - `annotations/instances_SPLIT.json`: read it with `pycocotools.coco.COCO`. `categories` are all classes in
+      the order of the table below; `id` is the index there plus 1.
+    - The instances are the connected regions (8 neighbours) of `mask`: grains, defects, lines. Grains that
+      touch are one region. Where the parameters list flares, each flare and the glare is one instance, in one
+      piece or in several. A class that is not localised, such as vignetting, has one instance of its whole mask.
+      `area` counts pixels; `bbox` is left, top, width, height in pixels.
+    - A class with more than 1000 regions in one image has one annotation of its whole mask there, with
+      `iscrowd` 1; all others have `iscrowd` 0. No pixel of a mask is left out, except in instances that are
+      smaller than `--min-area`.
+    """
 
     name = "coco"
-    summary = "COCO: 8 bit PNG images, and a JSON file of instances with run-length masks for each split."
     pattern = "images/*/*.png"
-    usage: ClassVar = (
-        "- `images/SPLIT/NUMBER.png`: R, G, B of the image, 8 bits a channel. The number is the "
-        "index of the sample "
-        "in the store, and the image's `id`.",
-        "- `annotations/instances_SPLIT.json`: read it with `pycocotools.coco.COCO`. `categories` "
-        "are all classes in "
-        "the order of the table below; `id` is the index there plus 1.",
-        "- The instances are the connected regions (8 neighbours) of `mask`: grains, defects, lines. Grains that "
-        "touch are one region. Where the parameters list flares, each flare and the glare is one instance, in one "
-        "piece or in several. A class that is not localised, such as vignetting, has one instance of its whole "
-        "mask. `area` counts pixels; `bbox` is left, top, width, height in pixels.",
-        f"- A class with more than {MOST_INSTANCES} regions in one image has one annotation of its "
-        f"whole mask there, "
-        "with `iscrowd` 1; all others have `iscrowd` 0. No pixel of a mask is left out, except in instances that "
-        "are smaller than `--min-area`.",
-    )
     has_instances = True
 
     def layers(self, spec: StoreSpec) -> Collection[str]:

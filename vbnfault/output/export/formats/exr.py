@@ -20,28 +20,24 @@ _SKIPPED = ("clean", "mask_any")
 
 
 class Exr(Format):
-    """Write one OpenEXR file for each sample."""
+    """OpenEXR: one file of named channels for each sample, with image, radiance, depth, normals and masks.
+
+    A file is `SPLIT/NUMBER.exr`; the number is the index of the sample in the store. Its channels, in
+    scan-lines from the top, compressed without loss:
+
+    - `R`, `G`, `B`, `I`: the image with faults, linear, DN / 255, half floats; times 255 and rounded they are
+      the stored 8 bit values.
+    - `radiance.<wavelength>nm`: radiance at the camera without faults and noise, in W m-2 sr-1 nm-1, if the
+      store has the layer `radiance`.
+    - `depth.Z`: depth along the boresight in m, infinite on the sky. `normal.X`, `normal.Y`, `normal.Z`: in the
+      camera's frame (x right, y down, z boresight), 0 on the sky. `semantic`: 0 sky, 1 body, 2 Sun, 3 spacecraft.
+    - `mask.<fault>`: 1 where the mask is set. Any other layer of one number a pixel has its name in the store.
+    """
 
     name = "exr"
-    summary = "OpenEXR: one file of named channels for each sample, with image, radiance, depth, normals and masks."
     media_type = "image/x-exr"
     croissant_image: ClassVar = {}  # a reader decodes no OpenEXR
     pattern = "*/*.exr"
-    usage: ClassVar = (
-        "A file is `SPLIT/NUMBER.exr`; the number is the index of the sample in the store. Its channels, in "
-        "scan-lines from the top, compressed without loss:",
-        "",
-        "- `R`, `G`, `B`, `I`: the image with faults, linear, DN / 255, half floats; times 255 and "
-        "rounded they are "
-        "the stored 8 bit values.",
-        "- `radiance.<wavelength>nm`: radiance at the camera without faults and noise, in W m-2 sr-1 nm-1, if the "
-        "store has the layer `radiance`.",
-        "- `depth.Z`: depth along the boresight in m, infinite on the sky. `normal.X`, `normal.Y`, `normal.Z`: in "
-        "the camera's frame (x right, y down, z boresight), 0 on the sky. `semantic`: 0 sky, 1 body, 2 Sun, "
-        "3 spacecraft.",
-        "- `mask.<fault>`: 1 where the mask is set. Any other layer of one number a pixel has its "
-        "name in the store.",
-    )
 
     def layers(self, spec: StoreSpec) -> Collection[str]:
         """Return the image, the masks and every layer of numbers."""

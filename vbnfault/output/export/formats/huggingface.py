@@ -21,25 +21,22 @@ _ROWS_IN_MEMORY = 8
 
 
 class HuggingFace(Format):
-    """Write Parquet files of about 256 MB with images, masks, labels and pose as typed columns."""
+    """Hugging Face: Parquet files with images, masks, labels and pose as typed columns.
+
+    - `data/SPLIT-*.parquet`: `datasets.load_dataset("PATH_OF_THIS_FOLDER")` gives all splits; the head of this
+      card names the files of each.
+    - `image`, `clean`: R, G, B, 8 bits a channel; `intensity`: the intensity channel. `mask_<fault>` for every
+      class, and `mask_any`: 8 bits, 255 where the mask is set.
+    - `faults`: the classes in the pixels, as labels of a `ClassLabel` in the order of the table below.
+      `parameters`: every drawn parameter, as JSON. Pose, Sun and exposure are columns of numbers.
+    """
 
     name = "huggingface"
-    summary = "Hugging Face: Parquet files with images, masks, labels and pose as typed columns."
     media_type = "application/x-parquet"
     pattern = "data/*.parquet"
     croissant_image: ClassVar = {"extract": {"column": "image"}, "transform": {"jsonPath": "bytes"}}
     croissant_sample: ClassVar = {"extract": {"column": "sample"}}
     part_bytes = 2**28
-    usage: ClassVar = (
-        '- `data/SPLIT-*.parquet`: `datasets.load_dataset("PATH_OF_THIS_FOLDER")` gives all splits; '
-        "the head of this "
-        "card names the files of each.",
-        "- `image`, `clean`: R, G, B, 8 bits a channel; `intensity`: the intensity channel. "
-        "`mask_<fault>` for every "
-        "class, and `mask_any`: 8 bits, 255 where the mask is set.",
-        "- `faults`: the classes in the pixels, as labels of a `ClassLabel` in the order of the table below. "
-        "`parameters`: every drawn parameter, as JSON. Pose, Sun and exposure are columns of numbers.",
-    )
 
     def layers(self, spec: StoreSpec) -> Collection[str]:
         """Return images and masks."""

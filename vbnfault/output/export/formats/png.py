@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator
-from typing import ClassVar
 
 import numpy as np
 
@@ -16,23 +15,21 @@ _PLAIN = ("mask_any", "semantic", "raw")
 
 
 class PngFolders(Format):
-    """Write each image and mask as a PNG file of 8 bits, and the raw mosaic as one of 16 bits."""
+    """PNG files of 8 bits, and of 16 bits for the raw mosaic, in a folder for each split and layer.
+
+    A file is `SPLIT/LAYER/NUMBER.png`; the number is the index of the sample in the store.
+
+    - `image`, `clean` and `without_<fault>`: R, G, B of the image, 8 bits a channel, in DN. `image_intensity`
+      and the like: its intensity channel, 8 bits.
+    - `mask/<fault>`, `mask_effect/<fault>`, `mask_any`: 8 bits, 255 where the mask is set and 0 elsewhere.
+    - `semantic`: 8 bits; 0 sky, 1 body, 2 Sun, 3 spacecraft.
+    - `raw`: the mosaic of the analogue-to-digital converter, 16 bits, in DN and not scaled.
+    - A layer that the store lacks has no folder. Depth, normals and radiance are floating-point numbers: export
+      them as `exr`.
+    """
 
     name = "png"
-    summary = "PNG files of 8 bits, and of 16 bits for the raw mosaic, in a folder for each split and layer."
     pattern = "*/image/*.png"
-    usage: ClassVar = (
-        "A file is `SPLIT/LAYER/NUMBER.png`; the number is the index of the sample in the store.",
-        "",
-        "- `image`, `clean` and `without_<fault>`: R, G, B of the image, 8 bits a channel, in DN. "
-        "`image_intensity` and the like: its intensity channel, 8 bits.",
-        "- `mask/<fault>`, `mask_effect/<fault>`, `mask_any`: 8 bits, 255 where the mask is set and 0 elsewhere.",
-        "- `semantic`: 8 bits; 0 sky, 1 body, 2 Sun, 3 spacecraft.",
-        "- `raw`: the mosaic of the analogue-to-digital converter, 16 bits, in DN and not scaled.",
-        "- A layer that the store lacks has no folder. Depth, normals and radiance are "
-        "floating-point numbers: export "
-        "them as `exr`.",
-    )
 
     def layers(self, spec: StoreSpec) -> Collection[str]:
         """Return the layers of whole numbers and the masks."""

@@ -22,27 +22,22 @@ _PLAIN = ("mask_any", "semantic", "raw")
 
 
 class WebDataset(Format):
-    """Write tar files of about 256 MB, in which the files of a sample share its number."""
+    """WebDataset: tar files of PNG images and masks, NumPy arrays and JSON, each of one split.
+
+    - `SPLIT-NUMBER.tar`: read them with `webdataset.WebDataset`. The key of a sample is its index in the store.
+      Samples are in ascending order, so shuffle when you read.
+    - `image.png`, `clean.png`: R, G, B, 8 bits a channel; `intensity.png`: the intensity channel of the image.
+    - `mask.<fault>.png` for every class, in each sample, and `mask_any.png`: 8 bits, 255 where the mask is set.
+    - `semantic.png`: 8 bits; 0 sky, 1 body, 2 Sun, 3 spacecraft. `raw.png`: the raw mosaic, 16 bits, in DN.
+    - `depth_m.npy` and `normal.npy`: NumPy arrays in metres and in the camera's frame, if the store has them.
+    - `json`: the names of the injected faults (`injected`, a flag for each class), and all scalars.
+    """
 
     name = "webdataset"
-    summary = "WebDataset: tar files of PNG images and masks, NumPy arrays and JSON, each of one split."
     media_type = "application/x-tar"
     pattern = "*.tar"
     croissant_image: ClassVar = {}  # a reader unpacks no set of archives
     part_bytes = 2**28
-    usage: ClassVar = (
-        "- `SPLIT-NUMBER.tar`: read them with `webdataset.WebDataset`. The key of a sample is its "
-        "index in the store. "
-        "Samples are in ascending order, so shuffle when you read.",
-        "- `image.png`, `clean.png`: R, G, B, 8 bits a channel; `intensity.png`: the intensity "
-        "channel of the image.",
-        "- `mask.<fault>.png` for every class, in each sample, and `mask_any.png`: 8 bits, 255 where "
-        "the mask is set.",
-        "- `semantic.png`: 8 bits; 0 sky, 1 body, 2 Sun, 3 spacecraft. `raw.png`: the raw mosaic, 16 bits, in DN.",
-        "- `depth_m.npy` and `normal.npy`: NumPy arrays in metres and in the camera's frame, if the "
-        "store has them.",
-        "- `json`: the names of the injected faults (`injected`, a flag for each class), and all scalars.",
-    )
 
     def layers(self, spec: StoreSpec) -> Collection[str]:
         """Return images, masks and truth."""

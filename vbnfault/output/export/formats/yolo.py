@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable
-from typing import ClassVar
 
 import numpy as np
 
@@ -14,27 +13,23 @@ from ..regions import Region, instances, polygon
 
 
 class Yolo(Format):
-    """Write images, and for each a file of outlines and one of boxes, as Ultralytics reads them."""
+    """YOLO: 8 bit PNG images, outlines and boxes of the instances as text, and data.yaml.
+
+    - `data.yaml`: the splits and the names of all classes, in the order of the table below.
+    - `images/SPLIT/NUMBER.png`: R, G, B of the image, 8 bits a channel. The number is the index of the sample.
+    - `labels/SPLIT/NUMBER.txt`: one outline a line, `class x1 y1 x2 y2 ...`, as fractions of width and height.
+      Ultralytics trains segmentation with them, and detection with the boxes around them.
+    - `boxes/SPLIT/NUMBER.txt`: the same instances as exact boxes, `class x_centre y_centre width height`, for
+      programs that read boxes only; rename the folder to `labels` for them.
+    - The instances are the connected regions (8 neighbours) of `mask` of the localised classes; where the
+      parameters list flares, each flare and the glare is one. An outline runs through the centres of the pixels
+      at the edge and has no holes; that of an instance in several pieces is the outline of the longest. A class
+      that is not localised, such as vignetting, has no instances here; `samples.jsonl` says which samples have
+      it.
+    """
 
     name = "yolo"
-    summary = "YOLO: 8 bit PNG images, outlines and boxes of the instances as text, and data.yaml."
     pattern = "images/*/*.png"
-    usage: ClassVar = (
-        "- `data.yaml`: the splits and the names of all classes, in the order of the table below.",
-        "- `images/SPLIT/NUMBER.png`: R, G, B of the image, 8 bits a channel. The number is the "
-        "index of the sample.",
-        "- `labels/SPLIT/NUMBER.txt`: one outline a line, `class x1 y1 x2 y2 ...`, as fractions of "
-        "width and height. "
-        "Ultralytics trains segmentation with them, and detection with the boxes around them.",
-        "- `boxes/SPLIT/NUMBER.txt`: the same instances as exact boxes, `class x_centre y_centre "
-        "width height`, for "
-        "programs that read boxes only; rename the folder to `labels` for them.",
-        "- The instances are the connected regions (8 neighbours) of `mask` of the localised classes; where the "
-        "parameters list flares, each flare and the glare is one. An outline runs through the centres of the "
-        "pixels at the edge and has no holes; that of an instance in several pieces is the outline of the longest. "
-        "A class that is not localised, such as vignetting, has no instances here; `samples.jsonl` says which "
-        "samples have it.",
-    )
 
     has_instances = True
 

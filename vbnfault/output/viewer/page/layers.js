@@ -1,25 +1,11 @@
-// Read layers of a sample from the files of the store with zarrita.js, and paint them into canvases.
-import { Blosc } from "/blosc.js";
-import { FetchStore, get, open, registry, root } from "/zarrita.js";
-
-registry.set("blosc", () => Blosc);
-
+// Read layers of a sample, which the server decodes, and paint them into canvases.
 const SEMANTIC = [[24, 26, 32], [176, 164, 148], [240, 228, 66], [86, 200, 255]];
 // viridis (van der Walt and Smith 2015) at nine places, dark to bright
 const VIRIDIS = [[68, 1, 84], [71, 44, 122], [59, 81, 139], [44, 113, 142], [33, 144, 141], [39, 173, 129], [92, 200, 99], [170, 220, 50], [253, 231, 37]];
 const WIDE = { uint8: Uint8Array, bool: Uint8Array, uint16: Uint16Array, float32: Float32Array, float64: Float64Array };
 const MOST_KEPT = 24;
 
-// zarrita reads a missing file as zeros: here it is an error
-async function existing(request) {
-  const response = await fetch(request);
-  if (response.status === 404) throw new Error(`${new URL(request.url).pathname} is missing`);
-  return response;
-}
-const location = root(new FetchStore(new URL("/store", document.baseURI).href, { useSuffixRequest: true, fetch: existing }));
-const arrays = new Map();
 const kept = new Map(); // decoded layers, the latest last
-export const sources = { zarr: 0, server: 0 }; // where layers came from, for tests
 
 // Return a layer of a sample as {data, shape}. Raises an Error with a sentence if it cannot be read.
 export function read(layer, index) {
@@ -36,22 +22,10 @@ export function read(layer, index) {
 }
 
 async function fetched(layer, index) {
-  try {
-    if (!arrays.has(layer.name)) arrays.set(layer.name, open.v3(location.resolve(layer.name), { kind: "array" }));
-    const array = await arrays.get(layer.name);
-    const chunk = await get(array, [index, ...layer.shape.map(() => null)]);
-    const data = ArrayBuffer.isView(chunk.data) ? chunk.data : new Uint8Array(chunk.data.buffer, chunk.data.byteOffset, chunk.data.length);
-    sources.zarr += 1;
-    return { data, shape: layer.shape };
-  } catch (error) {
-    // a codec or a type that this browser lacks, or a damaged file: the server decodes it or says what is wrong
-    const response = await fetch(`/api/layer/${layer.name}/${index}`);
-    if (!response.ok) throw new Error(response.status === 422 ? await response.text() : `${layer.name} cannot be read`);
-    const buffer = await response.arrayBuffer();
-    sources.server += 1;
-    const data = layer.dtype === "float16" ? halves(new Uint16Array(buffer)) : new WIDE[layer.dtype](buffer);
-    return { data, shape: layer.shape };
-  }
+  const response = await fetch(`/api/layer/${layer.name}/${index}`);
+  if (!response.ok) throw new Error(response.status === 422 ? await response.text() : `${layer.name} cannot be read`);
+  const buffer = await response.arrayBuffer();
+  return { data: layer.dtype === "float16" ? halves(new Uint16Array(buffer)) : new WIDE[layer.dtype](buffer), shape: layer.shape };
 }
 
 // Return numbers of 16 bits as numbers of 32 bits, for browsers without Float16Array.

@@ -1,5 +1,5 @@
 // The page of `vbnfault view`: a grid of small images that scrolls any number of samples, and one sample at full size.
-import { difference, paint, paintMasks, ramp, read, rooted, sources } from "/layers.js";
+import { difference, paint, paintMasks, ramp, read, rooted } from "/layers.js";
 
 const $ = (id) => document.getElementById(id);
 const NOT_KNOWN = 255, GAP = 10, CAPTION = 26, MOST_PX = 2e7; // browsers cannot scroll elements of more than 3.3e7 px
@@ -658,7 +658,7 @@ document.addEventListener("keydown", (event) => {
 
 // --- begin --------------------------------------------------------------------------------------------------
 
-window.vbnfault = { view, sources, toggled: null, get listing() { return listing; }, get count() { return count(); } };
+window.vbnfault = { view, toggled: null, get listing() { return listing; }, get count() { return count(); } };
 tiles.fresh = true;
 status();
 layout();

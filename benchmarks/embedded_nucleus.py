@@ -1,4 +1,8 @@
-"""Generate a two-lobed nucleus with the published dimensions of 67P, so that everything works without a download.
+"""Make the two-lobed nucleus that ships with vbnfault, with the published dimensions of 67P.
+
+    python benchmarks/embedded_nucleus.py
+
+writes `scenes/bodies/embedded.npz`: `vertices_m` float64[n, 3] and `faces` int32[m, 3].
 
 Dimensions and volume are from Jorda et al. 2016 (Icarus 277), the lobe centres from Preusker et al. 2015 (Table 4),
 in the axes of 67P/C-G_FIXED. The orientation of the lobes and all relief are invented to resemble 67P: a smooth
@@ -7,20 +11,15 @@ neck, layered cliffs, plains with flat floors, and pits with steep walls.
 
 from __future__ import annotations
 
-from functools import lru_cache
-from pathlib import Path
-
 import numpy as np
 import scipy.sparse
 import scipy.sparse.csgraph
 from numpy.typing import NDArray
 
-from ..core.array_files import ArrayFiles, code_hash
-from .noise import fractal_noise, gradient_noise
-from .shape import Float64, Int32, check_mesh, vertex_normals
-
-NUCLEI = ArrayFiles(kind="nucleus", content="embedded nucleus")
-_SOURCES, _ARRAYS = ("noise", "shape"), ("vertices_m", "faces")
+from vbnfault.body.geometry import Float64, Int32, vertex_normals
+from vbnfault.body.noise import fractal_noise, gradient_noise
+from vbnfault.body.shape import check_mesh
+from vbnfault.core.resources import data_dir
 
 _SEED = 67
 _SPACING_KM = 0.066
@@ -177,28 +176,8 @@ def _umbrella(faces: Int32, count: int) -> scipy.sparse.csr_matrix:
     return scipy.sparse.diags(1.0 / np.asarray(matrix.sum(axis=1)).ravel()) @ matrix
 
 
-@lru_cache(maxsize=1)
-def embedded_nucleus() -> tuple[Float64, Int32]:
-    """Return the procedural nucleus: float64[n, 3] in metres and int32[m, 3], closed, wound outwards, read-only.
-
-    The result is deterministic. It is made once per machine, in about a second, and kept on disk (`array_files`).
-
-    Raises
-    ------
-    InputError
-        $VBNFAULT_CACHE_GIB is unusable.
-    """
-    here = Path(__file__)
-    key = code_hash([here, *(here.with_name(f"{name}.py") for name in _SOURCES)], ["scikit-image"])
-    kept = NUCLEI.kept(key, lambda: dict(zip(_ARRAYS, made_nucleus(), strict=True)))
-    vertices, faces = (kept[name] for name in _ARRAYS)
-    vertices.setflags(write=False)
-    faces.setflags(write=False)
-    return vertices, faces
-
-
 def made_nucleus() -> tuple[Float64, Int32]:
-    """Compute the vertices and faces of `embedded_nucleus` without the cache on disk."""
+    """Return the vertices float64[n, 3] in metres and the faces int32[m, 3], closed, wound outwards."""
     import skimage.measure
 
     low, high = np.array([-2.95, -2.25, -2.15]), np.array([2.95, 2.35, 2.10])
@@ -235,3 +214,8 @@ def _largest_piece(faces: Int32, count: int) -> Int32:
     graph = scipy.sparse.csr_matrix((ones, (rows, columns)), shape=(count, count))
     label = scipy.sparse.csgraph.connected_components(graph, directed=False)[1][faces[:, 0]]
     return faces[label == np.argmax(np.bincount(label))]
+
+
+if __name__ == "__main__":
+    vertices_m, faces = made_nucleus()
+    np.savez_compressed(data_dir("scenes") / "bodies" / "embedded.npz", vertices_m=vertices_m, faces=faces)

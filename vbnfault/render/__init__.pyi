@@ -1,0 +1,33 @@
+"""List the public names of the package, each with the module that defines it."""
+
+from .albedo import AlbedoMap as AlbedoMap
+from .atmosphere import TOP_SCALE_HEIGHTS as TOP_SCALE_HEIGHTS
+from .atmosphere import Air as Air
+from .atmosphere import air_light as air_light
+from .bounces import indirect as indirect
+from .detail import FineRelief as FineRelief
+from .earth import EarthAlbedo as EarthAlbedo
+from .integrate import radiance as radiance
+from .integrate import self_test as self_test
+from .layers import truth as truth
+from .light import Cells as Cells
+from .light import Sampled as Sampled
+from .light import direct as direct
+from .light import direct_by_sample as direct_by_sample
+from .light import direct_in_cells as direct_in_cells
+from .light import sun_in_view as sun_in_view
+from .resolve import first_ground as first_ground
+from .resolve import first_hit_m as first_hit_m
+from .resolve import ground_height_m as ground_height_m
+from .resolve import heights_towards_sun as heights_towards_sun
+from .resolve import hidden_points as hidden_points
+from .resolve import is_between as is_between
+from .resolve import is_clear as is_clear
+from .resolve import sun_visible_fraction as sun_visible_fraction
+from .resolve import sunlit_ground as sunlit_ground
+from .runtime import set_threads as set_threads
+from .surface import TerrainMesh as TerrainMesh
+from .unresolved import CloseUp as CloseUp
+from .unresolved import close_up as close_up
+from .unresolved import thin_parts as thin_parts
+from .vehicle import Vehicle as Vehicle
