@@ -300,8 +300,9 @@ def test_the_radiance_before_the_lens_and_without_stars_is_used(
 
 @pytest.mark.parametrize(("overwrite", "taken"), [(False, [1, 2]), (True, [0, 1, 2, 3])])
 def test_a_store_that_has_begun_keeps_its_samples_unless_it_is_replaced(
-    overwrite: bool, taken: list[int], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    overwrite: bool, taken: list[int], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
+    caplog.set_level("INFO", "vbnfault")
     finished: Any = SimpleNamespace(
         begun=lambda: [0],
         done=lambda _: dict.fromkeys(range(4), True),
@@ -314,5 +315,5 @@ def test_a_store_that_has_begun_keeps_its_samples_unless_it_is_replaced(
     monkeypatch.setattr(retake.store, "open_store", lambda _: begun)
     options: Any = SimpleNamespace(overwrite=overwrite)
     assert retake._samples(finished, Path("new.zarr"), options).tolist() == taken
-    noted = "note: s.zarr: 2 of 4 samples are taken, those that were finished\n"
-    assert capsys.readouterr().err == ("" if overwrite else noted)
+    noted = ["s.zarr: 2 of 4 samples are taken, those that were finished"]
+    assert caplog.messages == ([] if overwrite else noted)

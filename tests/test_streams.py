@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import logging
 import os
 import subprocess
 import sys
@@ -17,6 +18,22 @@ from test_cli import run
 
 from vbnfault import cli, store
 from vbnfault.core import streams
+
+
+def test_the_library_warns_in_sentences_each_of_them_once(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    logger = logging.getLogger("vbnfault")
+    for name, value in (("handlers", []), ("level", logger.level)):
+        monkeypatch.setattr(logger, name, value)
+    monkeypatch.setattr(streams.warnings, "showwarning", None)
+    streams.warn_in_sentences()
+    for _ in range(2):
+        logger.warning("the root of s.zarr is damaged")
+        logger.info("2 of 4 samples are taken")
+    said = ["warning: the root of s.zarr is damaged", "note: 2 of 4 samples are taken"]
+    assert capsys.readouterr().err.splitlines() == said
+
 
 # of every command, arguments with which it prints something and takes a moment
 COMMANDS = {

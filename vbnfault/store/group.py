@@ -184,7 +184,7 @@ def open_store(path: str | os.PathLike[str] | Url | Store, mode: str = "r") -> S
         raise InputError(f"{path}: {_why_no_store(files)}")
     _check_format(path, root.attributes.get("format_version"))
     try:
-        store = Store(files, root.attributes, mode)
+        store = Store(files, root.attributes)
     except InputError as error:
         raise InputError(f"{path}: {_NO_STORE}: {error}") from error
     except (KeyError, TypeError, ValueError, VbnfaultError) as error:

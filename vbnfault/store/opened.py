@@ -57,7 +57,7 @@ class Store:
     The files are read directly, and no more of them than the schema allows: the store may be that of a stranger.
     """
 
-    def __init__(self, files: Files, attributes: dict[str, Any], mode: str) -> None:
+    def __init__(self, files: Files, attributes: dict[str, Any]) -> None:
         self.files, self.path = files, files.path
         self.root_attributes = attributes
         self.attributes = {k: v for k, v in attributes.items() if k not in OWN_ATTRIBUTES}
@@ -65,7 +65,6 @@ class Store:
         self.samples = number_of_samples(attributes)
         self.spec = spec_from_plain(attributes["store"], self.attributes)
         check_names(self.spec, self.samples)
-        self._mode: Any = mode
         self._shapes: dict[str, tuple[int, ...]] = {}
 
     @property

@@ -153,7 +153,8 @@ class SampleDataset(Dataset[Batch]):
 
         This is the `pos_weight` of `torch.nn.BCEWithLogitsLoss` for the target `classes`.
         """
-        injected = self._columns()["injected"][:, self._class_indices()]
+        columns = Columns(open_store(self.path))
+        injected = columns["injected"][np.isin(columns.samples, self.samples)][:, self._class_indices()]
         positive = injected.sum(axis=0)
         return _weights(positive, len(injected) - positive)
 
@@ -192,11 +193,6 @@ class SampleDataset(Dataset[Batch]):
     def _class_indices(self) -> list[int]:
         """Return the positions of the chosen classes on the fault axis of the store."""
         return [self.targets.spec.faults.index(name) for name in self.classes]
-
-    def _columns(self) -> dict[str, NDArray[Any]]:
-        """Return `injected` of the chosen samples."""
-        columns = Columns(open_store(self.path))
-        return {"injected": columns["injected"][np.isin(columns.samples, self.samples)]}
 
     def _open_reader(self) -> SampleReader:
         """Return the reader of this process and worker, opened at first use: threads do not survive a fork."""
