@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
-import google_crc32c
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,8 +20,7 @@ from ..core.errors import VbnfaultError
 from ..core.quantities import soft_kind
 from .arrays import SCALARS
 from .bucket import Url
-from .codec import DIGEST_BYTES, crc_of_scalars, mask_union, sample_digest, threads
-from .compressors import compressor
+from .codec import DIGEST_BYTES, crc32c, crc_of_scalars, mask_union, sample_digest, threads
 from .group import open_store
 from .layout import drawn_table
 from .metadata import metadata_problems, short
@@ -197,7 +195,7 @@ def examine_shard(store: Store, number: int, *, labels: bool = False) -> ShardCh
         if problems_of_layers or i in damaged:
             return _SampleCheck(problems_of_layers, None, [])
         sentences = list(_check_labels(store.spec, i, scalars[i], layers, crcs[i])) if labels else []
-        hashes = {name: hashlib.sha256(data).digest() for name, data in layers.items()}
+        hashes = {name: hashlib.sha256(a.data if a.size else b"").digest() for name, a in layers.items()}
         return _SampleCheck([], sample_digest(hashes, scalars[i]), sentences)
 
     sample_bytes = sum(map(store.spec.layer_bytes, store.spec.pixel_layers))
@@ -274,13 +272,13 @@ def _chunks(store: Store, number: int, finished: list[int]) -> tuple[dict[str, d
 
 def _layers(
     store: Store, number: int, i: int, chunks: Mapping[str, Mapping[int, bytes]], crcs: NDArray[np.uint32]
-) -> tuple[list[tuple[int, Problem]], dict[str, Any]]:
-    """Return the problems of one sample, each with the index of its layer, and the decoded bytes of its layers."""
+) -> tuple[list[tuple[int, Problem]], dict[str, NDArray[Any]]]:
+    """Return the problems of one sample, each with the index of its layer, and its layers."""
     problems: list[tuple[int, Problem]] = []
-    layers: dict[str, Any] = {}
+    layers: dict[str, NDArray[Any]] = {}
     for k, name in enumerate(store.spec.pixel_layers):
         if store.spec.empty(name):
-            layers[name] = b""
+            layers[name] = store.decoded(name, b"")
         if name not in chunks:
             continue
         file, why = store.file_name(name, number), ""
@@ -288,10 +286,8 @@ def _layers(
             why = f"has no chunk in {file}"
         else:
             try:
-                layers[name] = compressor(store.spec.codecs[name]).decode(
-                    chunks[name][i], store.spec.layer_bytes(name)
-                )
-                if google_crc32c.value(layers[name]) != crcs[k]:
+                layers[name] = store.decoded(name, chunks[name][i])
+                if crc32c(layers[name]) != crcs[k]:
                     why = f"in {file} does not match its stored crc32c"
             except ValueError:
                 why = f"cannot be decoded, its chunk in {file} is damaged"
@@ -464,7 +460,11 @@ def count_faults(
 
 
 def _check_labels(
-    spec: StoreSpec, i: int, scalars: Mapping[str, Any], layers: Mapping[str, bytes], crcs: NDArray[np.uint32]
+    spec: StoreSpec,
+    i: int,
+    scalars: Mapping[str, Any],
+    layers: Mapping[str, NDArray[Any]],
+    crcs: NDArray[np.uint32],
 ) -> Iterator[str]:
     """Yield one sentence for each contradiction between a sample's labels and its pixels or other labels."""
     injected = scalars["injected"]
@@ -479,14 +479,14 @@ def _check_labels(
         if listed != is_in:
             clause = "has no parameters, although" if is_in else "has parameters, although not"
             yield f"sample {i}: {fault} {clause} marked in injected"
-    mask = _array(spec, "mask", layers)
+    mask = layers["mask"]
     yield from _check_masks(i, spec.faults, "mask", mask, injected, spec.localised_faults or ())
     effect: Any = ()
     if "mask_effect" in layers:
         # by definition, an injected fault changes the noise-free image somewhere
-        effect = _array(spec, "mask_effect", layers)
+        effect = layers["mask_effect"]
         yield from _check_masks(i, spec.faults, "mask_effect", effect, injected, spec.faults)
-    mask_any, union = _array(spec, "mask_any", layers), mask_union(spec, mask)
+    mask_any, union = layers["mask_any"], mask_union(spec, mask)
     members = ", ".join(spec.mask_any_faults) or "no class"
     is_joint = spec.mask_any_joint and injected[[name in spec.mask_any_faults for name in spec.faults]].any()
     if is_joint and (union & ~mask_any).any():
@@ -494,7 +494,7 @@ def _check_labels(
     if not is_joint and not np.array_equal(mask_any, union):
         yield f"sample {i}: mask_any is not the union of the masks of {members}"
     for fault, name, is_in in zip(spec.faults, spec.soft_layers, injected, strict=False):
-        if name in layers and not is_in and (_array(spec, name, layers) != soft_kind(name).neutral).any():
+        if name in layers and not is_in and (layers[name] != soft_kind(name).neutral).any():
             yield f"sample {i}: {name} is not {soft_kind(name).neutral:g}, although {fault} is not injected"
     for fault, kind, its_mask, its_effect in zip(spec.faults, spec.mask_kinds, mask, effect, strict=False):
         if kind == "effect" and not np.array_equal(its_mask, its_effect):
@@ -528,12 +528,6 @@ def _check_masks(
             yield f"sample {i}: {name} of {fault} is not empty, although it is not injected"
         if is_in and not marks and fault in seen:
             yield f"sample {i}: {name} of {fault} is empty, although it is injected"
-
-
-def _array(spec: StoreSpec, name: str, layers: Mapping[str, bytes]) -> NDArray[Any]:
-    """Return the decoded bytes of a layer as an array of its dtype and shape."""
-    row = spec.pixel_layers[name]
-    return np.frombuffer(layers[name], dtype=row.dtype).reshape(spec.shape(row))
 
 
 def _check_split(
