@@ -29,10 +29,7 @@ from .schema import DIGEST_VERSION, MAX_HELD_BYTES, SPLITS, VOLATILE_ATTRIBUTES,
 
 
 class FaultCounts:
-    """Count the samples for which each fault class is planned, and those in which it is injected, by split.
-
-    `add` counts the samples one by one.
-    """
+    """Count the samples for which each fault class is planned, and those in which it is injected, by split."""
 
     def __init__(self, faults: Sequence[str]) -> None:
         self.faults = tuple(faults)
@@ -41,20 +38,11 @@ class FaultCounts:
         self._realised: Counter[tuple[str, str]] = Counter()
         self._has_plan = True
 
-    def add(self, split: str, planned: Iterable[bool] | None, injected: Iterable[bool]) -> None:
-        """Count one sample.
+    def add(self, splits: NDArray[Any], planned: NDArray[np.bool_] | None, injected: NDArray[np.bool_]) -> None:
+        """Count some samples: their splits, str[sample], commanded and injected faults, bool[sample, fault].
 
-        `planned`, `injected`: bool[fault], the commanded and the injected faults; `planned` is None if no plan is
-        known.
+        `planned` is None if no plan is known.
         """
-        self.samples[split] += 1
-        self._has_plan &= planned is not None
-        for counts, flags in ((self._planned, planned), (self._realised, injected)):
-            for fault, is_in in zip(self.faults, flags if flags is not None else (), strict=False):
-                counts[split, fault] += bool(is_in)
-
-    def add_all(self, splits: NDArray[Any], planned: NDArray[np.bool_] | None, injected: NDArray[np.bool_]) -> None:
-        """Count some samples at once, as `add` counts each: str[sample], bool[sample, fault]."""
         self._has_plan &= planned is not None
         for split in dict.fromkeys(splits.tolist()):
             chosen = splits == split
@@ -431,7 +419,8 @@ def examine(
             problems += check.contradictions[i]
             problems += _check_split(store, i, scalars, split_of)
             problems += _check_plan(store.spec, i, scalars, planned, exact)
-            counts.add(str(scalars["split"]), planned.get("injected"), scalars["injected"])
+            commanded = None if "injected" not in planned else np.asarray(planned["injected"])[None]
+            counts.add(np.array([str(scalars["split"])]), commanded, scalars["injected"][None])
         if progress:
             progress(len(store.shard(number)))
     if progress and len(begun) < store.shards:
@@ -455,7 +444,7 @@ def count_faults(
             continue
         samples = store.shard(number)
         commanded = None if planned is None else planned[samples.start : samples.stop][done]
-        counts.add_all(store.column("split", number)[done], commanded, store.column("injected", number)[done])
+        counts.add(store.column("split", number)[done], commanded, store.column("injected", number)[done])
     return counts
 
 
