@@ -98,9 +98,9 @@ def full() -> Iterator[TextIO]:
 @pytest.fixture(autouse=True)
 def plan_of_made_up_samples(monkeypatch: pytest.MonkeyPatch) -> None:
     """Their scene is none that could be planned."""
-    monkeypatch.setattr("vbnfault.dataset.checking.planned", lambda *_: None)
-    monkeypatch.setattr("vbnfault.dataset.checking.check_described", lambda _: None)
-    monkeypatch.setattr("vbnfault.dataset.checking.is_exact", lambda *_: False)
+    monkeypatch.setattr("vbnfault.dataset.identity.planned", lambda *_: None)
+    monkeypatch.setattr("vbnfault.dataset.identity.check_described", lambda _: None)
+    monkeypatch.setattr("vbnfault.dataset.identity.is_exact", lambda *_: False)
 
 
 def test_every_command_is_tried() -> None:

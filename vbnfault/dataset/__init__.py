@@ -14,9 +14,8 @@ from ..core.lazy_names import load_name
 
 if TYPE_CHECKING:
     from .build import BuildOptions
-    from .checking import missing_plugins, verify
     from .from_scene import SessionFactory, build_scene, describe_scene
-    from .identity import is_exact, planned, scene_identity, store_spec
+    from .identity import is_exact, missing_plugins, planned, scene_identity, store_spec, verify
     from .merge import merge_stores, migrate_store
 
 # public name → the module that defines it; it is loaded when the name is first used
@@ -28,11 +27,11 @@ _HOMES = {
     "is_exact": "identity",
     "merge_stores": "merge",
     "migrate_store": "merge",
-    "missing_plugins": "checking",
+    "missing_plugins": "identity",
     "planned": "identity",
     "scene_identity": "identity",
     "store_spec": "identity",
-    "verify": "checking",
+    "verify": "identity",
 }
 __all__ = [*_HOMES]
 
