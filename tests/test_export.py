@@ -22,11 +22,11 @@ from vbnfault import cli
 from vbnfault import store as st
 from vbnfault.core import registry
 from vbnfault.core.errors import InputError, VbnfaultError
+from vbnfault.core.whole_files import replacing
 from vbnfault.output.export import Entry, Format, export_store, formats
 from vbnfault.output.export.folder import Folder
 from vbnfault.output.export.formats import coco
 from vbnfault.output.export.regions import coco_text, flare_discs, polygon, regions, whole
-from vbnfault.store import disk
 
 NAMES = ("coco", "exr", "huggingface", "png", "webdataset", "yolo")
 SAMPLES = 6
@@ -497,8 +497,8 @@ def test_a_file_that_cannot_be_streamed_leaves_the_old_one(tmp_path: Path) -> No
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     (tmp_path / "a.tar").write_bytes(b"old")
-    with pytest.raises(OSError, match="No space left"):
-        disk.write_with(tmp_path / "a.tar", failing)
+    with pytest.raises(OSError, match="No space left"), replacing(tmp_path / "a.tar") as temporary:
+        failing(temporary)
     assert tree(tmp_path) == {"a.tar": hashlib.sha256(b"old").hexdigest()}
 
 

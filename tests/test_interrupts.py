@@ -19,8 +19,8 @@ from test_cli import run
 from vbnfault import store
 from vbnfault.core import interrupts, resources
 from vbnfault.core.errors import InputError
+from vbnfault.core.interrupts import Interrupted
 from vbnfault.core.quantities import Sample
-from vbnfault.dataset.errors import Interrupted
 
 SENTENCE = "vbnfault: interrupted; the files written so far stay, and the same command continues the work\n"
 NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)

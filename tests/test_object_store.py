@@ -337,9 +337,9 @@ def test_stores_in_buckets_and_on_disks_are_merged(tmp_path: Path, built: str, u
 
 
 def test_commands_take_urls(tmp_path: Path, built: str, digest: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vbnfault.dataset.checking.planned", lambda *_: None)
-    monkeypatch.setattr("vbnfault.dataset.checking.check_described", lambda _: None)
-    monkeypatch.setattr("vbnfault.dataset.checking.is_exact", lambda *_: False)
+    monkeypatch.setattr("vbnfault.dataset.identity.planned", lambda *_: None)
+    monkeypatch.setattr("vbnfault.dataset.identity.check_described", lambda _: None)
+    monkeypatch.setattr("vbnfault.dataset.identity.is_exact", lambda *_: False)
     monkeypatch.setattr("vbnfault.dataset.missing_plugins", lambda _: [])
 
     def call(*words: str) -> str:

@@ -321,14 +321,15 @@ def test_a_killed_retake_resumes_to_the_same_digest(
 
 
 def test_of_half_a_store_the_finished_samples_are_taken(
-    source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    source: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
+    caplog.set_level("INFO", "vbnfault")
     half = store.open_store(shutil.copytree(source, tmp_path / "half.zarr"), "r+")
     half._write_done(0, {1, 2})
     scene = scene_with()
     new = tmp_path / "new.zarr"
     assert retake(half.path, scene, new).samples == 6
-    assert "half.zarr: 6 of 8 samples are taken, those that were finished" in capsys.readouterr().err
+    assert "half.zarr: 6 of 8 samples are taken, those that were finished" in caplog.text
     assert vbnfault.verify(new).problems == []
     assert store.open_store(new).attributes["retake"]["samples"] == [[1, 2], [4, 7]]
     assert plan_numbers(store.open_store(new).attributes).tolist() == [1, 2, 4, 5, 6, 7]

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vbnfault import render
+from vbnfault import render, store
 from vbnfault.core.errors import InputError
 from vbnfault.dataset import retake
 from vbnfault.pipeline import retaken
@@ -192,7 +192,6 @@ def test_a_lens_must_have_the_scale_and_the_guard_band_of_the_store(
 
 @pytest.mark.parametrize("key", retake._OPTICS)
 def test_any_other_optics_make_another_aperture(finished_store: Any, key: str) -> None:
-    from vbnfault import store
 
     opened = store.open_store(finished_store)
     attributes = {**opened.attributes, "scene": {"camera": {"lens": "a", "f_number": 4.0}}}
@@ -268,11 +267,10 @@ def test_each_stored_sample_is_taken_as_often_as_the_variants_say(
     ],
 )
 def test_numbers_of_samples_are_written_as_ranges(numbers: list[int], ranges: list[list[int]]) -> None:
-    assert retake._ranges(np.array(numbers)) == ranges
+    assert store.runs(numbers) == ranges
 
 
 def test_the_checksum_of_the_old_store_is_that_of_the_samples_taken(finished_store: Any) -> None:
-    from vbnfault import store
 
     opened = store.open_store(finished_store)  # shards of 4 samples
     chosen = ([0, 1, 5], [0, 1, 6], [0, 5], [0, 1, 5, 9])
@@ -302,8 +300,9 @@ def test_the_radiance_before_the_lens_and_without_stars_is_used(
 
 @pytest.mark.parametrize(("overwrite", "taken"), [(False, [1, 2]), (True, [0, 1, 2, 3])])
 def test_a_store_that_has_begun_keeps_its_samples_unless_it_is_replaced(
-    overwrite: bool, taken: list[int], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    overwrite: bool, taken: list[int], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
+    caplog.set_level("INFO", "vbnfault")
     finished: Any = SimpleNamespace(
         begun=lambda: [0],
         done=lambda _: dict.fromkeys(range(4), True),
@@ -316,5 +315,5 @@ def test_a_store_that_has_begun_keeps_its_samples_unless_it_is_replaced(
     monkeypatch.setattr(retake.store, "open_store", lambda _: begun)
     options: Any = SimpleNamespace(overwrite=overwrite)
     assert retake._samples(finished, Path("new.zarr"), options).tolist() == taken
-    noted = "note: s.zarr: 2 of 4 samples are taken, those that were finished\n"
-    assert capsys.readouterr().err == ("" if overwrite else noted)
+    noted = ["s.zarr: 2 of 4 samples are taken, those that were finished"]
+    assert caplog.messages == ([] if overwrite else noted)

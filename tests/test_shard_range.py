@@ -112,12 +112,13 @@ def test_ranges_without_locks_of_the_file_system(
     out = tmp_path / "s.zarr"
 
     def others() -> None:
-        with pytest.raises(VbnfaultError, match=r"shards 0:2 of it .*\.owner if it has ended"):
+        with pytest.raises(VbnfaultError, match=r"shards 0:2 of it .*\.json if it has ended"):
             run(out, shard_range=range(1, 3))
         run(out, shard_range=range(2, SHARDS))
 
     killed = {"host": platform.node(), "pid": 1, "started": 0}
-    (tmp_path / ".s.zarr.shards-0-4.owner").write_text(json.dumps(killed))
+    (tmp_path / ".s.zarr.claims").mkdir()
+    (tmp_path / f".s.zarr.claims/shards-0-4.{'0' * 32}.json").write_text(json.dumps(killed))
     run(out, Guest(others), shard_range=range(2))
     assert [p.name for p in tmp_path.iterdir()] == ["s.zarr"]
     assert st.digest(out) == st.digest(whole)

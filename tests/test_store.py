@@ -302,7 +302,7 @@ def test_paths_that_hold_no_store_are_one_sentence(tmp_path: Path, whole: st.Sto
         (st.FORMAT_VERSION + 1, f"reads up to {st.FORMAT_VERSION}; install a newer one$"),
         (
             2,
-            "earlier vbnfault made it, and this one reads 3; open it with xarray, complete it with vbnfault 0.1, or",
+            "earlier vbnfault made it, and this one reads 3; open it with xarray, complete it with vbnfault 0.1",
         ),
         (0, "is no vbnfault store"),
         ("2", "is no vbnfault store"),

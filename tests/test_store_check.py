@@ -6,7 +6,6 @@ import json
 import re
 import shutil
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +15,7 @@ from synthetic import FAULTS, fake_sample, filled, flip, repaired
 from vbnfault import store as st
 from vbnfault.core.errors import InputError, VbnfaultError
 from vbnfault.core.quantities import Sample
-from vbnfault.store import check, codec
+from vbnfault.store import codec
 from vbnfault.store.attributes import check_attributes
 
 # --- damage ---------------------------------------------------------------------------------------------------
@@ -172,13 +171,11 @@ def test_pictures_and_effects_that_contradict_the_labels_are_found(whole: st.Sto
 
 def test_one_pass_gives_problems_digest_and_counts(whole: st.Store, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each chunk is decompressed once, for checksums, labels and digest together."""
-    decoded: list[int] = []
-    compressor = check.compressor
-
-    def counted(name: str) -> SimpleNamespace:
-        return SimpleNamespace(decode=lambda *data: (decoded.append(1), compressor(name).decode(*data))[1])
-
-    monkeypatch.setattr(check, "compressor", counted)
+    decoded: list[str] = []
+    real = st.Store.decoded
+    monkeypatch.setattr(
+        st.Store, "decoded", lambda store, name, chunk: (decoded.append(name), real(store, name, chunk))[1]
+    )
     commanded = np.array([fake_sample(whole.spec, i).scalars["injected"] for i in range(10)])
     realised = commanded.sum(axis=0)
     i, off = (int(n[0]) for n in np.nonzero(~commanded))

@@ -59,8 +59,8 @@ def test_unfinished_and_damaged_samples_are_not_copied(plain: st.Store, tmp_path
     st.append_samples(plain.path, 4)
     chunk = plain.chunk("image", 0)[0]  # sound in itself, but of another sample
     shard = codec.join_shard({0: chunk, 1: chunk}, plain.spec.shard_samples)
+    plain.file("image", 0).write_bytes(shard)
     with pytest.raises(VbnfaultError, match="sample 1: image in image/c/0/0/0/0 does not match its stored crc32c"):
-        plain.file("image", 0).write_bytes(shard)
         dataset.migrate_store(plain.path, tmp_path / "new.zarr", progress=False)
     assert "samples 1-3" in st.verify(tmp_path / "new.zarr")[0]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import logging
 import os
 import subprocess
 import sys
@@ -17,6 +18,22 @@ from test_cli import run
 
 from vbnfault import store
 from vbnfault.core import streams
+
+
+def test_the_library_warns_in_sentences_each_of_them_once(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    logger = logging.getLogger("vbnfault")
+    for name, value in (("handlers", []), ("level", logger.level)):
+        monkeypatch.setattr(logger, name, value)
+    monkeypatch.setattr(streams.warnings, "showwarning", None)
+    streams.warn_in_sentences()
+    for _ in range(2):
+        logger.warning("the root of s.zarr is damaged")
+        logger.info("2 of 4 samples are taken")
+    said = ["warning: the root of s.zarr is damaged", "note: 2 of 4 samples are taken"]
+    assert capsys.readouterr().err.splitlines() == said
+
 
 # arguments with which a command prints: its result, a table, a progress bar beside it, files, a sheet
 COMMANDS = {
@@ -60,9 +77,9 @@ def full() -> Iterator[TextIO]:
 @pytest.fixture(autouse=True)
 def plan_of_made_up_samples(monkeypatch: pytest.MonkeyPatch) -> None:
     """Their scene is none that could be planned."""
-    monkeypatch.setattr("vbnfault.dataset.checking.planned", lambda *_: None)
-    monkeypatch.setattr("vbnfault.dataset.checking.check_described", lambda _: None)
-    monkeypatch.setattr("vbnfault.dataset.checking.is_exact", lambda *_: False)
+    monkeypatch.setattr("vbnfault.dataset.identity.planned", lambda *_: None)
+    monkeypatch.setattr("vbnfault.dataset.identity.check_described", lambda _: None)
+    monkeypatch.setattr("vbnfault.dataset.identity.is_exact", lambda *_: False)
 
 
 @pytest.mark.parametrize("name", COMMANDS)

@@ -20,8 +20,8 @@ import xarray
 
 import vbnfault
 from vbnfault.core.errors import InputError, VbnfaultError
+from vbnfault.core.interrupts import Interrupted
 from vbnfault.dataset import BuildOptions
-from vbnfault.dataset.errors import Interrupted
 from vbnfault.study import indices, results, run
 from vbnfault.study.designs import make_design
 from vbnfault.study.spec import DUMMY, Evaluation, StudySpec, parse_study

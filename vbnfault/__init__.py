@@ -79,47 +79,7 @@ _HOMES = {
     "verify": "dataset",
 }
 
-__all__ = [
-    "BuildOptions",
-    "DiscReflectance",
-    "Effect",
-    "Exposure",
-    "Fault",
-    "FaultContext",
-    "Flare",
-    "InputError",
-    "Interval",
-    "Prescription",
-    "Reflectance",
-    "Scene",
-    "Sensor",
-    "Session",
-    "VbnfaultError",
-    "__version__",
-    "bounds",
-    "build",
-    "choice",
-    "export",
-    "flag",
-    "load_lens",
-    "load_scene",
-    "load_sensor",
-    "merge",
-    "navigation",
-    "number",
-    "open_dataset",
-    "path",
-    "report",
-    "retake",
-    "rows",
-    "simulate",
-    "statistics",
-    "study",
-    "text",
-    "torch",
-    "trace_flare",
-    "verify",
-]
+__all__ = sorted([*_HOMES, "__version__"])
 
 
 if not TYPE_CHECKING:  # a type checker that saw the function would accept every misspelled name

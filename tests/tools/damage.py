@@ -35,6 +35,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 import trimesh
 import zarr
 
@@ -47,6 +48,7 @@ from vbnfault.body import Body, choose_sites
 from vbnfault.body import patch as cache
 from vbnfault.body.patch import build_patch
 from vbnfault.body.spec import PatchSpec
+from vbnfault.core import whole_files
 from vbnfault.core.errors import VbnfaultError
 from vbnfault.core.quantities import Sample
 from vbnfault.dataset import build as bd
@@ -338,12 +340,16 @@ def _prepare(command: Callable[[Path], None], folder: Path) -> Path:
 
 
 def _with(system: FailingSystem, command: Callable[[Path], None], path: Path) -> None:
-    """Run a command while `system` replaces `os` in `store.disk`."""
-    disk.os = system  # type: ignore[assignment]
-    try:
+    """Run a command while `system` replaces `os` in what writes the files of stores."""
+    with pytest.MonkeyPatch.context() as patch:
+        replace_system(patch, system)
         command(path)
-    finally:
-        disk.os = os
+
+
+def replace_system(patch: pytest.MonkeyPatch, system: FailingSystem) -> None:
+    """Have what writes the files of stores use a `FailingSystem`."""
+    for module in (disk, whole_files):
+        patch.setattr(module, "os", system)
 
 
 def operations(command: Callable[[Path], None], folder: Path) -> int:

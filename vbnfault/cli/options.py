@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
+from ..core.environment import MOST_SAMPLES, MOST_THREADS
 from ..core.errors import InputError, shown
 from ..core.path_checks import real
 from ..core.whole_files import unwritable
@@ -23,8 +24,7 @@ from ..core.whole_files import unwritable
 if TYPE_CHECKING:
     from ..scene.config import Scene
 
-MOST_SAMPLES = 10_000_000
-MOST_PROCESSES = 1024
+MOST_PROCESSES = MOST_THREADS
 MOST_SEED = 2**63 - 1
 
 _A_SCENE = "Path of a scene file, or name of a packaged scene."

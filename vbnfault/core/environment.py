@@ -11,8 +11,9 @@ from pathlib import Path
 from .errors import InputError, shown
 from .resources import PACKAGE
 
-# The most threads or processes that a variable, an option or a call may ask for: more than any machine has.
+# The most threads or processes that an environment variable or option may ask for: more than any machine has.
 MOST_THREADS = 1024
+MOST_SAMPLES = 10_000_000  # of a dataset
 _M_ARENA_MAX, _ARENAS = -8, 2  # option of `mallopt` in the GNU C library, and its value
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import logging
 import os
 import signal
 import sys
@@ -46,8 +47,27 @@ def steady() -> Iterator[None]:
 
 
 def warn_in_sentences() -> None:
-    """Have this process print a warning as one sentence on standard error, without the line of code that warns."""
+    """Have this process print warnings as sentences on standard error, without the line of code that warns.
+
+    The library logs to `vbnfault`; other libraries use `warnings`.
+    """
+    logger = logging.getLogger("vbnfault")
+    logger.handlers[:], logger.level = [_Sentences()], logging.INFO
     warnings.showwarning = lambda message, *_, **__: print(f"warning: {message}", file=sys.stderr, flush=True)
+
+
+class _Sentences(logging.Handler):
+    """Print each record of a logger once, as a warning or as a note."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._said: set[str] = set()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        text = f"{'warning' if record.levelno >= logging.WARNING else 'note'}: {record.getMessage()}"
+        if text not in self._said:
+            self._said.add(text)
+            print(text, file=sys.stderr, flush=True)
 
 
 def is_unread(stop: BaseException) -> bool:

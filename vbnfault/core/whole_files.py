@@ -68,6 +68,7 @@ def write_whole(path: Path, content: str | bytes) -> None:
 class replacing:
     """Write a file or folder under a temporary name beside it, and rename it at the end of a `with` block.
 
+    A file is flushed to the device before: it is the old or the complete new one, also after a loss of power.
     A link of this name is replaced, not what it names; a folder is replaced by a folder only.
     """
 
@@ -83,10 +84,42 @@ class replacing:
             if kind is None:
                 if self._temporary.is_dir():
                     remove(self._path)
-                os.replace(self._temporary, self._path)
+                else:
+                    _flush_at(self._temporary, os.O_RDWR | getattr(os, "O_BINARY", 0))
+                rename(self._temporary, self._path)
         finally:
             with contextlib.suppress(OSError):  # the first error counts
                 remove(self._temporary)
+
+
+def rename(source: Path, target: Path) -> None:
+    """Rename a file or folder within one parent folder, durably."""
+    os.replace(source, target)
+    flush_folder(target.parent)
+
+
+def flush_folder(folder: Path) -> None:
+    """Flush the entries of a folder to the device: files made, renamed or removed in it."""
+    if os.name != "nt":  # Windows cannot open folders
+        _flush_at(folder, os.O_RDONLY)
+
+
+def _flush_at(path: Path, flags: int) -> None:
+    """Flush a file or folder to the device."""
+    handle = os.open(path, flags)
+    try:
+        flush(handle)
+    finally:
+        os.close(handle)
+
+
+def flush(handle: int) -> None:
+    """Flush an open file or folder to the device; ignore file systems that cannot."""
+    try:
+        os.fsync(handle)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP):
+            raise
 
 
 def remove(path: Path) -> None:

@@ -14,25 +14,9 @@ from ..core.lazy_names import load_name
 
 if TYPE_CHECKING:
     from .build import BuildOptions
-    from .checking import missing_plugins, verify
     from .from_scene import SessionFactory, build_scene, describe_scene
-    from .identity import is_exact, planned, scene_identity, store_spec
+    from .identity import is_exact, missing_plugins, planned, scene_identity, store_spec, verify
     from .merge import merge_stores, migrate_store
-
-__all__ = [
-    "BuildOptions",
-    "SessionFactory",
-    "build_scene",
-    "describe_scene",
-    "is_exact",
-    "merge_stores",
-    "migrate_store",
-    "missing_plugins",
-    "planned",
-    "scene_identity",
-    "store_spec",
-    "verify",
-]
 
 # public name → the module that defines it; it is loaded when the name is first used
 _HOMES = {
@@ -43,12 +27,13 @@ _HOMES = {
     "is_exact": "identity",
     "merge_stores": "merge",
     "migrate_store": "merge",
-    "missing_plugins": "checking",
+    "missing_plugins": "identity",
     "planned": "identity",
     "scene_identity": "identity",
     "store_spec": "identity",
-    "verify": "checking",
+    "verify": "identity",
 }
+__all__ = [*_HOMES]
 
 
 if not TYPE_CHECKING:  # a type checker that saw the function would accept every misspelled name

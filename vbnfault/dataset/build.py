@@ -9,29 +9,29 @@ interruptions and repairs.
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import sys
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, InstanceOf, WithJsonSchema
 
 from .. import store as store_module
 from ..core import environment, tables
 from ..core.errors import InputError, VbnfaultError, shown
-from ..core.interrupts import interruptible
+from ..core.interrupts import Interrupted, interruptible
 from ..store import FaultCounts, Location, Planned, Store, StoreSpec, Url, files_of, located
 from .dask import check_scheduler, run_on_dask
-from .errors import BuildFailed, Interrupted
 from .lock import locked, others_at_work, prepared_by_one
 from .processes import Pool
 from .progress import Progress, duration_text, size_text
-from .resume import blocks_of, check_same_scene, planned_blocks, with_versions_noted
-from .tasks import Run, SampleMaker, SampleWorkers, SessionFactory
-from .versions import known
+from .resume import blocks_of, check_same_scene, known_versions, planned_blocks, with_versions_noted
+from .tasks import BuildFailed, Run, SampleMaker, SampleWorkers, SessionFactory
 from .work import run_here
 
 __all__ = [
@@ -48,7 +48,7 @@ __all__ = [
 ]
 
 
-@dataclass(frozen=True, kw_only=True)
+@tables.table_class()
 class BuildOptions:
     """Hold the options of how a build does its work. No option changes a stored value.
 
@@ -81,44 +81,31 @@ class BuildOptions:
         If a value is outside its range, or if two options exclude each other.
     """
 
-    workers: int = 1
-    threads: int | None = None
+    workers: Annotated[int, Field(ge=1, le=environment.MOST_THREADS)] = 1
+    threads: Annotated[int, Field(ge=1, le=environment.MOST_THREADS)] | None = None
     scheduler: str | None = None
     overwrite: bool = False
     accept_versions: bool = False
     dry_run: bool = False
     progress: bool = True
-    shard_range: range | None = None
-    recycle_shards: int = 32
+    shard_range: Annotated[InstanceOf[range], WithJsonSchema({"title": "a range"})] | None = None
+    recycle_shards: Annotated[int, Field(ge=1)] = 32
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "workers", _checked("workers", self.workers))
-        if self.threads is not None:
-            object.__setattr__(self, "threads", _checked("threads", self.threads))
-        if (number := tables.whole(self.recycle_shards)) is None or number < 1:
-            raise InputError(
-                f"recycle_shards = {shown(self.recycle_shards)}: must be at least 1, and a whole number"
-            )
-        for key in ("overwrite", "accept_versions", "dry_run"):
-            if not isinstance(value := getattr(self, key), bool | np.bool_):
-                raise InputError(f"{key} = {shown(value)}: must be True or False")
-        if not isinstance(self.scheduler, str | None):
-            raise InputError(f"scheduler = {shown(self.scheduler)}: must be an address such as tcp://host:8786")
         if self.scheduler is not None and self.workers > 1:
-            raise InputError(
+            raise ValueError(
                 f"--workers {self.workers} and --scheduler {self.scheduler} exclude each other: the cluster has its"
                 " own workers; give one of them"
             )
-        if self.shard_range is not None:
-            part = self.shard_range
-            if not isinstance(part, range) or part.step != 1:
-                raise InputError(f"shard_range = {shown(part)}: must be a range of steps of 1, such as range(0, 4)")
-            if not 0 <= part.start < part.stop:
-                raise InputError(
-                    f"--shard-range {part.start}:{part.stop}: must be A:B, whole numbers with 0 <= A < B"
-                )
-            if self.overwrite:
-                raise InputError("--shard-range and --overwrite exclude each other: delete the store first")
+        part = self.shard_range
+        if part is None:
+            return
+        if part.step != 1:
+            raise ValueError(f"shard_range = {part}: must be a range of steps of 1, such as range(0, 4)")
+        if not 0 <= part.start < part.stop:
+            raise ValueError(f"--shard-range {part.start}:{part.stop}: must be A:B, whole numbers with 0 <= A < B")
+        if self.overwrite:
+            raise ValueError("--shard-range and --overwrite exclude each other: delete the store first")
 
     @classmethod
     def of(cls, options: BuildOptions | None, keywords: Mapping[str, Any]) -> BuildOptions:
@@ -128,7 +115,7 @@ class BuildOptions:
         """
         if not isinstance(options, cls | None):
             raise InputError(f"options = {shown(options)}: must be BuildOptions")
-        return replace(options or cls(), **keywords)
+        return cls(**{**vars(options or cls()), **keywords})
 
     def shards_of(self, count: int) -> range:
         """Return the shards to make of a store of `count` shards. Raises InputError if it has no such shards."""
@@ -139,16 +126,6 @@ class BuildOptions:
                 f"0 <= A < B <= {count}"
             )
         return part
-
-
-def _checked(option: str, value: int) -> int:
-    """Return the value of an option. Raises InputError unless it is a whole number from 1 to `MOST_THREADS`."""
-    number = tables.whole(value)
-    if number is None or number < 1:
-        raise InputError(f"--{option} {shown(value)}: must be at least 1, and a whole number")
-    if number > environment.MOST_THREADS:
-        raise InputError(f"--{option} {shown(value)}: must be at most {environment.MOST_THREADS}")
-    return number
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -416,7 +393,7 @@ def _locked_store(plan: BuildPlan, path: Location, options: BuildOptions, stack:
             return _prepared_store(plan, path, options)
         store = store_module.open_store(path, "r+")
         versions = plan.spec.attributes.get("versions", {})
-        if store.samples < len(plan.site) or versions not in known(store.attributes):
+        if store.samples < len(plan.site) or versions not in known_versions(store.attributes):
             raise VbnfaultError(
                 f"{path}: another command is writing shards of it, so no samples or versions can be added now; "
                 "wait until it ends"
@@ -457,4 +434,4 @@ def _check_room(summary: Summary, spec: StoreSpec) -> None:
     if needed / 2 > free:
         raise VbnfaultError(f"{text}, but only {size_text(free)} are free there; choose another --out")
     if needed > free:
-        print(f"warning: {text}, and {size_text(free)} are free there: it may not fit", file=sys.stderr)
+        logging.getLogger("vbnfault").warning(f"{text}, and {size_text(free)} are free there: it may not fit")

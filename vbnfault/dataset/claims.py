@@ -1,8 +1,9 @@
-"""Lock a store in an object store, where there are no locked files: by objects that say who writes what.
+"""Lock a store where there are no locked files, by files that say who writes what: in an object store, and beside a
+store on a file system without locks (`.NAME.claims`).
 
 A command writes its claim, lists all claims, and goes on if none of another command overlaps. So of two commands
 that begin together, at least one sees the other. The claim is written again every 20 s. A claim counts as that of a
-killed command and is removed if it was not written for two minutes, by the clock of the object store, or if its
+killed command and is removed if it was not written for two minutes, by the clock of what stores it, or if its
 process ran on this host and has ended.
 """
 
@@ -10,6 +11,8 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
+import platform
 import random
 import re
 import threading
@@ -19,11 +22,11 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from ..core.errors import VbnfaultError
-from ..store import OWN, Bucket, Url
-from .owners import has_ended, overlap, still_writing, this_process
+from ..core.whole_files import kind_of as kind_of_error
+from ..core.whole_files import own_folder
+from ..store import OWN, Files, Location, Url, files_of
 
 _MOST_BYTES = 65536  # of a claim
-_FOLDER = f"{OWN}/claims"
 _SECONDS_BETWEEN_BEATS = 20.0
 _SECONDS_OF_A_CLAIM = 120.0
 _SECONDS_BETWEEN_TRIES = 0.2
@@ -31,10 +34,70 @@ _NAME = re.compile(r"(whole|prepare|shards-(\d+)-(\d+))\.([0-9a-f]{32})\.json")
 PREPARE = "prepare"
 
 
-class _Claim(NamedTuple):
-    """Hold a claim of another command: its object, what it is for, and its owner."""
+class Held(VbnfaultError):
+    """Report that another command writes what this one wants to write."""
 
-    name: str
+
+def still_writing(path: Location, owner: dict[str, Any], shards: range | None = None, file: object = None) -> Held:
+    """Return the error for a lock that another command holds.
+
+    `shards`: what it has locked, everything by default. `file`: what may be deleted if the owner has ended.
+    """
+    by = f" (process {owner['pid']} on {owner['host']})" if {"pid", "host"} <= owner.keys() else ""
+    what = "to it" if shards is None else f"shards {shards.start}:{shards.stop} of it"
+    sentence = f"{path}: another command is writing {what}{by}; wait until it ends"
+    return Held(sentence if file is None else f"{sentence}, or delete {file} if it has ended")
+
+
+def overlap(a: range | None, b: range | None) -> bool:
+    """Return whether two commands write to the same shards; None stands for the whole store."""
+    return a is None or b is None or (a.start < b.stop and b.start < a.stop)
+
+
+def this_process() -> dict[str, Any]:
+    """Return host, process number and start time of this process."""
+    import psutil
+
+    return {"host": platform.node(), "pid": os.getpid(), "started": psutil.Process().create_time()}
+
+
+def has_ended(owner: dict[str, Any]) -> bool:
+    """Return whether the owner of a claim was a process of this host that has ended.
+
+    The start time is compared, too: another process may have got the number of the owner.
+    """
+    import psutil
+
+    if owner.get("host") != platform.node() or not isinstance(owner.get("pid"), int):
+        return False
+    try:
+        process = psutil.Process(owner["pid"])
+        same = process.create_time() == owner.get("started")
+    except psutil.NoSuchProcess:
+        return True
+    except psutil.Error:
+        return False
+    return not same or process.status() == psutil.STATUS_ZOMBIE
+
+
+class _Claims(NamedTuple):
+    """Say where the claims on a store are: files, and the beginning of their names."""
+
+    files: Files
+    folder: str
+
+    @classmethod
+    def on(cls, path: Location) -> _Claims:
+        """Return the place of the claims on a store."""
+        if isinstance(path, Url):
+            return cls(files_of(path), f"{OWN}/claims/")
+        return cls(files_of(path.absolute().with_name(f".{path.name}.claims")), "")
+
+
+class _Claim(NamedTuple):
+    """Hold a claim of another command: its file, what it is for, and its owner."""
+
+    file: str
     kind: str
     shards: range | None
     owner: dict[str, Any]
@@ -46,57 +109,59 @@ def kind_of(shards: range | None) -> str:
 
 
 @contextlib.contextmanager
-def claimed(url: Url, shards: range | None) -> Iterator[None]:
-    """Hold a claim on the store at a URL, or on some of its shards, during a `with` block.
+def claimed(path: Location, shards: range | None) -> Iterator[None]:
+    """Hold a claim on a store, or on some of its shards, during a `with` block.
 
-    Raises VbnfaultError if another command writes there, or if the object store refuses.
+    Raises Held if another command writes there, VbnfaultError if a claim cannot be written.
     """
-    bucket = Bucket(url)
-    with _written(bucket, kind_of(shards)) as own:
-        for other in _others(bucket, own):
+    claims = _Claims.on(path)
+    with _written(path, claims, kind_of(shards)) as own:
+        for other in _others(claims, own):
             if other.kind != PREPARE and overlap(other.shards, shards):
-                raise still_writing(url, other.owner, other.shards, f"{url}/{_FOLDER}/{other.name}")
+                raise still_writing(path, other.owner, other.shards, other.file)
         yield
 
 
 @contextlib.contextmanager
-def prepared(url: Url, seconds: float) -> Iterator[None]:
+def prepared(path: Location, seconds: float) -> Iterator[None]:
     """Let commands pass a `with` block one after the other; wait at most some seconds."""
-    bucket, until = Bucket(url), time.monotonic() + seconds
+    claims, until = _Claims.on(path), time.monotonic() + seconds
     while True:
-        with _written(bucket, PREPARE) as own:
-            before = [other for other in _others(bucket, own) if other.kind == PREPARE]
+        with _written(path, claims, PREPARE) as own:
+            before = [other for other in _others(claims, own) if other.kind == PREPARE]
             if not before:
                 yield
                 return
         if time.monotonic() > until:
-            raise still_writing(url, before[0].owner, None, f"{url}/{_FOLDER}/{before[0].name}")
+            raise still_writing(path, before[0].owner, None, before[0].file)
         time.sleep(_SECONDS_BETWEEN_TRIES * (1 + random.random()))  # so that two do not wait in step
 
 
-def ranges_at_work(url: Url) -> list[range]:
-    """Return the ranges of shards that commands write now, this one's too."""
-    return [other.shards for other in _others(Bucket(url), "") if other.shards is not None]
+def ranges_at_work(path: Location) -> list[range]:
+    """Return the ranges of shards that commands claim now, this one's too."""
+    return [other.shards for other in _others(_Claims.on(path), "") if other.shards is not None]
 
 
 @contextlib.contextmanager
-def _written(bucket: Bucket, kind: str) -> Iterator[str]:
-    """Keep a claim written during a `with` block, and give its name."""
-    name = f"{kind}.{uuid.uuid4().hex}.json"
-    file, content = f"{_FOLDER}/{name}", json.dumps(this_process()).encode()
+def _written(path: Location, claims: _Claims, kind: str) -> Iterator[str]:
+    """Keep a claim on a store written during a `with` block, and give its name."""
+    name, files = f"{kind}.{uuid.uuid4().hex}.json", claims.files
+    file, content = f"{claims.folder}{name}", json.dumps(this_process()).encode()
     ended = threading.Event()
 
     def beat() -> None:
         while not ended.wait(_SECONDS_BETWEEN_BEATS):
             with contextlib.suppress(OSError, VbnfaultError):
-                bucket.write([(file, content)])
+                files.write([(file, content)])
 
     try:
-        bucket.write([(file, content)])
+        if not isinstance(files.path, Url):
+            own_folder(files.path)
+        files.write([(file, content)])
     except OSError as error:
-        raise VbnfaultError(
-            f"{bucket.path}: cannot be written: {error.strerror}; nothing is lost, and the same command resumes "
-            "once that is mended"
+        raise (VbnfaultError if isinstance(path, Url) else kind_of_error(error))(
+            f"{path}: cannot be written: {error.strerror}; nothing is lost, and the same command resumes once that "
+            "is mended"
         ) from error
     thread = threading.Thread(target=beat, daemon=True)
     thread.start()
@@ -106,12 +171,14 @@ def _written(bucket: Bucket, kind: str) -> Iterator[str]:
         ended.set()
         thread.join()
         with contextlib.suppress(OSError, VbnfaultError):  # otherwise the claim ends by itself
-            bucket.remove([file])
+            files.remove([file])
+            if not isinstance(files.path, Url):
+                files.path.rmdir()  # the last one
 
 
-def _others(bucket: Bucket, own: str) -> list[_Claim]:
+def _others(claims: _Claims, own: str) -> list[_Claim]:
     """Return the claims of other commands at work, and remove those of killed ones."""
-    written = bucket.modified(_FOLDER)
+    written = claims.files.modified(claims.folder)
     now = written.get(own) or max(written.values(), default=None)
     others = []
     for name, moment in sorted(written.items()):
@@ -119,7 +186,7 @@ def _others(bucket: Bucket, own: str) -> list[_Claim]:
         if match is None or name == own:
             continue
         try:
-            owner = json.loads(bucket.read(f"{_FOLDER}/{name}", _MOST_BYTES))
+            owner = json.loads(claims.files.read(f"{claims.folder}{name}", _MOST_BYTES))
         except FileNotFoundError:  # it has just ended
             continue
         except (OSError, ValueError):
@@ -127,8 +194,8 @@ def _others(bucket: Bucket, own: str) -> list[_Claim]:
         too_old = now is not None and (now - moment).total_seconds() > _SECONDS_OF_A_CLAIM
         if too_old or has_ended(owner):
             with contextlib.suppress(OSError):
-                bucket.remove([f"{_FOLDER}/{name}"])
+                claims.files.remove([f"{claims.folder}{name}"])
             continue
         shards = range(int(match[2]), int(match[3])) if match[2] else None
-        others.append(_Claim(name, match[1].split("-")[0], shards, owner))
+        others.append(_Claim(f"{claims.files.path}/{claims.folder}{name}", match[1].split("-")[0], shards, owner))
     return others

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 import os
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .. import pipeline, store
 from ..core import environment, file_contents, llvm, tables
@@ -19,8 +20,6 @@ from ..scene.config import Scene
 from ..scene.trajectory import with_rows
 from . import build, card, describe
 from .identity import is_exact, planned, store_spec
-
-_MOST_SAMPLES = 10_000_000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,22 +36,32 @@ class SessionFactory:
     contents: file_contents.Contents = dataclasses.field(default_factory=file_contents.Contents)
 
     def __call__(self) -> build.SampleMaker:
-        threads = self.threads or environment.whole_number("VBNFAULT_THREADS", environment.MOST_THREADS) or None
         with self.contents.in_use():
-            return _CheckedSession(pipeline.Session(self.scene, blocks=self.blocks, threads=threads), self.contents)
+            session = pipeline.Session(self.scene, blocks=self.blocks, threads=render_threads(self.threads))
+        return CheckedSession(session, self.contents)
+
+
+def render_threads(threads: int | None) -> int | None:
+    """Return the number of render threads of a worker; None for those of the renderer."""
+    return threads or environment.whole_number("VBNFAULT_THREADS", environment.MOST_THREADS) or None
 
 
 @dataclasses.dataclass(frozen=True)
-class _CheckedSession:
-    """Make samples as a session does, but fail if an input file changed after the build was planned."""
+class CheckedSession:
+    """Make samples as a session does, but fail if an input file changed after the build was planned.
 
-    session: pipeline.Session
+    `numbers`: the number in the session's plan of each sample of the store; by default its index.
+    """
+
+    session: build.SampleMaker
     contents: file_contents.Contents
+    numbers: NDArray[np.int64] | None = None
 
     def simulate(self, index: int) -> Sample:
         """Return a sample. Raises InputChanged if an input file has changed."""
+        number = index if self.numbers is None else int(self.numbers[index])
         with self.contents.in_use():
-            return self.session.simulate(index)
+            return dataclasses.replace(self.session.simulate(number), index=index)
 
 
 def estimated_seconds(session: pipeline.Session) -> float:
@@ -161,7 +170,7 @@ def _prepared(
     contents.complete()
     if not options.dry_run:
         for sentence in plan.shortcomings(scene, session.plan):
-            print(f"warning: {sentence}", file=sys.stderr)
+            logging.getLogger("vbnfault").warning(sentence)
     build_plan = build.BuildPlan(
         spec=spec,
         site=session.plan.site,
@@ -184,8 +193,8 @@ def _with_samples(scene: Scene, samples: int | None) -> Scene:
     if samples is None:
         return scene
     number = tables.whole(samples)
-    if number is None or not 1 <= number <= _MOST_SAMPLES:
-        raise InputError(f"--samples {shown(samples)}: must be a whole number from 1 to {_MOST_SAMPLES}")
+    if number is None or not 1 <= number <= environment.MOST_SAMPLES:
+        raise InputError(f"--samples {shown(samples)}: must be a whole number from 1 to {environment.MOST_SAMPLES}")
     return scene.model_copy(update={"dataset": scene.dataset.model_copy(update={"samples": number})})
 
 

@@ -2,14 +2,16 @@
 
 `store_spec` returns the spec of the store, which includes the root attributes. `scene_identity` returns the part of
 the root attributes that identifies the scene. `planned` computes the scalars of each sample that the plan sets; it
-reads the root attributes of an existing store.
+reads the root attributes of an existing store. `verify` compares a store with all of this.
 """
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import importlib.metadata
+import operator
 import platform
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -23,7 +25,7 @@ from ..camera import Camera
 from ..core import file_contents, llvm, resources, user_files
 from ..core.errors import InputError, VbnfaultError, in_file
 from ..detector import Detector
-from ..faults import Fault, belongs_here, is_packaged, plugins_of, registry
+from ..faults import Fault, belongs_here, is_packaged, loaded_plugin, plugins_of, registry
 from ..lens import load_lens
 from ..pipeline import masks
 from ..pipeline.record import proposal
@@ -44,6 +46,24 @@ _LIBRARIES = ("mitsuba", "drjit", "numpy", "scipy", "trimesh", "scikit-image", "
 # [first, last] of the other's plan that it holds; `repeats`, how often it holds each; `source`, what identifies the
 # other store and its plan.
 RETAKE = "retake"
+# Keys that came after version 0.1 of the store: a scene that has their defaults has the identity of before.
+_LEFT_OUT_AT_DEFAULT = (
+    "body.atmosphere",
+    "body.albedo_map.projection",
+    "body.sharpen",
+    "body.volume_km3",
+    "coma",
+    "camera.point_spread",
+    "camera.exposure_stops",
+    "dataset.variants_per_view",
+    "dataset.radiance_dtype",
+    "patch.fractured",
+    "patch.facet_px",
+    "plan.order",
+    "plan.unusable_views",
+    "sky.bodies",
+    "trajectory",
+)
 _OPENCV = ("opencv-python-headless", "opencv-python")
 
 
@@ -97,41 +117,17 @@ def _identity(session: pipeline.Session) -> dict[str, Any]:
 
 def _leave_out_unused(identity: dict[str, Any], scene: Scene) -> None:
     """Delete what a scene does not use, and keys at their defaults, so that earlier stores keep their identity."""
-    if scene.body.atmosphere is None:
-        del identity["body"]["atmosphere"]
-    if (albedo_map := scene.body.albedo_map) and albedo_map.projection == "equirectangular":
-        del identity["body"]["albedo_map"]["projection"]
-    if scene.body.sharpen == 0:
-        del identity["body"]["sharpen"]
-    if scene.body.volume_km3 is None:
-        del identity["body"]["volume_km3"]
-    if scene.coma is None:
-        del identity["coma"]
-    if scene.camera.point_spread is None:
-        del identity["camera"]["point_spread"]
-    elif not scene.camera.point_spread.wing_fraction:
+    for key in _LEFT_OUT_AT_DEFAULT:
+        *tables, name = key.split(".")
+        holder: Any = functools.reduce(getattr, tables, scene)
+        if holder is not None and getattr(holder, name) == type(holder).model_fields[name].default:
+            del functools.reduce(operator.getitem, tables, identity)[name]
+    if (spread := scene.camera.point_spread) and not spread.wing_fraction:
         for key in ("wing_fraction", "wing_urad", "wing_index"):
             del identity["camera"]["point_spread"][key]
-    if scene.patch.fractured is None:
-        del identity["patch"]["fractured"]
-    if not scene.sky.bodies:
-        del identity["sky"]["bodies"]
-    if scene.trajectory is None:
-        del identity["trajectory"]
     if not scene.is_aimed:
         for key in OF_AN_AIM:
             del identity["geometry"][key]
-    for table, key in (
-        ("dataset", "variants_per_view"),
-        ("dataset", "radiance_dtype"),
-        ("camera", "exposure_stops"),
-        ("patch", "facet_px"),
-        ("plan", "order"),
-        ("plan", "unusable_views"),
-    ):
-        values = getattr(scene, table)
-        if getattr(values, key) == type(values).model_fields[key].default:
-            del identity[table][key]
 
 
 def _identify_plugins(identity: dict[str, Any], session: pipeline.Session) -> None:
@@ -462,3 +458,52 @@ def planned(attributes: Mapping[str, Any], faults: Sequence[str]) -> Callable[[i
         }
 
     return expected
+
+
+def missing_plugins(attributes: Mapping[str, Any]) -> list[str]:
+    """Return a sentence for each plug-in of a store that is not installed, or not with the same source."""
+    sentences = []
+    for name, stored in attributes.get("scene", {}).get("plugins", {}).items():
+        plugin = loaded_plugin(name)
+        sha256 = str(stored.get("sha256", "unknown"))
+        if plugin is None or plugin.sha256 != sha256:
+            state = "not loaded" if plugin is None else "loaded in another version"
+            sentences.append(
+                f"the scene uses the plug-in {name} (sha256 {sha256[:12]}"
+                + "".join(f", {model}" for model in stored.get("models", ()))
+                + f"), which is {state} here; the check does not need it"
+            )
+    return sentences
+
+
+def verify(path: str | Path | store.Store, progress: Callable[[int], None] | None = None) -> store.Report:
+    """Return what is wrong with a store, how its faults are counted, and its digest.
+
+    Parameters
+    ----------
+    path
+        Path of the store, or the open store.
+    progress
+        Called with the number of samples that were checked since its last call.
+
+    Returns
+    -------
+    store.Report
+        `problems` is empty if every sample is whole, labelled and as planned.
+
+    Raises
+    ------
+    InputError
+        If there is no store at `path`, or one of another format.
+    """
+    opened = store.open_store(path)
+    attributes = opened.spec.attributes
+    check_described(opened)
+    with in_file(str(opened.path)):
+        expected = planned(attributes, opened.spec.faults)
+    return store.examine(
+        opened,
+        expected=expected,
+        exact=is_exact(attributes),
+        progress=progress,
+    )

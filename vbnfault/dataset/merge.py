@@ -21,10 +21,10 @@ from ..core.errors import InputError, VbnfaultError, shown
 from ..core.interrupts import check, finishing, interruptible
 from ..core.path_checks import real
 from ..store import Location, SampleDigests, Store, StoreSpec, Url, located, spans
-from . import card, versions
+from . import card
 from .lock import locked
 from .progress import Progress
-from .resume import check_same_dataset
+from .resume import VERSIONS_OF_SAMPLES, check_same_dataset, joined_versions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -186,7 +186,7 @@ class _Merge:
         self.sources, self._move = sources, move
         if not exists:
             first = sources[0].spec
-            attributes = {k: v for k, v in first.attributes.items() if k != versions.VERSIONS_OF_SAMPLES}
+            attributes = {k: v for k, v in first.attributes.items() if k != VERSIONS_OF_SAMPLES}
             spec = StoreSpec(
                 **{**first.plain(), **({} if codecs is None else {"codecs": codecs})}, attributes=attributes
             )
@@ -207,10 +207,10 @@ class _Merge:
             new = {i for number in source.begun() for i, done in source.done(number).items() if done} - held
             held |= new
             taken.append((source.attributes, new))
-        joined = versions.joined(store.attributes, taken)
-        if joined == store.attributes.get(versions.VERSIONS_OF_SAMPLES, []):
+        joined = joined_versions(store.attributes, taken)
+        if joined == store.attributes.get(VERSIONS_OF_SAMPLES, []):
             return store
-        store.update_attributes({versions.VERSIONS_OF_SAMPLES: joined})
+        store.update_attributes({VERSIONS_OF_SAMPLES: joined})
         return store_module.open_store(store.path, "r+")
 
     def run(self, bar: Progress) -> MergeSummary:

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from .. import store as store_module
 from ..core import tables
 from ..core.errors import InputError, shown
 from ..store import Planned, Store, StoreSpec, Url
-from . import versions
+
+# Root attribute: a list of tables, each with `versions` and the `samples` made with them, as ranges [first, last].
+# All other samples were made with the versions in the root attribute `versions`.
+VERSIONS_OF_SAMPLES = "versions_of_samples"
 
 
 def planned_blocks(
@@ -55,16 +58,16 @@ def with_versions_noted(store: Store, spec: StoreSpec, expected: Planned | None,
     This happens before any of them is made, so that the record is right after an interruption, too.
     """
     now = spec.attributes.get("versions", {})
-    if versions.known(store.attributes) == [now]:
+    if known_versions(store.attributes) == [now]:
         return store
     wanted = set(store_module.problem_samples(store))
     if expected is not None:
         shards = range(store.shards)
         wanted |= {i for n in shards for i in store_module.unplanned_samples(store, n, expected, exact=exact)}
-    made = versions.made_now(store.attributes, now, wanted)
-    if made == store.attributes.get(versions.VERSIONS_OF_SAMPLES, []):
+    made = versions_made_now(store.attributes, now, wanted)
+    if made == store.attributes.get(VERSIONS_OF_SAMPLES, []):
         return store
-    store.update_attributes({versions.VERSIONS_OF_SAMPLES: made})
+    store.update_attributes({VERSIONS_OF_SAMPLES: made})
     return store_module.open_store(store.path, "r+")
 
 
@@ -77,8 +80,8 @@ def check_same_scene(
     """
     differing = list(differences(_compared(store.spec), _compared(spec)))
     if differing and all(d.key.startswith("versions.") for d in differing):
-        if not accept_versions and spec.attributes.get("versions") not in versions.known(store.attributes):
-            changed = versions.differences(store.attributes, spec.attributes)
+        if not accept_versions and spec.attributes.get("versions") not in known_versions(store.attributes):
+            changed = version_differences(store.attributes, spec.attributes)
             raise InputError(
                 f"{store.path}: was made with other versions: {changed}; "
                 "--accept-versions completes it with those of now and notes which samples they made, or choose "
@@ -128,7 +131,7 @@ def _named(differing: list[Difference], *holders: str) -> str:
 
 _NOT_COMPARED = {
     "blocks",
-    versions.VERSIONS_OF_SAMPLES,
+    VERSIONS_OF_SAMPLES,
     "shard_samples",
     "format",
     "format_version",
@@ -215,3 +218,73 @@ def _has_parts(values: list[Any]) -> bool:
 def _sum_text(values: Sequence[int]) -> str:
     """Return block sizes as text: `8 + 4`."""
     return " + ".join(str(v) for v in values)
+
+
+# --- which versions of the libraries made which samples ---------------------------------------------------------
+
+
+def known_versions(attributes: Mapping[str, Any]) -> list[dict[str, str]]:
+    """Return all sets of versions that made samples of a store, or were accepted for that."""
+    return [attributes.get("versions", {}), *(entry["versions"] for entry in _entries(attributes))]
+
+
+def version_differences(stored: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+    """Return as text which versions differ between two sets of root attributes."""
+    old, new = stored.get("versions", {}), now.get("versions", {})
+    names = [name for name in {**new, **old} if old.get(name) != new.get(name)]
+    return ", ".join(f"{name} {old.get(name, 'absent')} (now {new.get(name, 'absent')})" for name in names)
+
+
+def versions_made_now(
+    attributes: Mapping[str, Any], now: Mapping[str, str], samples: Collection[int]
+) -> list[dict[str, Any]]:
+    """Return the new attribute `versions_of_samples` of a store.
+
+    Parameters
+    ----------
+    attributes
+        Root attributes of the store.
+    now
+        Versions with which `samples` are about to be made.
+    """
+    entries = [(entry["versions"], _samples(entry) - set(samples)) for entry in _entries(attributes)]
+    if now != attributes.get("versions", {}):
+        made = next((made for versions, made in entries if versions == now), None)
+        if made is None:
+            entries.append((dict(now), made := set()))
+        made.update(samples)
+    return [{"versions": versions, "samples": store_module.runs(made)} for versions, made in entries if made]
+
+
+def joined_versions(
+    attributes: Mapping[str, Any], taken: Iterable[tuple[Mapping[str, Any], Collection[int]]]
+) -> list[dict[str, Any]]:
+    """Return the new attribute `versions_of_samples` of a store that takes samples of other stores.
+
+    Parameters
+    ----------
+    attributes
+        Root attributes of the store. Its `versions` are those of the others.
+    taken
+        For each of the others, its root attributes and the samples that are taken.
+    """
+    everything = list(taken)
+    new = {i for _, samples in everything for i in samples}
+    made = [(entry["versions"], _samples(entry) - new) for entry in _entries(attributes)]
+    for others, samples in everything:
+        for entry in _entries(others):
+            of_entry = next((known for versions, known in made if versions == entry["versions"]), None)
+            if of_entry is None:
+                made.append((entry["versions"], of_entry := set()))
+            of_entry.update(_samples(entry) & set(samples))
+    return [{"versions": versions, "samples": store_module.runs(samples)} for versions, samples in made if samples]
+
+
+def _entries(attributes: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return the tables of `versions_of_samples`; none if the attribute is missing."""
+    return list(attributes.get(VERSIONS_OF_SAMPLES, ()))
+
+
+def _samples(entry: Mapping[str, Any]) -> set[int]:
+    """Return the samples in the ranges of a table."""
+    return {i for first, last in entry["samples"] for i in range(first, last + 1)}

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import logging
 import os
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,9 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import pipeline, store
-from ..core import environment, file_contents, llvm
+from ..core import file_contents, llvm
 from ..core.errors import InputError
-from ..core.quantities import Sample
 from ..faults import Fault
 from ..pipeline.rendering import ANGLE_LAYERS
 from ..pipeline.retaken import TRUTH_LAYERS, RetakeSession, StoredView
@@ -30,7 +29,7 @@ from ..scene.retaken_plan import make_retaken_plan
 from ..scene.trajectory import with_rows
 from ..store import Store, StoreSpec
 from . import build
-from .from_scene import with_card
+from .from_scene import CheckedSession, render_threads, with_card
 from .identity import (
     RETAKE,
     blocks_of_plan,
@@ -158,7 +157,7 @@ def _planned(
     _check_same_view(opened, session, source)
     samples = _samples(opened, out, options)
     attributes[RETAKE] = {
-        "samples": _ranges(plan_numbers(opened.attributes)[samples]),
+        "samples": store.runs(plan_numbers(opened.attributes)[samples].tolist()),
         "repeats": repeats,
         "source": {**of_source, "checksums_sha256": _checksums(opened, samples)},
     }
@@ -176,7 +175,7 @@ def _planned(
     table = _retaken_plan(session.scene, attributes, session.faults)
     if not options.dry_run:
         for sentence in plan.shortcomings(scene, table):
-            print(f"warning: {sentence}", file=sys.stderr)
+            logging.getLogger("vbnfault").warning(sentence)
     return build.BuildPlan(
         spec=spec,
         site=table.site[numbers],
@@ -234,17 +233,10 @@ def _samples(opened: Store, out: store.Location, options: build.BuildOptions) ->
         wanted = np.concatenate([np.arange(first, last + 1) for first, last in ranges])
         samples = np.flatnonzero(np.isin(plan_numbers(opened.attributes), wanted))
     if len(samples) < opened.samples:
-        print(
-            f"note: {opened.path}: {len(samples)} of {opened.samples} samples are taken, those that were finished",
-            file=sys.stderr,
+        logging.getLogger("vbnfault").info(
+            f"{opened.path}: {len(samples)} of {opened.samples} samples are taken, those that were finished"
         )
     return samples
-
-
-def _ranges(numbers: NDArray[np.int64]) -> list[list[int]]:
-    """Return ascending numbers as ranges [first, last]."""
-    parts = np.split(numbers, np.flatnonzero(np.diff(numbers) != 1) + 1)
-    return [[int(part[0]), int(part[-1])] for part in parts]
 
 
 # --- what is refused -------------------------------------------------------------------------------------------
@@ -356,35 +348,16 @@ class RetakeFactory:
     contents: file_contents.Contents = dataclasses.field(default_factory=file_contents.Contents)
 
     def __call__(self) -> build.SampleMaker:
-        threads = self.threads or environment.whole_number("VBNFAULT_THREADS", environment.MOST_THREADS) or None
         with self.contents.in_use():
             scene = with_rows(self.scene)
-            return _CheckedRetake(
-                session=RetakeSession(
-                    scene,
-                    _retaken_plan(scene, self.attributes, pipeline.configure_faults(scene)),
-                    blocks_of_plan(self.attributes[RETAKE]["source"]),
-                    _StoredViews(store.open_store(self.path), self.attributes["scene"]["camera"]),
-                    threads=threads,
-                ),
-                numbers=plan_numbers(self.attributes),
-                contents=self.contents,
+            session = RetakeSession(
+                scene,
+                _retaken_plan(scene, self.attributes, pipeline.configure_faults(scene)),
+                blocks_of_plan(self.attributes[RETAKE]["source"]),
+                _StoredViews(store.open_store(self.path), self.attributes["scene"]["camera"]),
+                threads=render_threads(self.threads),
             )
-
-
-@dataclasses.dataclass(frozen=True)
-class _CheckedRetake:
-    """Make the samples of a new store from those of its plan; fail if an input file changed."""
-
-    session: RetakeSession
-    numbers: NDArray[np.int64]
-    contents: file_contents.Contents
-
-    def simulate(self, index: int) -> Sample:
-        """Return a sample. Raises InputChanged if an input file has changed."""
-        with self.contents.in_use():
-            sample = self.session.simulate(int(self.numbers[index]))
-        return dataclasses.replace(sample, index=index)
+        return CheckedSession(session, self.contents, plan_numbers(self.attributes))
 
 
 class _StoredViews:

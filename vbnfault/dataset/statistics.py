@@ -278,7 +278,7 @@ def statistics(path: str | os.PathLike[str] | Store) -> Statistics:
         per_sample.update(injected.sum(axis=1).tolist())
         strata.update(STRATA[k] for k in columns["stratum"].tolist())
         split = columns["split"]
-        counts.add_all(split, None if commanded is None else commanded[samples], injected > 0)
+        counts.add(split, None if commanded is None else commanded[samples], injected > 0)
         samples_of = {of: split == of for of in dict.fromkeys(split.tolist())}
         for of, chosen in samples_of.items():
             sites.setdefault(of, set()).update(columns["site"][chosen].tolist())

@@ -7,7 +7,7 @@ loads the terrain of a site once.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -22,11 +22,21 @@ from ..core.errors import InputChanged, VbnfaultError
 from ..core.interrupts import check, finishing
 from ..core.quantities import Sample
 from ..store import Encoded, Location, Planned, SampleDigests, Store
-from .errors import BuildFailed
 from .progress import Progress
 from .work import Fatal, Lazy, Queue, Tick, describe
 
 _HOPELESS = 32  # after so many failures without one success, the build stops: the others would fail, too
+
+
+class BuildFailed(VbnfaultError):
+    """Report that some samples could not be made.
+
+    `failures`: by sample, one line and the traceback, or a sentence on how its worker ended.
+    """
+
+    def __init__(self, sentence: str, failures: Mapping[int, str] | None = None) -> None:
+        super().__init__(sentence)
+        self.failures = dict(failures or {})
 
 
 class SampleMaker(Protocol):

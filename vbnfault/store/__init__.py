@@ -21,6 +21,7 @@ scalars (everything else). These rules protect a store against kills, power loss
 from .arrays import EFFECT_RULE, LAYERS, MASK_RULES, REQUIRED_LAYERS, SCALARS, SEMANTIC, Array, Member
 from .bucket import OWN, Bucket, Url
 from .check import (
+    FaultCounts,
     Planned,
     Problem,
     Report,
@@ -31,72 +32,16 @@ from .check import (
     examine,
     examine_shard,
     problem_samples,
+    runs,
     spans,
     unplanned_samples,
     verify,
 )
 from .codec import Encoded, SharedChunks, encode, mask_union
-from .counts import FaultCounts
-from .files import Location, files_of, located
-from .group import MOST_DOCUMENT_BYTES, check_free, create, is_store, open_store, write_samples
-from .labelled import open_dataset
+from .files import Files, Location, files_of, located
+from .group import MOST_DOCUMENT_BYTES, check_free, create, is_store, open_dataset, open_store, write_samples
 from .layout import drawn_table, is_sealed, sealed
 from .metadata import append_samples, recover
 from .opened import Store
 from .schema import FORMAT_VERSION, SPLITS, STRATA, VOLATILE_ATTRIBUTES, StoreSpec
 from .shards import FetchedSample, ShardReader
-
-__all__ = [
-    "EFFECT_RULE",
-    "FORMAT_VERSION",
-    "LAYERS",
-    "MASK_RULES",
-    "MOST_DOCUMENT_BYTES",
-    "OWN",
-    "REQUIRED_LAYERS",
-    "SCALARS",
-    "SEMANTIC",
-    "SPLITS",
-    "STRATA",
-    "VOLATILE_ATTRIBUTES",
-    "Array",
-    "Bucket",
-    "Encoded",
-    "FaultCounts",
-    "FetchedSample",
-    "Location",
-    "Member",
-    "Planned",
-    "Problem",
-    "Report",
-    "SampleDigests",
-    "ShardReader",
-    "SharedChunks",
-    "Store",
-    "StoreSpec",
-    "Url",
-    "append_samples",
-    "check_free",
-    "check_shard",
-    "count_faults",
-    "create",
-    "digest",
-    "drawn_table",
-    "encode",
-    "examine",
-    "examine_shard",
-    "files_of",
-    "is_sealed",
-    "is_store",
-    "located",
-    "mask_union",
-    "open_dataset",
-    "open_store",
-    "problem_samples",
-    "recover",
-    "sealed",
-    "spans",
-    "unplanned_samples",
-    "verify",
-    "write_samples",
-]

@@ -40,11 +40,11 @@ class Array:
     uncompressed size; `benchmarks/codecs.py` measures both.
     """
 
-    dimensions: str
-    dtype: str
-    units: str
     long_name: str
     description: str
+    axes: str = "sample"
+    dtype: str = "float64"
+    units: str = "1"
     names: tuple[str, ...] = ()  # CF flag meanings, of the values 0, 1, … or of the bits 0, 1, …
     bits: bool = False  # whether `names` are of bits
     codec: str = ZSTD
@@ -54,7 +54,7 @@ class Array:
     @property
     def dims(self) -> tuple[str, ...]:
         """Return the names of the dimensions, in order."""
-        return tuple(self.dimensions.split())
+        return tuple(self.axes.split())
 
     @property
     def is_text(self) -> bool:
@@ -87,157 +87,149 @@ class Member(NamedTuple):
 
 _PIXELS = "sample y x channel"
 
-# Layers (per-pixel arrays): a chunk holds one sample, and chunks are sharded.
+# Layers (per-pixel arrays): a chunk holds one sample, and chunks are sharded. Those behind `clean` are optional;
+# `StoreSpec.pixel_layers` makes the rows of `without_<fault>`.
 LAYERS: dict[str, Array] = {
     "image": Array(
-        _PIXELS,
-        "uint8",
-        "count",
         "image with faults",
         "8 bit image as the camera delivers it, linear in light, with noise and every injected fault.",
+        axes=_PIXELS,
+        dtype="uint8",
+        units="count",
         codec=_IMAGE,
         ratio=0.35,
     ),
     "mask": Array(
-        "sample fault y x",
-        "bool",
-        "1",
         "where each fault is, by its kind",
         "True in the pixels of a fault. The attributes rules and kinds say how the mask of each class is made.",
+        axes="sample fault y x",
+        dtype="bool",
         ratio=0.002,
     ),
     "mask_any": Array(
-        "sample y x",
-        "bool",
-        "1",
         "union of mask over the faults named here",
         "True where at least one of the classes in the attribute faults has its mask.",
+        axes="sample y x",
+        dtype="bool",
         ratio=0.004,
     ),
     "clean": Array(
-        _PIXELS,
-        "uint8",
-        "count",
         "same camera, exposure and noise, no fault",
         "The image as it would be without any fault: same view, camera, exposure and noise.",
+        axes=_PIXELS,
+        dtype="uint8",
+        units="count",
         codec=_IMAGE,
         ratio=0.28,
     ),
-    # the layers from here on are optional; `StoreSpec.pixel_layers` makes the rows of `without_<fault>`
     "mask_effect": Array(
-        "sample fault y x",
-        "bool",
-        "1",
         "where each fault changes the image",
         "True where the noise-free 8 bit image changes if this fault alone is switched off.",
+        axes="sample fault y x",
+        dtype="bool",
         ratio=0.006,
     ),
     "raw": Array(
-        "sample y x",
-        "uint16",
-        "count",
         "raw mosaic of the analogue-to-digital converter",
         "Numbers of the converter before demosaicing, one colour filter for each pixel, with offset and noise.",
+        axes="sample y x",
+        dtype="uint16",
+        units="count",
         codec=_RAW,
         ratio=0.52,
     ),
     "defects": Array(
-        "sample y x",
-        "uint8",
-        "1",
         "what is wrong with a pixel of the mosaic",
         "Bits that say which defects the detector's pixel has; 0 is a sound pixel.",
-        DEFECTS,
+        axes="sample y x",
+        dtype="uint8",
+        names=DEFECTS,
         bits=True,
         ratio=0.001,
     ),
     "depth_m": Array(
-        "sample y x",
-        "float32",
-        "m",
         "depth along the boresight, inf on the sky",
         "Distance of what the pixel's centre shows from the camera's plane, along the boresight.",
+        axes="sample y x",
+        dtype="float32",
+        units="m",
         codec=_SINGLE,
         ratio=0.3,
     ),
     "normal": Array(
-        "sample y x xyz",
-        "float16",
-        "1",
         "surface normal in C, 0 on the sky",
         "Unit vector out of the surface at the pixel's centre, in the camera's frame: x right, y down, z forward.",
+        axes="sample y x xyz",
+        dtype="float16",
         codec=_NORMAL,
         ratio=0.35,
     ),
     "semantic": Array(
-        "sample y x",
-        "uint8",
-        "1",
         "what a pixel shows",
         "Class of what the pixel's centre shows, without faults.",
-        SEMANTIC,
+        axes="sample y x",
+        dtype="uint8",
+        names=SEMANTIC,
         ratio=0.004,
     ),
     "point_T_m": Array(
-        "sample y x xyz",
-        "float64",
-        "m",
         "surface point in T, NaN on the sky",
         "Position of the ground at the pixel's centre in T, the frame fixed to the body.",
+        axes="sample y x xyz",
+        units="m",
         codec=_DOUBLE,
         ratio=0.9,
     ),
     "incidence_deg": Array(
-        "sample y x",
-        "float32",
-        "degree",
         "normal to Sun, NaN on the sky",
         "Angle between the surface normal and the direction to the Sun; above 90 the ground faces away from it.",
+        axes="sample y x",
+        dtype="float32",
+        units="degree",
         codec=_SINGLE,
         ratio=0.8,
     ),
     "emission_deg": Array(
-        "sample y x",
-        "float32",
-        "degree",
         "normal to camera, NaN on the sky",
         "Angle between the surface normal and the direction to the camera.",
+        axes="sample y x",
+        dtype="float32",
+        units="degree",
         codec=_SINGLE,
         ratio=0.8,
     ),
     "phase_deg": Array(
-        "sample y x",
-        "float32",
-        "degree",
         "Sun to camera at the surface, NaN on the sky",
         "Angle at the ground between the directions to the Sun and to the camera.",
+        axes="sample y x",
+        dtype="float32",
+        units="degree",
         codec=_SINGLE,
         ratio=0.7,
     ),
     "albedo": Array(
-        "sample y x",
-        "float32",
-        "1",
         "I/F at i = e = phase = 0 near 649 nm, spacecraft included, NaN on the sky",
         "Normal albedo of the ground or of the spacecraft's material, in the band of the scene closest to 649 nm.",
+        axes="sample y x",
+        dtype="float32",
         codec=_SINGLE,
         ratio=0.4,
     ),
     "radiance": Array(
-        "sample band y x",
-        "float16",
-        "W m-2 sr-1 nm-1",
         "radiance at the camera",
         "Spectral radiance that reaches the lens, without faults and noise, at the wavelengths of wavelength_nm.",
+        axes="sample band y x",
+        dtype="float16",
+        units="W m-2 sr-1 nm-1",
         codec=_HALF,
         ratio=0.7,
     ),
     "scene_radiance": Array(
-        "sample band y_rendered x_rendered",
-        "float16",
-        "W m-2 sr-1 nm-1",
         "radiance before the lens, on the pinhole grid of the render with its guard band, without stars",
         "Spectral radiance of the scene as rendered, from which vbnfault retake makes other images of the view.",
+        axes="sample band y_rendered x_rendered",
+        dtype="float16",
+        units="W m-2 sr-1 nm-1",
         codec=_HALF,
         ratio=0.7,
     ),
@@ -248,11 +240,11 @@ RADIANCE_LAYERS = ("radiance", "scene_radiance")  # their data type is `StoreSpe
 def without_row(fault: str) -> Array:
     """Return the schema row of the layer `without_<fault>`."""
     return Array(
-        _PIXELS,
-        "uint8",
-        "count",
         f"the image without {fault}",
         f"The image with every fault but {fault}: same view, camera, exposure and noise.",
+        axes=_PIXELS,
+        dtype="uint8",
+        units="count",
         codec=_IMAGE,
         ratio=0.33,
     )
@@ -262,11 +254,11 @@ def soft_row(name: str, fault: str) -> Array:
     """Return the schema row of the soft layer `name` of a fault class."""
     kind = soft_kind(name)
     return Array(
-        "sample y x",
-        kind.dtype,
-        "count" if kind.units == "DN" else kind.units,
         f"{fault}: {kind.meaning}",
         f"Strength of {fault} in each pixel, without the other faults; {kind.neutral:g} where it is absent.",
+        axes="sample y x",
+        dtype=kind.dtype,
+        units="count" if kind.units == "DN" else kind.units,
         codec=_HALF if kind.dtype == "float16" else _SINGLE,
         ratio=0.4,
     )
@@ -294,200 +286,159 @@ REQUIRED_LAYERS = ("image", "mask", "mask_any", "clean")
 # Scalars and small vectors: one chunk holds a whole shard, so that a task writes whole chunks.
 SCALARS: dict[str, Array] = {
     "injected": Array(
-        "sample fault",
-        "bool",
-        "1",
         "faults that are in the pixels",
         "True for the classes that change this image. A commanded fault without any effect is not injected.",
+        axes="sample fault",
+        dtype="bool",
     ),
     "camera_position_T_m": Array(
-        "sample xyz",
-        "float64",
-        "m",
         "camera position in T",
         "Position of the camera in T, the frame fixed to the body.",
+        axes="sample xyz",
+        units="m",
     ),
     "position_L_m": Array(
-        "sample xyz",
-        "float64",
-        "m",
         "camera position in L, from the site",
         "Position of the camera in the local level frame L: x north, y east, z down.",
+        axes="sample xyz",
+        units="m",
     ),
     "camera_from_T": Array(
-        "sample quaternion",
-        "float64",
-        "1",
         "attitude, unit quaternion",
         "Rotation that takes vectors from T to the camera's frame C; w comes first.",
+        axes="sample quaternion",
     ),
     "T_from_L": Array(
-        "sample axis_row axis_col",
-        "float64",
-        "1",
         "rotation from the local level frame to T",
         "Matrix that takes vectors from the local level frame of the site to the body's frame T.",
+        axes="sample axis_row axis_col",
     ),
     "T_from_J": Array(
-        "sample axis_row axis_col",
-        "float64",
-        "1",
         "rotation from the inertial frame J to T",
         "Matrix that takes vectors from the inertial frame J, which does not turn with the body, to T.",
+        axes="sample axis_row axis_col",
     ),
     "site_T_m": Array(
-        "sample xyz",
-        "float64",
-        "m",
         "site, the origin of L, in T",
         "Position of the site on the body's surface, around which the terrain is refined.",
+        axes="sample xyz",
+        units="m",
     ),
     "sun_direction_T": Array(
-        "sample xyz",
-        "float64",
-        "1",
-        "unit vector towards the Sun in T",
-        "Direction from the site to the centre of the Sun.",
+        "unit vector towards the Sun in T", "Direction from the site to the centre of the Sun.", axes="sample xyz"
     ),
     "sun_distance_au": Array(
-        "sample", "float64", "au", "distance to the Sun", "Distance from the body to the Sun; it sets the sunlight."
+        "distance to the Sun", "Distance from the body to the Sun; it sets the sunlight.", units="au"
     ),
     "julian_date": Array(
-        "sample", "float64", "d", "Julian date (TDB)", "Time of the exposure as a Julian date in dynamical time."
+        "Julian date (TDB)", "Time of the exposure as a Julian date in dynamical time.", units="d"
     ),
     "intrinsics": Array(
-        "sample intrinsic",
-        "float64",
-        "1",
         "pinhole camera, pixel centres at +0.5",
         "Focal lengths and principal point in pixels, from the top left corner, as in OpenCV's camera matrix.",
+        axes="sample intrinsic",
     ),
     "distortion": Array(
-        "sample coefficient",
-        "float64",
-        "1",
         "of the lens at 587.6 nm, as OpenCV takes it, for the intrinsics",
         "Coefficients of OpenCV's rational model of distortion, fitted to the chief rays of the lens.",
+        axes="sample coefficient",
     ),
     "sun_azimuth_deg": Array(
-        "sample",
-        "float64",
-        "degree",
-        "Sun azimuth in L, from north towards east",
-        "Direction of the Sun over the site's horizon.",
+        "Sun azimuth in L, from north towards east", "Direction of the Sun over the site's horizon.", units="degree"
     ),
     "sun_elevation_deg": Array(
-        "sample", "float64", "degree", "Sun elevation in L, up", "Height of the Sun above the site's horizon."
+        "Sun elevation in L, up", "Height of the Sun above the site's horizon.", units="degree"
     ),
     "roll_deg": Array(
-        "sample",
-        "float64",
-        "degree",
         "tilt of the boresight from its stratum's reference about x",
         "First angle of the attitude; the attribute reference names the direction of each stratum.",
+        units="degree",
     ),
     "pitch_deg": Array(
-        "sample",
-        "float64",
-        "degree",
         "tilt of the boresight from its stratum's reference about y",
         "Second angle of the attitude; the attribute reference names the direction of each stratum.",
+        units="degree",
     ),
     "yaw_deg": Array(
-        "sample",
-        "float64",
-        "degree",
         "turn about the boresight, from that reference",
         "Third angle of the attitude; the attribute reference names the direction of each stratum.",
+        units="degree",
     ),
     "sun_xy_px": Array(
-        "sample xy",
-        "float64",
-        "1",
         "Sun centre in the image, NaN behind the camera",
         "Column and row of the Sun's centre in pixels, from the top left corner; it may lie outside the image.",
+        axes="sample xy",
     ),
     "sun_visible_fraction": Array(
-        "sample",
-        "float64",
-        "1",
         "part of the solar disc that is not occluded",
         "Seen from the camera: 1 is the whole disc, 0 a Sun behind the ground or the spacecraft.",
     ),
     "exposure_s": Array(
-        "sample",
-        "float64",
-        "s",
         "exposure time",
         "Metered once on the image without noise and faults, and shared by every twin of the sample.",
+        units="s",
     ),
     "samples_per_pixel": Array(
-        "sample",
-        "float64",
-        "1",
         "mean number of render samples a pixel",
         "Larger than the number of the scene where the render had to reduce its noise.",
     ),
     "noise_fraction_p99": Array(
-        "sample",
-        "float64",
-        "1",
         "noise of sampling over the sensor's, 99th percentile of lit pixels; NaN: not asked",
         "Standard deviation of the render in units of that of the sensor, over the lit pixels.",
     ),
     "tries": Array(
-        "sample", "int32", "1", "views drawn, of which the last was kept", "A view is drawn again if it is refused."
+        "views drawn, of which the last was kept", "A view is drawn again if it is refused.", dtype="int32"
     ),
     "views": Array(
-        "sample",
-        "int32",
-        "1",
         "views rendered, of which the last shows every commanded fault",
         "More than 1 where a commanded fault did not show at first.",
+        dtype="int32",
     ),
     "resolved": Array(
-        "sample",
-        "bool",
-        "1",
         "the pose meets every condition of the scene",
         "False if no view that met them was drawn; the sample then holds the last one.",
+        dtype="bool",
     ),
     "stratum": Array(
-        "sample", "uint8", "1", "stratum of the sampling", "Whether the view was drawn to face the Sun.", STRATA
+        "stratum of the sampling", "Whether the view was drawn to face the Sun.", dtype="uint8", names=STRATA
     ),
     "site": Array(
-        "sample", "int32", "1", "index of the site", "Position in the attribute names; a site is in one split only."
+        "index of the site", "Position in the attribute names; a site is in one split only.", dtype="int32"
     ),
-    "lens": Array("sample", "int32", "1", "index of the lens", "Position in the attribute names."),
+    "lens": Array("index of the lens", "Position in the attribute names.", dtype="int32"),
     "detector_individual": Array(
-        "sample",
-        "int32",
-        "1",
         "index of the individual detector",
         "Position in the attribute names; each individual has its own defects.",
+        dtype="int32",
     ),
     "split": Array(
-        "sample",
-        "str",
-        "1",
         "split of the dataset, constant per site",
         "train, val or test; samples of one site or one view are never in two splits.",
+        dtype="str",
         most_bytes=64,
     ),
     "parameters": Array(
-        "sample",
-        "str",
-        "1",
         "drawn parameters of every injected fault, JSON",
         "By class, the model and the drawn values from which the fault can be injected again.",
+        dtype="str",
         most_bytes=2 << 20,
     ),
     "proposal": Array(
-        "sample",
-        "str",
-        "1",
         "proposed variables before redraws, JSON",
         "What the plan drew for the sample before any rendering: its view and its commanded faults.",
+        dtype="str",
         most_bytes=1 << 18,
     ),
 }
+# What says that the others are whole.
+CRC32C = Array(
+    "CRC-32C of the decoded bytes",
+    "Checksum of every layer of a sample, and one of all its scalars; vbnfault verify compares them.",
+    axes="sample layer",
+    dtype="uint32",
+)
+DONE = Array(
+    "1 where a sample is whole; written last",
+    "0 where a sample is not built yet; its other values are then not valid.",
+    dtype="uint8",
+)

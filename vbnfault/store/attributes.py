@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields
 from typing import Any
 
+from ..core.environment import MOST_SAMPLES
 from ..core.errors import InputError, shown, without_middle
 
 # Dotted keys of the root attributes that are tables wherever they are present; * stands for every key of a table.
@@ -28,36 +29,32 @@ _TABLES = (
     "scene.body.photometry",
     *(f"scene.{table}" for table in ("camera", "dataset", "geometry", "plan", "sky", "spice")),
 )
-# Names of the elements of a tuple in the type of a field of `StoreSpec` → the types that they have in JSON.
-_ELEMENTS: dict[str, tuple[type, ...]] = {
-    "str": (str,),
-    "int": (int,),
-    "float": (int, float),
-    "bool": (bool,),
+# Types of the fields of `StoreSpec`, and of the elements of its tuples → what they are in JSON, and in words.
+_TYPES: dict[str, tuple[tuple[type, ...], str]] = {
+    "str": ((str,), "a text"),
+    "int": ((int,), "a whole number"),
+    "float": ((int, float), "a number"),
+    "bool": ((bool,), "true or false"),
+    "Mapping": ((dict,), "a table"),
 }
-_WORDS = {
-    "tuple": "a list of ",
-    "Mapping": "a table",
-    "str": "a text",
-    "int": "a whole number",
-    "float": "a number",
-    "bool": "true or false",
+# What else holds for the values of some fields of `StoreSpec`, and in words; a scene has fewer pixels.
+_MOST_PIXELS, _MOST_RENDERED, _MOST_WISHED = 32768, 65536, 2**31
+_RULES: dict[str, tuple[Callable[[Any], bool], str]] = {
+    "height": (lambda n: 1 <= n <= _MOST_PIXELS, f"be from 1 to {_MOST_PIXELS}"),
+    "width": (lambda n: 1 <= n <= _MOST_PIXELS, f"be from 1 to {_MOST_PIXELS}"),
+    "shard_samples": (lambda n: 0 <= n <= _MOST_WISHED, f"be from 0 to {_MOST_WISHED}"),
+    "distortion_residual_px": (lambda pair: len(pair) == 2, "have 2 elements"),
+    "centre_of_mass_T_m": (lambda vector: vector is None or len(vector) == 3, "have 3 elements"),
+    "attitude_references": (
+        lambda names: len(names) == 2 and {*names} <= {"sun", "nadir", "centre"},
+        "be 2 of sun, nadir and centre",
+    ),
+    "rendered_shape": (
+        lambda shape: len(shape) in (0, 2) and all(0 < n <= _MOST_RENDERED for n in shape),
+        f"be 2 numbers from 1 to {_MOST_RENDERED}",
+    ),
 }
-_WORDS_OF_ELEMENTS = {"str": "texts", "int": "whole numbers", "float": "numbers"}
-# Fields of `StoreSpec` whose lists have this many elements.
-_LENGTHS = {
-    "distortion_residual_px": (2,),
-    "attitude_references": (2,),
-    "centre_of_mass_T_m": (3,),
-    "rendered_shape": (0, 2),
-}
-# The texts in these fields of `StoreSpec` must be among those listed.
-_CHOICES = {"attitude_references": ("sun", "nadir", "centre")}
-# Fields of `StoreSpec` that count something, and the least and the most that they may be; a scene has fewer pixels.
-_RANGES = {"height": (1, 32768), "width": (1, 32768), "shard_samples": (0, 2**31)}
-_MOST_RENDERED = 65536
-# The most samples of a store, and the most flags that they have together, one for each sample and class.
-MOST_SAMPLES = 10_000_000
+# The most flags that the samples have together, one for each sample and class.
 _MOST_FLAGS = 2**28
 # Fields of `StoreSpec` that become names of arrays, of folders and of files of an export.
 _NAMES = ("faults", "soft_layers")
@@ -174,38 +171,27 @@ def check_plain_spec(plain: Any, spec: type) -> None:
     for field in fields(spec):
         if field.name not in plain:
             continue
-        value, kind = plain[field.name], str(field.type)
-        if (value is not None or not kind.endswith("| None")) and not _is_of(kind, value):
-            raise InputError(f"store.{field.name} = {shown(value)}: must be {_in_words(kind)}")
-        least, most = _RANGES.get(field.name, (None, None))
-        if least is not None and not least <= value <= most:
-            raise InputError(f"store.{field.name} = {shown(value)}: must be from {least} to {most}")
-        if field.name == "rendered_shape" and not all(0 < n <= _MOST_RENDERED for n in value):
-            raise InputError(f"store.rendered_shape = {shown(value)}: must be from 1 to {_MOST_RENDERED}")
-        choices = _CHOICES.get(field.name)
-        if choices is not None and not {*value} <= {*choices}:
-            raise InputError(f"store.{field.name} = {shown(value)}: elements must be among {', '.join(choices)}")
-        lengths = _LENGTHS.get(field.name)
-        if field.name in _OF_CLASSES:
-            lengths = 0, len(plain.get("faults", ()))
-        if lengths is not None and value is not None and len(value) not in lengths:
-            raise InputError(f"store.{field.name} = {shown(value)}: must have {lengths[-1]} elements")
+        value = plain[field.name]
+        start = f"store.{field.name} = {shown(value)}: must"
+        if words := _wrong_type(str(field.type), value):
+            raise InputError(f"{start} be {words}")
+        holds, words = _RULES.get(field.name, (lambda _: True, ""))
+        if not holds(value):
+            raise InputError(f"{start} {words}")
+        if field.name in _OF_CLASSES and len(value) not in (0, count := len(plain.get("faults", ()))):
+            raise InputError(f"{start} have {count} elements")
 
 
-def _in_words(kind: str) -> str:
-    """Return what a type in `StoreSpec` is in JSON."""
-    words = _WORDS[kind.split("[")[0].removesuffix(" | None")]
-    if kind.startswith("tuple["):
-        words += _WORDS_OF_ELEMENTS[kind.removeprefix("tuple[").split(",")[0].split("]")[0]]
-    return f"{words}, or null" if kind.endswith("| None") else words
-
-
-def _is_of(kind: str, value: Any) -> bool:
-    """Return whether a JSON value fits a type as it is written in `StoreSpec`."""
-    kind = kind.removesuffix(" | None")
-    if kind.startswith("tuple["):
-        types = _ELEMENTS[kind.removeprefix("tuple[").split(",")[0]]
-        return isinstance(value, list | tuple) and all(type(element) in types for element in value)
-    if kind.startswith("Mapping["):
-        return isinstance(value, dict)
-    return type(value) in _ELEMENTS[kind]
+def _wrong_type(kind: str, value: Any) -> str:
+    """Return in words which type a value should have, as it is written in `StoreSpec`; "" if it has that."""
+    optional, element = kind.endswith(" | None"), kind.removeprefix("tuple[")
+    types, words = next(known for name, known in _TYPES.items() if element.startswith(name))
+    is_list = element != kind
+    if value is None and optional:
+        return ""
+    if is_list and isinstance(value, list | tuple) and all(type(one) in types for one in value):
+        return ""
+    if not is_list and type(value) in types:
+        return ""
+    words = f"a list, each {words}" if is_list else words
+    return f"{words}, or null" if optional else words

@@ -21,6 +21,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from functools import cached_property, partial
+from pathlib import Path
 from typing import Any
 
 from ..core.errors import InputError, VbnfaultError, shown
@@ -90,7 +91,7 @@ def parsed(text: str) -> Url:
 
 
 class Bucket:
-    """Read and write the objects below one URL; see `files.Files` for the methods."""
+    """Read and write the objects below one URL; see `disk.Disk` for the methods."""
 
     def __init__(self, url: Url) -> None:
         self.path = url
@@ -230,7 +231,7 @@ class Bucket:
         import obstore
 
         with self._reading(folder):
-            entries = obstore.list_with_delimiter(self._objects, folder)["objects"]
+            entries = obstore.list_with_delimiter(self._objects, folder.rstrip("/"))["objects"]
         return {entry["path"].rsplit("/", 1)[-1]: entry["last_modified"] for entry in entries}
 
     def zarr(self) -> Any:
@@ -255,11 +256,11 @@ class Bucket:
 
     # --- writing --------------------------------------------------------------------------------------------
 
-    def write(self, files: Iterable[tuple[str, bytes]]) -> None:
+    def write(self, files: Iterable[tuple[str, bytes | Path]]) -> None:
         """Replace objects; each is the old or the complete new one at any moment."""
         import obstore
 
-        def put(name: str, content: bytes) -> None:
+        def put(name: str, content: bytes | Path) -> None:
             with self._translated(name):
                 obstore.put(self._objects, name, content, chunk_size=_PART_BYTES, max_concurrency=2)
 

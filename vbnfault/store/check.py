@@ -8,11 +8,11 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
-import google_crc32c
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,14 +20,85 @@ from ..core.errors import VbnfaultError
 from ..core.quantities import soft_kind
 from .arrays import SCALARS
 from .bucket import Url
-from .codec import DIGEST_BYTES, crc_of_scalars, mask_union, sample_digest, threads
-from .compressors import compressor
-from .counts import FaultCounts
+from .codec import DIGEST_BYTES, crc32c, crc_of_scalars, mask_union, sample_digest, threads
 from .group import open_store
 from .layout import drawn_table
 from .metadata import metadata_problems, short
 from .opened import Store
-from .schema import DIGEST_VERSION, MAX_HELD_BYTES, VOLATILE_ATTRIBUTES, StoreSpec
+from .schema import DIGEST_VERSION, MAX_HELD_BYTES, SPLITS, VOLATILE_ATTRIBUTES, StoreSpec
+
+
+class FaultCounts:
+    """Count the samples for which each fault class is planned, and those in which it is injected, by split."""
+
+    def __init__(self, faults: Sequence[str]) -> None:
+        self.faults = tuple(faults)
+        self.samples: Counter[str] = Counter()
+        self._planned: Counter[tuple[str, str]] = Counter()
+        self._realised: Counter[tuple[str, str]] = Counter()
+        self._has_plan = True
+
+    def add(self, splits: NDArray[Any], planned: NDArray[np.bool_] | None, injected: NDArray[np.bool_]) -> None:
+        """Count some samples: their splits, str[sample], commanded and injected faults, bool[sample, fault].
+
+        `planned` is None if no plan is known.
+        """
+        self._has_plan &= planned is not None
+        for split in dict.fromkeys(splits.tolist()):
+            chosen = splits == split
+            self.samples[split] += int(chosen.sum())
+            for counts, flags in ((self._planned, planned), (self._realised, injected)):
+                if flags is not None:
+                    totals = flags[chosen].sum(axis=0).tolist()
+                    for fault, total in zip(self.faults, totals, strict=True):
+                        counts[split, fault] += total
+
+    def planned(self, fault: str, split: str | None = None) -> int:
+        """Return the number of samples for which a fault is planned, in one split or in all."""
+        return sum(n for (s, f), n in self._planned.items() if f == fault and split in (None, s))
+
+    def realised(self, fault: str, split: str | None = None) -> int:
+        """Return the number of samples in which a fault is injected, in one split or in all."""
+        return sum(n for (s, f), n in self._realised.items() if f == fault and split in (None, s))
+
+    @property
+    def missing(self) -> dict[str, int]:
+        """Return planned minus realised samples by fault class, only where the difference is not 0."""
+        if not self._has_plan:
+            return {}
+        differences = {f: self.planned(f) - self.realised(f) for f in self.faults}
+        return {fault: n for fault, n in differences.items() if n}
+
+    def missing_text(self) -> str:
+        """Return `missing` as a sentence."""
+        few = ", ".join(f"{name} {count}" for name, count in self.missing.items())
+        return f"planned, but without effect and not injected: {few}"
+
+    def lines(self) -> list[str]:
+        """Return a text table: for each fault class the planned and realised samples, in all and by split."""
+        if not self.faults or not self.samples:
+            return []
+        known = [s for s in SPLITS if s in self.samples]
+        splits = [*known, *sorted(set(self.samples) - set(known))]
+        head = ["fault", "planned", "realised", *splits]
+        if not self._has_plan:
+            head.remove("planned")
+        table = [head]
+        for fault in self.faults:
+            row = [fault, str(self.planned(fault)), str(self.realised(fault))]
+            for split in splits:
+                planned, realised = self.planned(fault, split), self.realised(fault, split)
+                same = planned == realised or not self._has_plan
+                row.append(str(realised) if same else f"{realised} of {planned}")
+            table.append(row if self._has_plan else [row[0], *row[2:]])
+        totals = ["samples", *[""] * (len(head) - len(splits) - 2), str(self.samples.total())]
+        table.append([*totals, *(str(self.samples[s]) for s in splits)])
+        widths = [max(len(row[k]) for row in table) for k in range(len(head))]
+        lines = []
+        for row in table:
+            cells = [row[0].ljust(widths[0]), *(c.rjust(w) for c, w in zip(row[1:], widths[1:], strict=True))]
+            lines.append("  ".join(cells).rstrip())
+        return lines
 
 
 class Problem(NamedTuple):
@@ -112,7 +183,7 @@ def examine_shard(store: Store, number: int, *, labels: bool = False) -> ShardCh
         if problems_of_layers or i in damaged:
             return _SampleCheck(problems_of_layers, None, [])
         sentences = list(_check_labels(store.spec, i, scalars[i], layers, crcs[i])) if labels else []
-        hashes = {name: hashlib.sha256(data).digest() for name, data in layers.items()}
+        hashes = {name: hashlib.sha256(a.data if a.size else b"").digest() for name, a in layers.items()}
         return _SampleCheck([], sample_digest(hashes, scalars[i]), sentences)
 
     sample_bytes = sum(map(store.spec.layer_bytes, store.spec.pixel_layers))
@@ -189,13 +260,13 @@ def _chunks(store: Store, number: int, finished: list[int]) -> tuple[dict[str, d
 
 def _layers(
     store: Store, number: int, i: int, chunks: Mapping[str, Mapping[int, bytes]], crcs: NDArray[np.uint32]
-) -> tuple[list[tuple[int, Problem]], dict[str, Any]]:
-    """Return the problems of one sample, each with the index of its layer, and the decoded bytes of its layers."""
+) -> tuple[list[tuple[int, Problem]], dict[str, NDArray[Any]]]:
+    """Return the problems of one sample, each with the index of its layer, and its layers."""
     problems: list[tuple[int, Problem]] = []
-    layers: dict[str, Any] = {}
+    layers: dict[str, NDArray[Any]] = {}
     for k, name in enumerate(store.spec.pixel_layers):
         if store.spec.empty(name):
-            layers[name] = b""
+            layers[name] = store.decoded(name, b"")
         if name not in chunks:
             continue
         file, why = store.file_name(name, number), ""
@@ -203,10 +274,8 @@ def _layers(
             why = f"has no chunk in {file}"
         else:
             try:
-                layers[name] = compressor(store.spec.codecs[name]).decode(
-                    chunks[name][i], store.spec.layer_bytes(name)
-                )
-                if google_crc32c.value(layers[name]) != crcs[k]:
+                layers[name] = store.decoded(name, chunks[name][i])
+                if crc32c(layers[name]) != crcs[k]:
                     why = f"in {file} does not match its stored crc32c"
             except ValueError:
                 why = f"cannot be decoded, its chunk in {file} is damaged"
@@ -215,15 +284,20 @@ def _layers(
     return problems, layers
 
 
-def spans(indices: Iterable[int]) -> str:
-    """Return sorted indices as ranges: `3-7, 9` for 3, 4, 5, 6, 7, 9."""
-    runs: list[list[int]] = []
+def runs(indices: Iterable[int]) -> list[list[int]]:
+    """Return indices as ascending ranges [first, last]."""
+    ranges: list[list[int]] = []
     for i in sorted(indices):
-        if runs and i == runs[-1][1] + 1:
-            runs[-1][1] = i
+        if ranges and i == ranges[-1][1] + 1:
+            ranges[-1][1] = i
         else:
-            runs.append([i, i])
-    return ", ".join(str(a) if a == b else f"{a}-{b}" for a, b in runs)
+            ranges.append([i, i])
+    return ranges
+
+
+def spans(indices: Iterable[int]) -> str:
+    """Return indices as ranges: `3-7, 9` for 3, 4, 5, 6, 7, 9."""
+    return ", ".join(str(a) if a == b else f"{a}-{b}" for a, b in runs(indices))
 
 
 def _not_built(samples: list[int]) -> Iterator[str]:
@@ -345,7 +419,8 @@ def examine(
             problems += check.contradictions[i]
             problems += _check_split(store, i, scalars, split_of)
             problems += _check_plan(store.spec, i, scalars, planned, exact)
-            counts.add(str(scalars["split"]), planned.get("injected"), scalars["injected"])
+            commanded = None if "injected" not in planned else np.asarray(planned["injected"])[None]
+            counts.add(np.array([str(scalars["split"])]), commanded, scalars["injected"][None])
         if progress:
             progress(len(store.shard(number)))
     if progress and len(begun) < store.shards:
@@ -369,12 +444,16 @@ def count_faults(
             continue
         samples = store.shard(number)
         commanded = None if planned is None else planned[samples.start : samples.stop][done]
-        counts.add_all(store.column("split", number)[done], commanded, store.column("injected", number)[done])
+        counts.add(store.column("split", number)[done], commanded, store.column("injected", number)[done])
     return counts
 
 
 def _check_labels(
-    spec: StoreSpec, i: int, scalars: Mapping[str, Any], layers: Mapping[str, bytes], crcs: NDArray[np.uint32]
+    spec: StoreSpec,
+    i: int,
+    scalars: Mapping[str, Any],
+    layers: Mapping[str, NDArray[Any]],
+    crcs: NDArray[np.uint32],
 ) -> Iterator[str]:
     """Yield one sentence for each contradiction between a sample's labels and its pixels or other labels."""
     injected = scalars["injected"]
@@ -389,14 +468,14 @@ def _check_labels(
         if listed != is_in:
             clause = "has no parameters, although" if is_in else "has parameters, although not"
             yield f"sample {i}: {fault} {clause} marked in injected"
-    mask = _array(spec, "mask", layers)
+    mask = layers["mask"]
     yield from _check_masks(i, spec.faults, "mask", mask, injected, spec.localised_faults or ())
     effect: Any = ()
     if "mask_effect" in layers:
         # by definition, an injected fault changes the noise-free image somewhere
-        effect = _array(spec, "mask_effect", layers)
+        effect = layers["mask_effect"]
         yield from _check_masks(i, spec.faults, "mask_effect", effect, injected, spec.faults)
-    mask_any, union = _array(spec, "mask_any", layers), mask_union(spec, mask)
+    mask_any, union = layers["mask_any"], mask_union(spec, mask)
     members = ", ".join(spec.mask_any_faults) or "no class"
     is_joint = spec.mask_any_joint and injected[[name in spec.mask_any_faults for name in spec.faults]].any()
     if is_joint and (union & ~mask_any).any():
@@ -404,7 +483,7 @@ def _check_labels(
     if not is_joint and not np.array_equal(mask_any, union):
         yield f"sample {i}: mask_any is not the union of the masks of {members}"
     for fault, name, is_in in zip(spec.faults, spec.soft_layers, injected, strict=False):
-        if name in layers and not is_in and (_array(spec, name, layers) != soft_kind(name).neutral).any():
+        if name in layers and not is_in and (layers[name] != soft_kind(name).neutral).any():
             yield f"sample {i}: {name} is not {soft_kind(name).neutral:g}, although {fault} is not injected"
     for fault, kind, its_mask, its_effect in zip(spec.faults, spec.mask_kinds, mask, effect, strict=False):
         if kind == "effect" and not np.array_equal(its_mask, its_effect):
@@ -438,12 +517,6 @@ def _check_masks(
             yield f"sample {i}: {name} of {fault} is not empty, although it is not injected"
         if is_in and not marks and fault in seen:
             yield f"sample {i}: {name} of {fault} is empty, although it is injected"
-
-
-def _array(spec: StoreSpec, name: str, layers: Mapping[str, bytes]) -> NDArray[Any]:
-    """Return the decoded bytes of a layer as an array of its dtype and shape."""
-    row = spec.pixel_layers[name]
-    return np.frombuffer(layers[name], dtype=row.dtype).reshape(spec.shape(row))
 
 
 def _check_split(

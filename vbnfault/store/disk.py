@@ -13,17 +13,18 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
-import re
 import shutil
 import stat
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from datetime import datetime
 from pathlib import Path
 from typing import TypeVar
 
 from ..core.errors import InputError, VbnfaultError
-from ..core.whole_files import kind_of
+from ..core.whole_files import flush, flush_folder, kind_of, rename
+from ..core.whole_files import remove as remove_whole
 
 PARTIAL = ".partial"
 # Number of parallel flushes. Measured on ext4, the 42 files and 90 folders of a shard take 45-600 ms one after the
@@ -32,7 +33,6 @@ _FLUSHES = 8
 _OPEN_AT_ONCE = 32  # files: a process may have few
 _MOST_COPIED_BYTES = 1 << 32  # all layers of a shard have less
 T = TypeVar("T")
-_UNSUPPORTED = (errno.EINVAL, errno.ENOTSUP)  # errors of file systems that cannot flush a folder
 
 
 class Misplaced(OSError):
@@ -40,7 +40,7 @@ class Misplaced(OSError):
 
 
 @contextlib.contextmanager
-def explained(path: Path, doing: str) -> Iterator[None]:
+def explained(path: object, doing: str) -> Iterator[None]:
     """Turn an OSError in a `with` block into a VbnfaultError or InputError with one sentence for the user."""
     try:
         yield
@@ -215,26 +215,6 @@ def write(root: Path, files: Iterable[tuple[str, bytes | Path]]) -> None:
         raise
 
 
-def write_with(target: Path, make: Callable[[Path], object]) -> None:
-    """Replace one file durably by what `make` writes to a temporary path beside it; the folder must exist.
-
-    Unlike `write`, no content has to be in memory. Raises OSError if the file cannot be written.
-    """
-    partial = target.with_name(f"{target.name}.{uuid.uuid4().hex}{PARTIAL}")
-    try:
-        make(partial)
-        file = os.open(partial, os.O_RDWR | getattr(os, "O_BINARY", 0))
-        try:
-            _flush(file)
-        finally:
-            os.close(file)
-        rename(partial, target)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            os.unlink(partial)
-        raise
-
-
 def _at_once(flush: Callable[[T], None], items: Iterable[T]) -> None:
     """Flush files or folders in parallel: a journaling file system commits once for all that wait."""
     with ThreadPoolExecutor(_FLUSHES) as pool:
@@ -244,7 +224,7 @@ def _at_once(flush: Callable[[T], None], items: Iterable[T]) -> None:
 
 def _flush_and_close(opened: list[int]) -> None:
     """Flush the open files of a list to the device, close them, and empty the list."""
-    _at_once(_flush, opened)
+    _at_once(flush, opened)
     while opened:
         os.close(opened.pop())
 
@@ -293,26 +273,6 @@ def _make_way(target: Path) -> None:
         shutil.rmtree(target)
 
 
-def _flush(file: int) -> None:
-    """Flush an open file or folder to the device; ignore file systems that cannot."""
-    try:
-        os.fsync(file)
-    except OSError as error:
-        if error.errno not in _UNSUPPORTED:
-            raise
-
-
-def flush_folder(folder: Path) -> None:
-    """Flush the entries of a folder to the device: files made, renamed or removed in it."""
-    if os.name == "nt":  # Windows cannot open folders
-        return
-    file = os.open(folder, os.O_RDONLY)
-    try:
-        _flush(file)
-    finally:
-        os.close(file)
-
-
 def remove(root: Path, files: Iterable[str]) -> None:
     """Remove files below `root` durably, as one batch; files that do not exist are left out."""
     folders: dict[Path, None] = {}
@@ -321,12 +281,6 @@ def remove(root: Path, files: Iterable[str]) -> None:
             os.unlink(root / name)
             folders[(root / name).parent] = None
     _at_once(flush_folder, folders)
-
-
-def rename(source: Path, target: Path) -> None:
-    """Rename a file or folder within one parent folder, durably."""
-    os.replace(source, target)
-    flush_folder(target.parent)
 
 
 def remove_partials(folder: str | Path) -> None:
@@ -346,18 +300,30 @@ def remove_partials(folder: str | Path) -> None:
 
 
 class Disk:
-    """Read and write the files of a store in a folder; see `files.Files` for the methods."""
+    """Read and write the files of a store in a folder; their names are relative to it and separated by `/`."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self._folder = str(path)
 
     def read(self, name: str, most_bytes: int) -> bytes:
-        """Return the content of a file, see `read`."""
+        """Return the content of a file of at most so many bytes.
+
+        Raises
+        ------
+        FileNotFoundError
+            There is no such file.
+        OSError
+            The file is damaged: it cannot be read, is larger, or a link stands in its place or above it.
+        InputError
+            This user may not read it.
+        VbnfaultError
+            The object store cannot be reached.
+        """
         return read(self._inside(name), most_bytes)
 
     def read_each(self, files: Sequence[tuple[str, int]]) -> Iterator[bytes | OSError]:
-        """Yield the content of each file, given by its name and its most bytes, or why it cannot be read."""
+        """Yield the content of each file, given by its name and its most bytes, or the OSError of `read`."""
         for name, most_bytes in files:
             try:
                 yield self.read(name, most_bytes)
@@ -384,22 +350,30 @@ class Disk:
     def read_parts(
         self, name: str, tail: int, choose: Callable[[bytes], Sequence[tuple[int, int]]]
     ) -> list[tuple[int, bytes]]:
-        """Return parts of a file, see `read_parts`."""
+        """Return parts of one version of a file, each with its start; `choose` gets the last `tail` bytes."""
         return read_parts(self._inside(name), tail, choose)
 
     def names(self, folder: str) -> list[str]:
-        """Return the names in a folder; none where it, or a folder above it, is a link."""
+        """Return the names in a folder; an empty list if there is no such folder."""
         try:
             return names(Path(self._inside(f"{folder}/").rstrip("/")))
         except OSError:
             return []
 
     def exists(self, name: str) -> bool:
-        """Return whether something has this name, also a broken link."""
+        """Return whether something has this name."""
         return os.path.lexists(self.path / name)
 
+    def modified(self, folder: str) -> dict[str, datetime]:
+        """Return by name when each file directly in a folder was written, by the clock of what stores it."""
+        written = {}
+        for name in self.names(folder):
+            with contextlib.suppress(OSError):
+                written[name] = datetime.fromtimestamp(os.lstat(self.path / folder / name).st_mtime)
+        return written
+
     def stamp(self, name: str) -> object:
-        """Return inode and modification time, which change if a file is replaced; None if there is no file."""
+        """Return what changes if a file is replaced; None if there is no file."""
         try:
             status = os.stat(self.path / name)
         except OSError:
@@ -407,19 +381,22 @@ class Disk:
         return status.st_ino, status.st_mtime_ns
 
     def zarr(self) -> Path:
-        """Return what zarr and xarray open."""
+        """Return what zarr and xarray open in order to read the store."""
         return self.path
 
     def failure(self, error: Exception, name: str) -> VbnfaultError | None:
-        """Return the error for a failure of zarr that is no damage."""
+        """Return the error for a failure while zarr reads an array that is no damage; None for any other."""
         return denied(error, self.path / name) if isinstance(error, PermissionError) else None
 
     def write(self, files: Iterable[tuple[str, bytes | Path]]) -> None:
-        """Replace files durably, see `write`."""
+        """Replace files durably, as one batch; each is the old or the complete new one at any moment.
+
+        The contents are bytes, or what `copied` returns. Raises OSError if a file cannot be written.
+        """
         write(self.path, files)
 
     def remove(self, files: Iterable[str]) -> None:
-        """Remove files durably; what lies behind a link to a folder stays."""
+        """Remove files durably; names that do not exist are left out."""
 
         def within() -> Iterator[str]:
             for name in files:
@@ -430,11 +407,11 @@ class Disk:
         remove(self.path, within())
 
     def copied(self, name: str, most_bytes: int, *, link: bool) -> bytes | Path:
-        """Return a file as `write` of another store takes it."""
+        """Return a file as `write` of another store takes it. `link`: where possible, no byte is copied."""
         return Path(self._inside(name)) if link else self.read(name, most_bytes)
 
     def why_occupied(self, own: Iterable[str]) -> str:
-        """Return why no store can be created here, as a clause; what a killed creation has left is beside it."""
+        """Return why no store can be created here, as a clause, or an empty text; `own`: names of a new store."""
         if self.path.is_symlink():
             return "is a link, in whose place nothing is created; name another --out, or what the link names"
         if self.path.exists() and (not self.path.is_dir() or any(self.path.iterdir())):
@@ -443,20 +420,39 @@ class Disk:
         return "" if above.is_dir() else f"no store can be created here: {above} is a file, not a folder"
 
     def create(self, files: Iterable[tuple[str, bytes]], *, old: bool) -> None:
-        """Make a store of these files, in place of an `old` one, under a temporary name, and rename it."""
+        """Make a store of these files, the root last, in place of an `old` store; it appears when it is whole.
+
+        Raises OSError if that is impossible.
+        """
         target = self.path.absolute()
         target.parent.mkdir(parents=True, exist_ok=True)
-        _remove_abandoned(target)
-        with _hidden_folder(target) as hidden:
+        hidden, retired = (target.with_name(f".{target.name}.{kind}{PARTIAL}") for kind in ("new", "old"))
+        try:
+            for left in (hidden, retired):  # by a killed command
+                remove_whole(left)
+            hidden.mkdir()
             write(hidden, files)
-            _replace(hidden, target, old=old)
+            if old:
+                rename(target, retired)
+            elif target.is_dir():
+                target.rmdir()
+            try:
+                rename(hidden, target)
+            except OSError:
+                if old and not target.exists():
+                    rename(retired, target)
+                raise
+        finally:
+            for left in (hidden, retired):
+                with contextlib.suppress(OSError):
+                    remove_whole(left)
 
     def remove_leftovers(self) -> None:
-        """Remove the temporary files of killed processes."""
+        """Remove what killed processes have left. No other process may write meanwhile."""
         remove_partials(self.path)
 
     def free_bytes(self) -> int | None:
-        """Return the free space in bytes; None if the system does not report it."""
+        """Return the free space in bytes; None if it is not known or not limited."""
         for folder in (self.path, *self.path.absolute().parents):
             try:
                 usage = shutil.disk_usage(folder)
@@ -464,89 +460,3 @@ class Disk:
                 continue
             return usage.free if usage.total else None  # some mounts report a size of 0
         return None
-
-
-def _replace(hidden: Path, target: Path, *, old: bool) -> None:
-    """Rename a new store to its final name, durably. An `old` store is removed, or restored if renaming fails."""
-    if not old:
-        if target.is_dir():
-            target.rmdir()
-        rename(hidden, target)
-        return
-    retired = _hidden_name(target)
-    rename(target, retired)
-    try:
-        rename(hidden, target)
-    except OSError:
-        if not target.exists():
-            rename(retired, target)
-        raise
-    with contextlib.suppress(OSError):
-        shutil.rmtree(retired)
-
-
-# --- folders in which a store is created before it has its name --------------------------------------------
-#
-# A process that works in such a folder holds a lock on it, which ends with the process: a folder that can be locked
-# is abandoned. If the file system has no locks, an abandoned folder cannot be recognised, and none is removed.
-
-
-def _hidden_name(target: Path) -> Path:
-    """Return a new, unique temporary name beside `target`."""
-    return target.with_name(f".{target.name}.{uuid.uuid4().hex}{PARTIAL}")
-
-
-@contextlib.contextmanager
-def _hidden_folder(target: Path) -> Iterator[Path]:
-    """Make a new, locked folder beside `target`; remove it at the end unless it was renamed."""
-    while True:
-        folder = _hidden_name(target)
-        os.mkdir(folder)
-        lock = _lock_folder(folder, wait=True)
-        if folder.is_dir():  # otherwise another process removed it as abandoned before it was locked
-            break
-        _unlock_folder(lock)
-    try:
-        yield folder
-    finally:
-        with contextlib.suppress(OSError):
-            shutil.rmtree(folder)
-        _unlock_folder(lock)
-
-
-def _remove_abandoned(target: Path) -> None:
-    """Remove the temporary folders of killed processes that were creating a store of this name."""
-    own = re.compile(rf"\.{re.escape(target.name)}\.[0-9a-f]{{32}}{re.escape(PARTIAL)}")
-    for name in names(target.parent):
-        folder = target.with_name(name)
-        if own.fullmatch(name) and folder.is_dir() and not folder.is_symlink():
-            lock = _lock_folder(folder, wait=False)
-            if lock is not None:
-                with contextlib.suppress(OSError):
-                    shutil.rmtree(folder)
-                _unlock_folder(lock)
-
-
-def _lock_folder(folder: Path, *, wait: bool) -> int | None:
-    """Lock a folder and return a handle for `_unlock_folder`.
-
-    None if another process holds the lock (and not `wait`), or if the file system has no locks.
-    """
-    try:
-        import fcntl
-
-        lock = os.open(folder, os.O_RDONLY)
-    except (ImportError, OSError):
-        return None
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-    except OSError:
-        os.close(lock)
-        return None
-    return lock
-
-
-def _unlock_folder(lock: int | None) -> None:
-    """Release the lock that `_lock_folder` returned, if any."""
-    if lock is not None:
-        os.close(lock)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
-import warnings
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..core.errors import InputError, VbnfaultError
 from ..core.path_checks import real
@@ -32,6 +32,9 @@ from .layout import (
 )
 from .opened import Store
 from .schema import FORMAT_VERSION, StoreSpec
+
+if TYPE_CHECKING:
+    import xarray
 
 # --- create, open, write ----------------------------------------------------------------------------------
 
@@ -181,14 +184,14 @@ def open_store(path: str | os.PathLike[str] | Url | Store, mode: str = "r") -> S
         raise InputError(f"{path}: {_why_no_store(files)}")
     _check_format(path, root.attributes.get("format_version"))
     try:
-        store = Store(files, root.attributes, mode)
+        store = Store(files, root.attributes)
     except InputError as error:
         raise InputError(f"{path}: {_NO_STORE}: {error}") from error
     except (KeyError, TypeError, ValueError, VbnfaultError) as error:
         raise InputError(f"{path}: {_NO_STORE}") from error
     if mode == "r":
         for problem in root.damage:
-            warnings.warn(f"{path}: {problem}; the build command mends it", UserWarning, stacklevel=2)
+            logging.getLogger("vbnfault").warning(f"{path}: {problem}; the build command mends it")
     return store
 
 
@@ -221,6 +224,28 @@ def _why_no_store(files: Files) -> str:
             "or choose another --out"
         )
     return "is no vbnfault store"
+
+
+def open_dataset(path: str | os.PathLike[str] | Url) -> xarray.Dataset:
+    """Return a store as an `xarray.Dataset` with named dimensions, units and coordinates.
+
+    Arrays are read when they are used, a sample of a layer at a time. README and the reference list them.
+
+    Raises
+    ------
+    InputError
+        If there is no store at `path`, one of another format, or one that this user may not read.
+    """
+    import xarray  # it takes longer to load than all the rest
+
+    store = open_store(path)
+    try:
+        return xarray.open_zarr(store.files.zarr(), chunks=None, zarr_format=3)
+    except Exception as error:
+        failure = store.files.failure(error, "")
+        if failure is None:
+            raise
+        raise failure from error
 
 
 def write_samples(store: str | os.PathLike[str] | Url | Store, samples: Iterable[Sample | Encoded]) -> None:

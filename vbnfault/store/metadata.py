@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 from collections.abc import Iterator, Mapping
@@ -108,23 +109,29 @@ def _differ(a: Any, b: Any) -> bool:
 
 def _misvalued(files: Files, name: str, member: Member) -> Iterator[str]:
     """Yield a clause for each chunk of a coordinate that cannot be decoded or holds wrong values."""
-    for chunk, wanted in coordinate_chunks(member):
-        stored = _values_in(files, f"{name}/{chunk}", member.dtype, wanted)
+    for chunk, wanted, stored in _wrong_chunks(files, name, member):
         if stored is None or stored.shape != wanted.shape:
-            yield f"its values in {name}/{chunk} are missing or cannot be decoded"
-        elif not np.array_equal(stored, wanted):
+            yield f"its values in {chunk} are missing or cannot be decoded"
+        else:
             first = next(i for i, (a, b) in enumerate(zip(stored, wanted, strict=True)) if a != b)
-            number = int(chunk.removeprefix("c/")) * member.chunks[0] + first
+            number = int(chunk.removeprefix(f"{name}/c/")) * member.chunks[0] + first
             yield f"its value {number} is {short(stored[first])}, not {short(wanted[first])}"
 
 
-def _values_in(files: Files, name: str, dtype: str, wanted: NDArray[Any]) -> NDArray[Any] | None:
-    """Return the values in a chunk file; None if it is missing, cannot be decoded, or is far larger."""
-    most_bytes = 2 * len(memoryview(plain_values(wanted)).cast("B")) + 1024
-    try:
-        return decode_values(files.read(name, most_compressed(most_bytes)), dtype, most_bytes)
-    except (OSError, ValueError):
-        return None
+def _wrong_chunks(
+    files: Files, name: str, member: Member
+) -> Iterator[tuple[str, NDArray[Any], NDArray[Any] | None]]:
+    """Yield the file, the right values and the stored values of each chunk of a coordinate where these differ.
+
+    The stored values are None if the file is missing, cannot be decoded, or is far larger.
+    """
+    for chunk, wanted in coordinate_chunks(member):
+        most_bytes = 2 * len(memoryview(plain_values(wanted)).cast("B")) + 1024
+        file, stored = f"{name}/{chunk}", None
+        with contextlib.suppress(OSError, ValueError):
+            stored = decode_values(files.read(file, most_compressed(most_bytes)), member.dtype, most_bytes)
+        if stored is None or not np.array_equal(stored, wanted):
+            yield file, wanted, stored
 
 
 def _root_differences(
@@ -210,10 +217,8 @@ def _outdated_arrays(
 ) -> Iterator[tuple[str, bytes]]:
     """Yield the name and right content of each array document and coordinate chunk that is wrong."""
     for name, member in members.items():
-        for chunk, wanted in coordinate_chunks(member):
-            stored = _values_in(files, f"{name}/{chunk}", member.dtype, wanted)
-            if stored is None or not np.array_equal(stored, wanted):
-                yield f"{name}/{chunk}", encode_values(wanted)
+        for file, wanted, _ in _wrong_chunks(files, name, member):
+            yield file, encode_values(wanted)
         yield from _outdated(files, {f"{name}/{DOCUMENT}": documents[name]})
 
 

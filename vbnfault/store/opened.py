@@ -57,7 +57,7 @@ class Store:
     The files are read directly, and no more of them than the schema allows: the store may be that of a stranger.
     """
 
-    def __init__(self, files: Files, attributes: dict[str, Any], mode: str) -> None:
+    def __init__(self, files: Files, attributes: dict[str, Any]) -> None:
         self.files, self.path = files, files.path
         self.root_attributes = attributes
         self.attributes = {k: v for k, v in attributes.items() if k not in OWN_ATTRIBUTES}
@@ -65,7 +65,6 @@ class Store:
         self.samples = number_of_samples(attributes)
         self.spec = spec_from_plain(attributes["store"], self.attributes)
         check_names(self.spec, self.samples)
-        self._mode: Any = mode
         self._shapes: dict[str, tuple[int, ...]] = {}
 
     @property
@@ -118,13 +117,14 @@ class Store:
         if name not in self.spec.pixel_layers:
             column, first = self.column(name, number), self.shard(number).start
             return {i: column[i - first] for i in samples}
-        row, codec = self.spec.pixel_layers[name], compressor(self.spec.codecs[name])
-        layers = {}
-        for i, chunk in self.chunk(name, number, samples).items():
-            layers[i] = np.empty(self._shape(name), dtype=row.dtype)
-            if layers[i].size:
-                codec.decode_into(chunk, layers[i])
-        return layers
+        return {i: self.decoded(name, chunk) for i, chunk in self.chunk(name, number, samples).items()}
+
+    def decoded(self, name: str, chunk: bytes) -> NDArray[Any]:
+        """Return a layer of a sample from its chunk. Raises ValueError if that is damaged."""
+        layer = np.empty(self._shape(name), dtype=self.spec.pixel_layers[name].dtype)
+        if layer.size:
+            compressor(self.spec.codecs[name]).decode_into(chunk, layer)
+        return layer
 
     def read_sample(self, index: int, layers: Collection[str] | None = None) -> Sample:
         """Return one sample, compared with its checksums; with `layers`, only these of its layers.
@@ -419,14 +419,11 @@ class Store:
 
     def _recoded(self, name: str, number: int, samples: Collection[int], codec: str) -> dict[int, bytes]:
         """Return the chunks of a layer of samples, compressed again if the codec is another one."""
-        chunks, own = self.chunk(name, number, samples), self.spec.codecs[name]
-        if codec == own or self.spec.empty(name):
+        chunks = self.chunk(name, number, samples)
+        if codec == self.spec.codecs[name] or self.spec.empty(name):
             return chunks
-        size = self.spec.layer_bytes(name)
         with ThreadPoolExecutor(threads()) as pool:
-            recoded = pool.map(
-                lambda chunk: compressor(codec).encode(compressor(own).decode(chunk, size)), chunks.values()
-            )
+            recoded = pool.map(lambda chunk: compressor(codec).encode(self.decoded(name, chunk)), chunks.values())
             return dict(zip(chunks, recoded, strict=True))
 
     def _finished(self, number: int, *, strict: bool) -> set[int]:

@@ -18,6 +18,8 @@ from ..core.errors import InputError
 from ..core.quantities import CHANNELS
 from ..scene.names import SPLITS, STRATA
 from .arrays import (
+    CRC32C,
+    DONE,
     EFFECT_DN,
     EFFECT_RULE,
     JOINT_ATTRIBUTES,
@@ -50,6 +52,8 @@ MAX_SAMPLE_BYTES = 2**34  # all layers of a sample, uncompressed
 _SCALARS = "scalars"  # the entry of the `layer` axis that stands for all scalars of a sample
 
 
+# Fields that older stores lack, with their defaults, which are not written: such stores stay as they were.
+_LATER = {"sample_names": (), "rendered_shape": (), "mask_any_joint": False, "distortion_valid_to_deg": None}
 # Fields that alter no decoded value: neither digests nor comparisons know them.
 _NO_DATA = ("shard_samples", "codecs", "distortion_valid_to_deg")
 _LABELS = {  # coordinates of the short axes
@@ -218,21 +222,7 @@ class StoreSpec:
     @cached_property
     def arrays(self) -> dict[str, Array]:
         """Return the schema row by name of every array that tasks write."""
-        crc32c = Array(
-            "sample layer",
-            "uint32",
-            "1",
-            "CRC-32C of the decoded bytes",
-            "Checksum of every layer of a sample, and one of all its scalars; vbnfault verify compares them.",
-        )
-        done = Array(
-            "sample",
-            "uint8",
-            "1",
-            "1 where a sample is whole; written last",
-            "0 where a sample is not built yet; its other values are then not valid.",
-        )
-        return {**self.pixel_layers, **SCALARS, "crc32c": crc32c, "done": done}
+        return {**self.pixel_layers, **SCALARS, "crc32c": CRC32C, "done": DONE}
 
     @property
     def checked(self) -> tuple[str, ...]:
@@ -364,15 +354,7 @@ class StoreSpec:
         """Return the fields as plain data, without the root attributes; `spec_from_plain` reads them back."""
         # asdict would copy the whole scene first
         plain = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "attributes"}
-        if not self.sample_names:
-            del plain["sample_names"]  # stores without names stay as they were
-        if not self.rendered_shape:
-            del plain["rendered_shape"]
-        if not self.mask_any_joint:
-            del plain["mask_any_joint"]
-        if self.distortion_valid_to_deg is None:
-            del plain["distortion_valid_to_deg"]
-        return plain
+        return {key: value for key, value in plain.items() if key not in _LATER or value != _LATER[key]}
 
     @property
     def data(self) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """Read a finished dataset at a trainer's speed: which samples, in which order, as which arrays.
 
-This package needs numpy alone; `vbnfault.torch` is a thin layer on top of it, and the place where another framework
-would stand. A process that reads imports neither zarr nor the renderer.
+The names below need numpy alone; `datasets`, `loader` and `slots` give them to PyTorch as `vbnfault.torch`.
+Another framework would stand beside them. A process that reads imports neither zarr nor the renderer.
 """
 
 from .order import Order

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import warnings
+import logging
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 
 import numpy as np
@@ -79,11 +79,9 @@ def select(
         raise InputError(f"where = {shown(where)}: must be a function of the scalars of all samples, or None")
     columns = Columns(store)
     if len(columns.samples) < store.samples:
-        warnings.warn(
+        logging.getLogger("vbnfault").warning(
             f"{store.path}: {len(columns.samples)} of {store.samples} samples are finished; the others are left "
-            "out until the build command has made them",
-            UserWarning,
-            stacklevel=3,
+            "out until the build command has made them"
         )
     keep = np.ones(len(columns.samples), dtype=bool)
     if split is not None:

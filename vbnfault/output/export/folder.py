@@ -22,7 +22,7 @@ from typing import Any
 
 from ...core.errors import InputError
 from ...core.path_checks import check_folder
-from ...core.whole_files import remove
+from ...core.whole_files import remove, replacing
 from ...store import disk, is_sealed, sealed
 
 STATE = "export.json"
@@ -56,7 +56,8 @@ class Folder:
         """Write one file by a function that gets a temporary path; it is complete or not there."""
         target = self.path / name
         disk.make_folders(self.path, target.parent, {})
-        disk.write_with(target, make)
+        with replacing(target) as temporary:
+            make(temporary)
         self.checksums[name] = _sha256(target)
 
     # --- what an earlier command has done -------------------------------------------------------------------

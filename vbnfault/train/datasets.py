@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, TypedDict, Unpack
 
@@ -20,10 +19,11 @@ from torch.utils.data import Dataset, IterableDataset, Sampler, default_collate,
 from ..core import environment
 from ..core.errors import InputError, shown
 from ..store import open_store
-from ..train import Columns, Order, SampleReader, Targets, select
-from ..train.order import checked_epoch
-from ..train.selection import Where
+from .order import Order, checked_epoch
+from .reader import SampleReader
+from .selection import Columns, Where, select
 from .slots import Slots, contiguous
+from .targets import Targets
 
 Batch = dict[str, Any]
 Transform = Callable[[Batch], Batch]
@@ -153,7 +153,8 @@ class SampleDataset(Dataset[Batch]):
 
         This is the `pos_weight` of `torch.nn.BCEWithLogitsLoss` for the target `classes`.
         """
-        injected = self._columns()["injected"][:, self._class_indices()]
+        columns = Columns(open_store(self.path))
+        injected = columns["injected"][np.isin(columns.samples, self.samples)][:, self._class_indices()]
         positive = injected.sum(axis=0)
         return _weights(positive, len(injected) - positive)
 
@@ -193,19 +194,13 @@ class SampleDataset(Dataset[Batch]):
         """Return the positions of the chosen classes on the fault axis of the store."""
         return [self.targets.spec.faults.index(name) for name in self.classes]
 
-    def _columns(self) -> dict[str, NDArray[Any]]:
-        """Return `injected` of the chosen samples."""
-        columns = Columns(open_store(self.path))
-        return {"injected": columns["injected"][np.isin(columns.samples, self.samples)]}
-
     def _open_reader(self) -> SampleReader:
         """Return the reader of this process and worker, opened at first use: threads do not survive a fork."""
         worker = get_worker_info()
         key = (os.getpid(), threads_of(worker.num_workers if worker else 0))
         if self._reader is None or self._reader[0] != key:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", UserWarning)  # said when the dataset was made
-                self._reader = key, SampleReader(open_store(self.path), self.targets, key[1])
+            store = open_store(self.path, "r+")  # what is damaged was said when the dataset was made
+            self._reader = key, SampleReader(store, self.targets, key[1])
         return self._reader[1]
 
     def __getstate__(self) -> dict[str, Any]:

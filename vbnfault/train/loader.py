@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import signal
 import threading
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -16,8 +16,8 @@ from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from ..core.errors import InputError, VbnfaultError, shown
-from ..train.order import checked_epoch
 from .datasets import Batch, BatchDataset
+from .order import checked_epoch
 from .slots import Failure, Packed, Slots, slot_size
 
 # slots beyond those that PyTorch fills ahead: one for the loop's own batch, one for the next
@@ -131,7 +131,7 @@ class Loader:
                         "smaller batch if memory was short"
                     ) from None
                 failed_at = self._next
-                warnings.warn(f"{where}; new workers go on from there", UserWarning, stacklevel=2)
+                logging.getLogger("vbnfault").warning(f"{where}; new workers go on from there")
         self.epoch, self._next = self.epoch + 1, 0
 
     def _received(self) -> Iterator[Batch]:
