@@ -100,7 +100,7 @@ def test_a_path_to_write_is_no_url() -> None:
 
 
 def test_every_option_is_named_in_a_test() -> None:
-    texts = "".join(path.read_text(encoding="utf-8") for path in Path(__file__).parent.glob("*.py"))
+    texts = "".join(path.read_text(encoding="utf-8") for path in Path(__file__).parent.rglob("*.py"))
     missing = []
     for command, option in options():
         for name in option.opts:

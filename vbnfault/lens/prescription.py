@@ -159,12 +159,12 @@ class Prescription:
     def spectral_step_nm(self) -> float:
         """Return the distance of wavelengths that resolve the light of ghosts, for interpolation by a spline.
 
-        There are 16 of them in a fringe of the thickest coating, and they are 2 to 6 nm apart. A glass that absorbs
+        There are 12 of them in a fringe of the thickest coating, and they are 2 to 8 nm apart. A glass that absorbs
         may have edges, for which they are 2 nm apart.
         """
         if any(s.internal_transmittance_10mm != CLEAR for s in self.surfaces):
             return 2.0
-        return float(np.clip(400.0**2 / (2 * max(self.film_nm, 1.0)) / 16, 2.0, 6.0))
+        return float(np.clip(400.0**2 / (2 * max(self.film_nm, 1.0)) / 12, 2.0, 8.0))
 
     def indices(self, wavelength_nm: float = D_NM) -> F64:
         """Return the indices of all media, float64[row + 1]: before the first row, then behind each row."""
