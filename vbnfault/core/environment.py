@@ -14,8 +14,7 @@ from .resources import PACKAGE
 # The most threads or processes that an environment variable or option may ask for: more than any machine has.
 MOST_THREADS = 1024
 MOST_SAMPLES = 10_000_000  # of a dataset
-# Options of `mallopt` in the GNU C library and their values: M_ARENA_MAX, then M_MMAP_THRESHOLD and M_TRIM_THRESHOLD
-# in bytes.
+# Options of `mallopt` in the GNU C library, and values: M_ARENA_MAX, M_MMAP_THRESHOLD and M_TRIM_THRESHOLD (bytes).
 _MALLOPT = (-8, 2), (-3, 32 << 20), (-1, 512 << 20)
 
 
