@@ -148,14 +148,16 @@ def look(path: str) -> None:
     try:
         paths = ["api/store", "api/listing", "api/severity", *(f"api/sample/{i}" for i in (0, 1))]
         paths += [f"api/small/{i}" for i in (0, 1)] + ["api/layer/image/0", "api/layer/normal/1"]
+        paths += [
+            "zarr.json",
+            "api/../zarr.json",
+            "store/image/c/0/0/0/0",
+            "api/layer/../image/0",
+            "api/layer/split/0",
+        ]
         for name in paths:
             with contextlib.suppress(VbnfaultError, server.Missing):
-                viewer.answer(name, {"masks": "1"})
-        for name in ("zarr.json", "image/zarr.json", "image/c/0/0/0/0", "normal/c/0/0/0/0", "split/c/0"):
-            for part in (None, "bytes=-20", "bytes=0-", "bytes=0-99", "bytes=0-9999999999"):
-                with contextlib.suppress(ValueError, server.Missing):
-                    body, _ = viewer.part(name, part)
-                    assert b"precious" not in body
+                assert b"precious" not in viewer.answer(name, {"masks": "1"})[0]
     finally:
         viewer.server.server_close()
 
