@@ -36,7 +36,7 @@ _SHARP = 1e-3  # default width of soft edges while boxes are located
 _LEAST_SPREAD = 0.25  # fraction of a ghost's image that is magnified less than `Arrivals.magnification`
 # Rays across a ghost whose spectrum is computed; more if coatings have an optical thickness above `_FILMS_NM`,
 # because their reflectances vary faster with the angle.
-_SPECTRUM, _SPECTRUM_OF_FILMS, _FILMS_NM = 12, 16, 800.0
+_SPECTRUM, _SPECTRUM_OF_FILMS, _FILMS_NM = 13, 16, 800.0
 _SPECTRUM_AT_ONCE = 1 << 20
 _LEAST_SHARE = 1e-2  # of a ghost's light in a band that a wavelength must have to be drawn in it
 _UNEVEN = 2.0  # ratio of the areas of neighbouring cells above which the image is uneven
