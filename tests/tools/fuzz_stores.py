@@ -23,7 +23,7 @@ from vbnfault.core.errors import VbnfaultError
 
 NAMES = [
     "../../../pwned",
-    "/tmp/pwned",
+    "/pwned",
     "a/b",
     "..",
     ".",
@@ -108,7 +108,7 @@ def escaped(here: Path, arguments: list[str]) -> str:
     """Return what a command has written where it may not, "" if nothing."""
     own = {Path(arguments[arguments.index("--out") + 1]).name} if "--out" in arguments else set()
     beside = {p.name for p in (here / "out").iterdir() if not p.name.startswith(tuple(f".{n}." for n in own))} - own
-    beside |= {p.name for p in (*here.parent.iterdir(), *Path("/tmp").iterdir()) if "pwned" in p.name}
+    beside |= {p.name for p in (*here.parent.iterdir(), *Path("/").iterdir()) if "pwned" in p.name}
     if beside:
         return f"files beside the output: {sorted(beside)}"
     for path in (here / "out").rglob("*"):

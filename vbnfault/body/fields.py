@@ -284,7 +284,7 @@ def smooth_max(a: NDArray, b: NDArray, width: float | Float32) -> NDArray:
 
 
 class Octaves:
-    """Evaluate fields at points sorted by their facet size; a field is 0 where the facets cannot show it."""
+    """Evaluate noise at points that are sorted by the size of their facets; it is 0 where facets are too coarse."""
 
     def __init__(
         self, place_m: Float64, facet_m: Float64, seed: int, roughness: Roughness, longest_m: float

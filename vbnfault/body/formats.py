@@ -428,7 +428,7 @@ def read_vrml(data: bytes, source: str) -> Mesh:
 
 
 def _vrml_error(text: bytes, offset: int, source: str, expected: str, given: str) -> InputError:
-    """Return the error at a byte offset."""
+    """Return the error that names the line of a byte offset in a VRML file, and what was expected there."""
     return InputError(f"{source}: line {_line(text, offset)}: expected {expected}, found {given}.")
 
 

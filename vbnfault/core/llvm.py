@@ -176,7 +176,7 @@ def _inspect(path: Path, origin: str) -> Candidate:
 
 
 def _candidate(path: Path, origin: str, version: tuple[int, int, int]) -> Candidate:
-    """Return a library of a known version."""
+    """Return the candidate for a library whose version is known, with the reason if it cannot be used."""
     problem = f"version {version[0]} aborts the first render" if version[0] < OLDEST_USABLE else ""
     return Candidate(path=path, origin=origin, version=version, problem=problem)
 

@@ -81,7 +81,7 @@ class Plugin:
 
     @property
     def models(self) -> list[type[Fault]]:
-        """Return the models that it defines."""
+        """Return the registered fault models that this plug-in defines."""
         return [cls for cls in models.registered() if self.defines(cls)]
 
     @property

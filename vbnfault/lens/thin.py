@@ -257,7 +257,7 @@ class Halo:
 
 
 def _moffat(scale_px: float, index: float, shape: tuple[int, int]) -> F64:
-    """Return a profile of Moffat averaged over pixels, on the offsets of `Halo.on_pixels`; its sum is 1."""
+    """Return Moffat's profile, averaged over each pixel around the centre of an image; its sum is 1."""
 
     def profile(down: F64, across: F64) -> F64:
         return np.asarray((1 + (down[:, None] ** 2 + across**2) / scale_px**2) ** (-index / 2))

@@ -71,7 +71,7 @@ def draw(
     *,
     attempt: int = 0,
 ) -> dict[str, NDArray[np.float64]]:
-    """Return `uniform`, in which the Sun is out of view of the Sun-averted samples."""
+    """Return draws of all variables as `uniform` does, and keep the Sun out of view of the Sun-averted samples."""
     drawn = uniform(scene, samples, stratum, light, paired, attempt=attempt)
     keep_sun_out_of_view(scene, samples, stratum, drawn, attempt)
     return drawn

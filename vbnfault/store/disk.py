@@ -385,7 +385,7 @@ class Disk:
         return self.path
 
     def failure(self, error: Exception, name: str) -> VbnfaultError | None:
-        """Return the error for a failure while zarr reads an array that is no damage; None for any other."""
+        """Return the error to raise where zarr may not read an array's files; None for other causes."""
         return denied(error, self.path / name) if isinstance(error, PermissionError) else None
 
     def write(self, files: Iterable[tuple[str, bytes | Path]]) -> None:

@@ -493,7 +493,7 @@ def _flux_mm2(source: GhostSource, paths: tuple[tuple[int, ...], ...]) -> dict[t
     return source.model.flux_mm2(*source.sun, paths)
 
 
-# Stage and part of the functions that are not stages of their own.
+# The stage and the part of it under which the time of these functions is counted.
 _STAGES: Mapping[Callable[..., Any], tuple[str, str]] = {
     _flux_mm2: ("ghosts", "single"),
     GlareLayout: ("glare", "layout"),
