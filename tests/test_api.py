@@ -238,6 +238,9 @@ def test_what_is_no_path_is_refused_in_a_sentence(tmp_path: Path, path: Any) -> 
         ({"shard_range": (0, 1)}, r"shard_range = \(0, 1\): must be an instance of range"),
         ({"shard_range": range(0, 4, 2)}, r"shard_range = range\(0, 4, 2\): must be a range of steps of 1"),
         ({"overwrite": "never"}, "overwrite = 'never': must be true or false"),  # a text that is not empty is true
+        ({"overwrite": "yes"}, "overwrite = 'yes': must be true or false"),
+        ({"workers": True}, "workers = True: must be a whole number"),
+        ({"workers": "2"}, "workers = '2': must be a whole number"),
         ({"dry_run": 2}, "dry_run = 2: must be true or false"),
         ({"recycle_shards": None}, "recycle_shards = None: must be a whole number of at least 1"),
         ({"scheduler": 8786}, "scheduler = 8786: must be a string"),

@@ -6,6 +6,7 @@ import itertools
 import sys
 import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -61,6 +62,21 @@ def test_units(tmp_path: Path, size: float, unit: str, side_m: float) -> None:
     mesh.export(tmp_path / "box.ply")
     vertices, _ = load_shape(tmp_path / "box.ply", unit)  # type: ignore[arg-type]
     np.testing.assert_allclose(np.ptp(vertices, axis=0), side_m, rtol=1e-6)  # PLY may hold float32
+
+
+@pytest.mark.parametrize(
+    ("values", "says"),
+    [
+        ({"unit": "KM"}, "unit must be one of auto, m, km; got 'KM'"),
+        ({"volume_m3": -1.0}, "volume_m3 must be positive"),
+        ({"density_kg_m3": -1.0}, "density_kg_m3 must be positive"),
+        ({"rotation_period_s": 0.0}, "rotation_period_s must be positive"),
+    ],
+)
+def test_a_body_of_impossible_values_is_refused(tmp_path: Path, values: dict[str, Any], says: str) -> None:
+    trimesh.creation.box((2, 2, 2)).export(tmp_path / "box.ply")
+    with pytest.raises(InputError, match=says):
+        load_body(tmp_path / "box.ply", **values)
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import errno
 import json
@@ -13,10 +14,12 @@ import resource
 import shutil
 import subprocess
 import sys
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 from conftest import deny
 from synthetic import SAMPLES, Broken, Session, fake_sample, flip, make_spec, run, site_of
@@ -411,6 +414,17 @@ def test_where_a_file_system_has_no_locks_a_file_names_the_owner(
     other.write_text(json.dumps({"host": "elsewhere", "pid": os.getpid(), "started": 1.0}))
     with pytest.raises(VbnfaultError, match=r"process .* on elsewhere"):
         run(out, overwrite=True)
+    # of another host's claim nothing is heard for an hour; one of this host's stands still
+    for host, started, held in (("elsewhere", 1.0, False), (platform.node(), psutil.Process().create_time(), True)):
+        other.write_text(json.dumps({"host": host, "pid": os.getpid(), "started": started}))
+        os.utime(other, (time.time() - 3600,) * 2)
+        with pytest.raises(VbnfaultError, match="another command") if held else contextlib.nullcontext():
+            run(out)
+        folder.mkdir(exist_ok=True)
+    for content in ("[]", "3", "[" * 20000, json.dumps({"host": platform.node(), "pid": -1})):  # by a stranger
+        other.write_text(content)
+        with pytest.raises(VbnfaultError, match="another command is writing to it"):
+            run(out)
     # killed on this host: a process that is no more, or another one with its number
     dead = subprocess.Popen([sys.executable, "-c", ""])
     dead.wait()

@@ -145,6 +145,31 @@ def test_rays_near_total_reflection_cancel_in_the_spectrum() -> None:
     np.testing.assert_allclose(flux(sensed), sensed.weights @ lines, rtol=0.01)
 
 
+@pytest.mark.parametrize("case", ["a line filter where the coating reflects nothing", "a glass that blocks red"])
+def test_ghosts_beside_dark_wavelengths_stay(case: str) -> None:
+    """They are within 2 % of single wavelengths: the light at the dark ones is no measure of that beside them."""
+    lens = scaled_to_field(load_lens("tessar_50_f2p8"), 65.0, SIZE * 0.02).coated("bbar")
+    if case.startswith("a line"):
+        nm, low, high = np.linspace(450.0, 800.0, 351), 548.0, 552.0
+    else:
+        nm, low, high = np.linspace(400.0, 1000.0, 601), 570.0, 700.0
+        first = replace(
+            lens.surfaces[0], internal_transmittance_10mm=((400.0, 690.0, 700.0, 1000.0), (1, 0.9, 0, 0))
+        )
+        lens = replace(lens, surfaces=(first, *lens.surfaces[1:]))
+    sensed = Bands.of(nm, ((nm >= low) & (nm <= high)).astype(float)[None])
+    sensor = SensorGrid(shape=(SIZE, SIZE), pitch_mm=0.02)
+
+    def total(bands: Bands) -> float:
+        return float(FlareModel(lens, bands, sensor, sun_radius_rad=0.005).image(5.0).sum(axis=(1, 2))[0])
+
+    some = np.arange(low, high + 1, 4.0 if high - low > 10 else 1.0)
+    lines = CubicSpline(some, [total(Bands.lines(at)) for at in some])(nm)
+    assert total(sensed) == pytest.approx(
+        float(sensed.weights[0] @ np.where(sensed.weights[0] > 0, lines, 0)), rel=0.02
+    )
+
+
 def test_the_list_of_ghosts_has_the_means_of_both_coatings() -> None:
     """Without dispersion a paraxial ghost has one geometry, and its light is that of the package tmm."""
     bare = without_dispersion(doublet())

@@ -101,7 +101,8 @@ def vrml2(v: np.ndarray, f: np.ndarray) -> str:
         '#VRML V2.0 utf8\n# counts 12 20 [ {\nWorldInfo { title "a } body" }\n'
         "Transform { translation 0 0 0 rotation 0 0 1 0 scale 1 1 1 children [\n"
         "Viewpoint { position 0 0 9 orientation 0 1 0 1.5 }\n"
-        "Shape { appearance Appearance { material Material { diffuseColor 0.5 0.5 0.5 } }\n"
+        "Shape { appearance Appearance { material Material { diffuseColor 0.5 0.5 0.5 }"
+        " textureTransform TextureTransform { scale 10 10 translation 0.5 0.5 } }\n"
         " geometry IndexedFaceSet { solid TRUE\n coord DEF P Coordinate { point [\n" + points + "] }\n"
         " coordIndex [\n" + index + "] } } ] }\n"
     )
@@ -426,11 +427,18 @@ def changed(lines: list[str], line: int, text: str) -> str:
         (VRML.rstrip("\n }]"), "open.wrl", "closed by '\\]' after coordIndex"),
         (VRML.rstrip("\n }"), "brace.wrl", "expected as many '}' as '{' by the end"),
         (VRML + "}", "extra.wrl", "expected as many '}' as '{'"),
+        (
+            VRML.replace("Shape {", "Shape { geometry PointSet { coord Coordinate { point [ 9 9 9 ] } } } Shape {")
+            .replace("coord DEF P Coordinate {", "coordIndex [ 0 0 0 -1 ] coord DEF P Coordinate {", 1),
+            "order.wrl",
+            "points before the coordIndex",
+        ),
         (VRML.replace("scale 1 1 1", "scale 1 2 1"), "scale.wrl", "line 4: .*found a transform with scale 1 2 1"),
         (VRML.replace("0 0 1 0 scale", "0 0 1 0.5 scale"), "turn.wrl", "line 4: .*transform with rotation"),
         (VRML.replace("0, 11,", "0, 12,", 1), "index.wrl", "line 23: expected point numbers from 0 to 11 or -1"),
         (VRML.replace("0, 11,", "0, x,", 1), "word.wrl", "line 23: expected a number, found 'x'"),
         (VRML.replace("0, 11, 5, -1", "0, 11, -1", 1), "edge.wrl", "line 23: expected polygons of at least three"),
+        (letters(V, F).replace("f ", "F ", 1), "face.tab", "line 13: expected `v x y z` or `f a b c`, found 'F"),
         (VRML + "Shape { geometry USE Q }", "use.wrl", "expected geometry written out, found USE Q"),
     ],
 )  # fmt: skip

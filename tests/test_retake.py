@@ -323,7 +323,6 @@ def test_a_killed_retake_resumes_to_the_same_digest(
 def test_of_half_a_store_the_finished_samples_are_taken(
     source: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    caplog.set_level("INFO", "vbnfault")
     half = store.open_store(shutil.copytree(source, tmp_path / "half.zarr"), "r+")
     half._write_done(0, {1, 2})
     scene = scene_with()

@@ -302,7 +302,6 @@ def test_the_radiance_before_the_lens_and_without_stars_is_used(
 def test_a_store_that_has_begun_keeps_its_samples_unless_it_is_replaced(
     overwrite: bool, taken: list[int], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    caplog.set_level("INFO", "vbnfault")
     finished: Any = SimpleNamespace(
         begun=lambda: [0],
         done=lambda _: dict.fromkeys(range(4), True),

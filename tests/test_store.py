@@ -6,6 +6,7 @@ import errno
 import json
 import os
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from vbnfault import store as st
 from vbnfault.core.errors import InputError, VbnfaultError
 from vbnfault.scene.config import parse_scene
 from vbnfault.scene.plan import make_plan
+from vbnfault.store import disk
 
 
 def test_a_finished_store_verifies_and_reads_back(whole: st.Store) -> None:
@@ -265,7 +267,22 @@ def test_no_store_is_created_within_another(finished_store: Path) -> None:
         assert not (finished_store / name).exists()
 
 
-def test_create_leaves_foreign_folders_alone(whole: st.Store, tmp_path: Path) -> None:
+def renamed_once() -> Callable[[Path, Path], None]:
+    """A rename that works once, and then fails as on a broken disk."""
+    names: list[Path] = []
+
+    def rename(source: Path, target: Path) -> None:
+        names.append(source)
+        if len(names) > 1:
+            raise OSError(errno.EIO, "Input/output error")
+        os.replace(source, target)
+
+    return rename
+
+
+def test_create_leaves_foreign_folders_alone(
+    whole: st.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     foreign = tmp_path / "photos"
     foreign.mkdir()
     (foreign / "a.png").write_bytes(b"x")
@@ -278,6 +295,13 @@ def test_create_leaves_foreign_folders_alone(whole: st.Store, tmp_path: Path) ->
     assert st.create(whole.path, make_spec(), 3, overwrite=True).samples == 3
     (tmp_path / "empty").mkdir()
     st.create(tmp_path / "empty", make_spec(), 3)
+    # the new store cannot take its place: the old one stays
+    digest = st.digest(st.open_store(whole.path))
+    with monkeypatch.context() as patch:
+        patch.setattr(disk, "rename", renamed_once())
+        with pytest.raises(VbnfaultError, match="no store can be created here"):
+            st.create(whole.path, make_spec(), 5, overwrite=True)
+    assert st.digest(st.open_store(whole.path)) == digest
     assert sorted(p.name for p in tmp_path.iterdir()) == ["empty", "photos", "s.zarr"]
     with pytest.raises(InputError, match="must be at least 1"):
         st.create(tmp_path / "none", make_spec(), 0)

@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..core.errors import InputError
 from .geometry import Float64, Int32, centre_of_mass, face_normals_areas, signed_volume, vertex_normals
 from .gravity import PolyhedronGravity
 from .noise import fractal_noise
@@ -56,6 +57,10 @@ class Body:
     rotation_period_s: float = ROTATION_PERIOD_67P_S
 
     def __post_init__(self) -> None:
+        for key in ("density_kg_m3", "rotation_period_s"):
+            value = getattr(self, key)
+            if not (math.isfinite(value) and value > 0):
+                raise InputError(f"{self.name}: {key} must be positive and finite; got {value}.")
         for key, dtype in (("vertices_m", "<f8"), ("faces", "<i4")):
             array = np.array(getattr(self, key), dtype=dtype)
             array.setflags(write=False)
@@ -147,6 +152,8 @@ def load_body(
         vertices_m, faces = load_shape(shape, unit)
         vertices_m = sharpened(vertices_m, faces, sharpen)
     if volume_m3 is not None:
+        if not (math.isfinite(volume_m3) and volume_m3 > 0):
+            raise InputError(f"volume_m3 must be positive and finite; got {volume_m3}.")
         vertices_m = vertices_m * (volume_m3 / signed_volume(vertices_m, faces)) ** (1 / 3)
     return Body(
         name=name or (EMBEDDED if str(shape) == EMBEDDED else Path(shape).stem),

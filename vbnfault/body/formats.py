@@ -78,6 +78,9 @@ def read_shape(path: Path, data: bytes) -> RawShape:
     if not data.translate(_FORTRAN).strip():
         raise InputError(f"{source}: line 1: expected vertices and facets, found nothing.")
     if re.search(rb"(?m)^[ \t]*v[ \t]", data):  # lines `v x y z` and `f a b c`, as in the PDS's radar shapes
+        if lost := re.search(rb"(?m)^[ \t]*[VF\d.+-].*$", data):
+            line, given = _line(data, lost.start()), _shown(lost[0])
+            raise InputError(f"{source}: line {line}: expected `v x y z` or `f a b c`, found {given}.")
         return RawShape(*joined(read_obj(_clean(data), source, may_count_from_0=True)))
     if path.suffix.lower() == ".icq" or _is_icq(data):
         return RawShape(*read_icq(data, source))
@@ -105,13 +108,17 @@ def read_plate_table(data: bytes, source: str) -> Mesh:
         raise table.error(0, "the number of vertices, an integer of at least 4", f"{first:g}")
     if len(counts) > 2:
         raise table.error(0, "the number of vertices and of facets", f"{len(counts)} numbers")
-    vertices, at = table.block(1, int(first), "vertex", "vertices")
+    start = 1
+    if len(counts) == 1 and len(table.row(1)) == 1:
+        counts, start = np.append(counts, table.row(1)), 2
+    vertices, at = table.block(start, int(first), "vertex", "vertices")
+    where = start - 1
     if len(counts) == 1:
-        counts = np.append(counts, table.row(at))
-        if len(counts) != 2 or counts[1] != np.floor(counts[1]):
-            given = _listed(counts[1:]) or "the end"
-            raise table.error(at, f"the number of facets after {len(vertices)} vertices", given)
+        counts, where = np.append(counts, table.row(at)), at
         at += 1
+    if len(counts) != 2 or counts[1] != np.floor(counts[1]) or not 0 <= counts[1] < 2**31:
+        given = _listed(counts[1:]) or "the end"
+        raise table.error(where, f"the number of facets after {len(vertices)} vertices", given)
     table.leave_out_corner_counts(at)
     faces, end = table.block(at, int(counts[1]), "facet", "facets")
     if end < len(table.lines):
@@ -379,7 +386,11 @@ _STATEMENT = re.compile(
     + rb"|\bcoordIndex\s*"
     + _NUMBERS.replace(b"(", b"(?P<index>")
     + rb"|(?P<before>\S*)\s+USE\s+(?P<used>[^\s{}\[\],]+)"
-    rb"|\b(?P<field>translation|rotation|scale|scaleFactor|matrix)\s+(?P<values>(?:" + _NUMBER + rb"[\s,]*){3,16})"
+    rb"|\b(?P<field>translation|rotation|scale|scaleFactor|matrix)\s+(?P<values>"
+    + _NUMBER
+    + rb"(?:[\s,]+"
+    + _NUMBER
+    + rb"){2,15})(?![^\s,{}\[\]])"
 )
 _MAY_BE_USED = (b"appearance", b"material", b"texture", b"textureTransform", b"normal", b"color", b"texCoord")
 _IDENTITY = {
@@ -446,7 +457,7 @@ def _face_sets(text: bytes, source: str, *, keeps_points: bool) -> Iterator[tupl
     kind, points, named = b"", None, {}
     for match in _STATEMENT.finditer(text):
         if match["kind"]:
-            kind = match["kind"]
+            kind, points = match["kind"], points if keeps_points else None
         elif match["points"] is not None:
             points = named[match["name"]] = match
         elif match["used"]:

@@ -65,6 +65,8 @@ def load_shape(path: str | Path, unit: Unit = "auto") -> tuple[Float64, Int32]:
         The file is missing, unreadable, of another type, or not a closed mesh.
     """
     path = Path(path)
+    if unit not in ("auto", "m", "km"):  # another one would count as metres
+        raise InputError(f"{path}: unit must be one of auto, m, km; got {unit!r}.")
     data = user_files.read_input(path, "shape", types=FILE_TYPES)
     suffix = path.suffix.lower()
     native: Unit | None = None

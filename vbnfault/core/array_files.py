@@ -140,7 +140,7 @@ class ArrayFiles:
         if not stat.S_ISREG(path.stat().st_mode):
             raise ValueError("not a regular file")
         data = path.read_bytes()
-        content = data[:-_DIGEST_BYTES]
+        content = memoryview(data)[:-_DIGEST_BYTES]
         if _digest(key, content) != data[-_DIGEST_BYTES:]:
             raise ValueError("its checksum does not match")
         with np.load(io.BytesIO(content), allow_pickle=False) as file:
@@ -162,21 +162,22 @@ class ArrayFiles:
                 unfinished = Path(file.name)
                 content = io.BytesIO()
                 np.savez(content, **arrays)
-                file.write(content.getvalue() + _digest(key, content.getvalue()))
+                file.write(content.getbuffer())
+                file.write(_digest(key, content.getbuffer()))
             if path.is_dir() and not path.is_symlink():
                 shutil.rmtree(path)
             os.replace(unfinished, path)
             unfinished = None
             _evict(path.parent, limit_bytes)
-        except OSError as error:  # the folder is read-only or full, or another worker uses the file
-            _warn_unwritable(path.parent, self.content, error.strerror or str(error))
+        except (OSError, MemoryError) as error:  # the folder is read-only or full, or another worker uses the file
+            _warn_unwritable(path.parent, self.content, getattr(error, "strerror", None) or str(error))
         finally:
             if unfinished is not None:
                 with contextlib.suppress(OSError):
                     unfinished.unlink()
 
 
-def _digest(key: str, content: bytes) -> bytes:
+def _digest(key: str, content: bytes | memoryview) -> bytes:
     """Return the checksum of a file's content and of the key that determines it."""
     total = hashlib.sha256(key.encode())
     total.update(content)

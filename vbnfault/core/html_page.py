@@ -87,7 +87,8 @@ def image_url(image: NDArray[np.uint8], side_px: int) -> str:
     """Return an image [y, x] or [y, x, 3] as an address within the page, its longer side at most `side_px`."""
     factor = side_px / max(image.shape[:2])
     if factor < 1:
-        image = np.asarray(cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA), np.uint8)
+        size = tuple(max(1, round(n * factor)) for n in image.shape[1::-1])
+        image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
     if max(image.shape[:2]) <= _LOSSLESS_PX:
         return data_url(encoded(image, ".png"), "image/png")
     return data_url(encoded(image, ".webp", _QUALITY), "image/webp")

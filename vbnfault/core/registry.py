@@ -84,7 +84,13 @@ class Registry(Mapping[str, T]):
         again = qualname != "" and (known.qualname, known.file) == (qualname, file)
         if known.entry != entry and not again:
             files = dict.fromkeys([known.file, file])
-            raise DeclarationError([name], f"{self.kind} {name} is defined twice: in {' and in '.join(files)}")
+            text = f"{self.kind} {name} is defined twice: in {' and in '.join(files)}"
+            hint = (
+                "; rename one, or start Python again if an earlier scene has loaded the other"
+                if len(files) > 1
+                else ""
+            )
+            raise DeclarationError([name], text + hint)
         self._replace(self._definitions | {name: new})
 
     def _replace(self, definitions: dict[str, _Definition]) -> None:

@@ -52,7 +52,8 @@ def warn_in_sentences() -> None:
     The library logs to `vbnfault`; other libraries use `warnings`.
     """
     logger = logging.getLogger("vbnfault")
-    logger.handlers[:], logger.level = [_Sentences()], logging.INFO
+    logger.handlers[:] = [_Sentences()]
+    logger.setLevel(logging.INFO)
     warnings.showwarning = lambda message, *_, **__: print(f"warning: {message}", file=sys.stderr, flush=True)
 
 

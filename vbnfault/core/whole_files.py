@@ -60,6 +60,8 @@ def write_whole(path: Path, content: str | bytes) -> None:
         )
         with os.fdopen(descriptor, "wb") as file:
             file.write(data)
+            file.flush()
+            flush(file.fileno())
         if mode is not None:
             with contextlib.suppress(OSError):  # a file system without permissions
                 temporary.chmod(mode)
@@ -85,7 +87,8 @@ class replacing:
                 if self._temporary.is_dir():
                     remove(self._path)
                 else:
-                    _flush_at(self._temporary, os.O_RDWR | getattr(os, "O_BINARY", 0))
+                    with contextlib.suppress(PermissionError):  # `write_whole` has flushed it and set its mode
+                        _flush_at(self._temporary, os.O_RDWR | getattr(os, "O_BINARY", 0))
                 rename(self._temporary, self._path)
         finally:
             with contextlib.suppress(OSError):  # the first error counts

@@ -19,7 +19,7 @@ from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, InstanceOf, WithJsonSchema
+from pydantic import BeforeValidator, Field, InstanceOf, Strict, WithJsonSchema
 
 from .. import store as store_module
 from ..core import environment, tables
@@ -46,6 +46,16 @@ __all__ = [
     "build",
     "planned_blocks",
 ]
+
+
+def _of_python(value: Any) -> Any:
+    """Return a number or truth value of numpy as one of Python; other values as they are."""
+    return value.item() if isinstance(value, np.generic) else value
+
+
+# Neither 1 is true here nor "2" a number: an option such as `overwrite` must not be set by chance.
+_OF_PYTHON = BeforeValidator(_of_python)
+_Flag = Annotated[bool, Strict(), _OF_PYTHON]
 
 
 @tables.table_class()
@@ -81,15 +91,15 @@ class BuildOptions:
         If a value is outside its range, or if two options exclude each other.
     """
 
-    workers: Annotated[int, Field(ge=1, le=environment.MOST_THREADS)] = 1
-    threads: Annotated[int, Field(ge=1, le=environment.MOST_THREADS)] | None = None
-    scheduler: str | None = None
-    overwrite: bool = False
-    accept_versions: bool = False
-    dry_run: bool = False
-    progress: bool = True
+    workers: Annotated[int, Field(strict=True, ge=1, le=environment.MOST_THREADS), _OF_PYTHON] = 1
+    threads: Annotated[int, Field(strict=True, ge=1, le=environment.MOST_THREADS), _OF_PYTHON] | None = None
+    scheduler: Annotated[str, Strict()] | None = None
+    overwrite: _Flag = False
+    accept_versions: _Flag = False
+    dry_run: _Flag = False
+    progress: _Flag = True
     shard_range: Annotated[InstanceOf[range], WithJsonSchema({"title": "a range"})] | None = None
-    recycle_shards: Annotated[int, Field(ge=1)] = 32
+    recycle_shards: Annotated[int, Field(strict=True, ge=1), _OF_PYTHON] = 32
 
     def __post_init__(self) -> None:
         if self.scheduler is not None and self.workers > 1:

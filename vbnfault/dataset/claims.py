@@ -30,6 +30,7 @@ _MOST_BYTES = 65536  # of a claim
 _SECONDS_BETWEEN_BEATS = 20.0
 _SECONDS_OF_A_CLAIM = 120.0
 _SECONDS_BETWEEN_TRIES = 0.2
+_TRIES = 10  # to write a claim
 _NAME = re.compile(r"(whole|prepare|shards-(\d+)-(\d+))\.([0-9a-f]{32})\.json")
 PREPARE = "prepare"
 
@@ -61,22 +62,22 @@ def this_process() -> dict[str, Any]:
     return {"host": platform.node(), "pid": os.getpid(), "started": psutil.Process().create_time()}
 
 
-def has_ended(owner: dict[str, Any]) -> bool:
-    """Return whether the owner of a claim was a process of this host that has ended.
+def has_ended(owner: dict[str, Any]) -> bool | None:
+    """Return whether the owner of a claim, a process of this host, has ended; None if that is not known.
 
     The start time is compared, too: another process may have got the number of the owner.
     """
     import psutil
 
     if owner.get("host") != platform.node() or not isinstance(owner.get("pid"), int):
-        return False
+        return None
     try:
         process = psutil.Process(owner["pid"])
         same = process.create_time() == owner.get("started")
     except psutil.NoSuchProcess:
         return True
-    except psutil.Error:
-        return False
+    except (psutil.Error, ValueError, OverflowError):  # no number of a process
+        return None
     return not same or process.status() == psutil.STATUS_ZOMBIE
 
 
@@ -94,7 +95,7 @@ class _Claims(NamedTuple):
         return cls(files_of(path.absolute().with_name(f".{path.name}.claims")), "")
 
 
-class _Claim(NamedTuple):
+class Claim(NamedTuple):
     """Hold a claim of another command: its file, what it is for, and its owner."""
 
     file: str
@@ -137,9 +138,9 @@ def prepared(path: Location, seconds: float) -> Iterator[None]:
         time.sleep(_SECONDS_BETWEEN_TRIES * (1 + random.random()))  # so that two do not wait in step
 
 
-def ranges_at_work(path: Location) -> list[range]:
-    """Return the ranges of shards that commands claim now, this one's too."""
-    return [other.shards for other in _others(_Claims.on(path), "") if other.shards is not None]
+def at_work(path: Location) -> list[Claim]:
+    """Return what commands claim of a store now, this one's claim too."""
+    return [claim for claim in _others(_Claims.on(path), "") if claim.kind != PREPARE]
 
 
 @contextlib.contextmanager
@@ -149,15 +150,24 @@ def _written(path: Location, claims: _Claims, kind: str) -> Iterator[str]:
     file, content = f"{claims.folder}{name}", json.dumps(this_process()).encode()
     ended = threading.Event()
 
+    def write() -> None:
+        for tries_left in range(_TRIES, 0, -1):
+            try:
+                if not isinstance(files.path, Url):
+                    own_folder(files.path)
+                files.write([(file, content)])
+                return
+            except FileNotFoundError:  # another command has removed the folder after its last claim
+                if tries_left == 1:
+                    raise
+
     def beat() -> None:
         while not ended.wait(_SECONDS_BETWEEN_BEATS):
             with contextlib.suppress(OSError, VbnfaultError):
-                files.write([(file, content)])
+                write()
 
     try:
-        if not isinstance(files.path, Url):
-            own_folder(files.path)
-        files.write([(file, content)])
+        write()
     except OSError as error:
         raise (VbnfaultError if isinstance(path, Url) else kind_of_error(error))(
             f"{path}: cannot be written: {error.strerror}; nothing is lost, and the same command resumes once that "
@@ -176,7 +186,7 @@ def _written(path: Location, claims: _Claims, kind: str) -> Iterator[str]:
                 files.path.rmdir()  # the last one
 
 
-def _others(claims: _Claims, own: str) -> list[_Claim]:
+def _others(claims: _Claims, own: str) -> list[Claim]:
     """Return the claims of other commands at work, and remove those of killed ones."""
     written = claims.files.modified(claims.folder)
     now = written.get(own) or max(written.values(), default=None)
@@ -189,13 +199,15 @@ def _others(claims: _Claims, own: str) -> list[_Claim]:
             owner = json.loads(claims.files.read(f"{claims.folder}{name}", _MOST_BYTES))
         except FileNotFoundError:  # it has just ended
             continue
-        except (OSError, ValueError):
+        except (OSError, ValueError, RecursionError):
             owner = {}
+        owner = owner if isinstance(owner, dict) else {}
+        known = has_ended(owner)  # a process of this host that stands still keeps its claim
         too_old = now is not None and (now - moment).total_seconds() > _SECONDS_OF_A_CLAIM
-        if too_old or has_ended(owner):
+        if known or (known is None and too_old):
             with contextlib.suppress(OSError):
                 claims.files.remove([f"{claims.folder}{name}"])
             continue
         shards = range(int(match[2]), int(match[3])) if match[2] else None
-        others.append(_Claim(f"{claims.files.path}/{claims.folder}{name}", match[1].split("-")[0], shards, owner))
+        others.append(Claim(f"{claims.files.path}/{claims.folder}{name}", match[1].split("-")[0], shards, owner))
     return others

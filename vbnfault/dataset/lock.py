@@ -60,6 +60,9 @@ def locked(path: Location, shards: range | None = None) -> Iterator[None]:
             for held, file in _held_locks(path):
                 if held != shards and overlap(held, shards):
                     raise still_writing(path, _read_owner(file), held)
+            for claim in claims.at_work(path):  # of hosts that mount this folder without locks
+                if overlap(claim.shards, shards):
+                    raise still_writing(path, claim.owner, claim.shards, claim.file)
         yield
 
 
@@ -88,7 +91,8 @@ def prepared_by_one(path: Location) -> Iterator[None]:
 def others_at_work(path: Location, shards: range) -> bool:
     """Return whether other commands write other shards of the store at `path` now."""
     held = [] if isinstance(path, Url) else [held for held, _ in _held_locks(path)]
-    return any(others not in (None, shards) for others in (*held, *claims.ranges_at_work(path)))
+    claimed = [claim.shards for claim in claims.at_work(path)]
+    return any(others not in (None, shards) for others in (*held, *claimed))
 
 
 def _stem(path: Path, shards: range | None) -> str:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -96,6 +96,11 @@ def migrate_store(
     source = store_module.open_store(path)
     if out is None:
         return source
+    target = located(out)
+    new = replace(source.spec, codecs={}).codecs
+    other = store_module.is_store(target) and not _same(source.path, target)
+    if other and store_module.open_store(target).spec.codecs != new:
+        raise InputError(f"{target}: exists already, and its layers have other codecs; choose another --out")
     summary = join_stores([source.path], out, progress=progress, codecs={})
     card.write_card(summary.path)
     return store_module.open_store(summary.path)

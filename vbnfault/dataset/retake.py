@@ -233,7 +233,7 @@ def _samples(opened: Store, out: store.Location, options: build.BuildOptions) ->
         wanted = np.concatenate([np.arange(first, last + 1) for first, last in ranges])
         samples = np.flatnonzero(np.isin(plan_numbers(opened.attributes), wanted))
     if len(samples) < opened.samples:
-        logging.getLogger("vbnfault").info(
+        logging.getLogger("vbnfault").warning(
             f"{opened.path}: {len(samples)} of {opened.samples} samples are taken, those that were finished"
         )
     return samples

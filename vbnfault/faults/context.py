@@ -131,7 +131,8 @@ class FaultContext:
 
         `apply` and `footprint` share the result, so an expensive computation runs only once.
         """
-        key = function.__module__, function.__qualname__, pickle.dumps((params, more))
+        owner = getattr(function, "__self__", None)  # the model of a method, whose keys count too
+        key = function.__module__, function.__qualname__, pickle.dumps((owner, params, more))
         if key not in self._memo:
             self._memo[key] = function(params, self, *more)
         result: T = self._memo[key]

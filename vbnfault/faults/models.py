@@ -25,7 +25,10 @@ _REGISTRY: Registry[type[Fault]] = Registry("fault model", __package__ or "")
 
 
 def register(cls: type[Fault]) -> None:
-    """Add a model to the registry. Raise DeclarationError if another class has its names."""
+    """Add a model to the registry. Raise DeclarationError if another class has its names, or they are no names."""
+    if not is_name(cls.fault) or not is_name(cls.model):  # it would stay registered
+        problem = "its names must consist of lower-case letters, digits and underscores"
+        raise DeclarationError([cls.fault], f"fault model {cls.fault}/{cls.model}: {problem}")
     _REGISTRY.add(f"{cls.fault}/{cls.model}", cls, module=cls.__module__, qualname=cls.__qualname__)
 
 
@@ -105,9 +108,7 @@ def _check(cls: type[Fault]) -> None:
     """Raise DeclarationError if a model declares its names, its place or its fields wrongly."""
     problem = ""
     options = cls.__dict__.get("__dataclass_params__")
-    if not is_name(cls.fault) or not is_name(cls.model):
-        problem = "its names must consist of lower-case letters, digits and underscores"
-    elif cls.default and cls.after is None:
+    if cls.default and cls.after is None:
         problem = "the default model must state the class after which its class acts: after = ..."
     elif cls.default and cls.axis is not None and not is_packaged(cls):
         problem = f"axis = {cls.axis}: only the six classes of the paper have a position"

@@ -118,7 +118,7 @@ def load_installed() -> None:
 
 def _load(wanted: Mapping[str, str]) -> None:
     """Load plug-ins, each with its name in messages, together or not at all."""
-    new, modules = dict(loaded), set(sys.modules)
+    new, modules = dict(loaded), dict(sys.modules)
     try:
         with registry.undoing_registrations():
             for name, where in wanted.items():
@@ -128,9 +128,11 @@ def _load(wanted: Mapping[str, str]) -> None:
             _check_together({where: new[name] for name, where in wanted.items()})
     except BaseException:  # the next attempt imports them anew
         tops = {name.split(".")[0] for name in wanted}
-        for name in set(sys.modules) - modules:
+        for name in sys.modules.keys() - modules:
             if name.split(".")[0] in tops:
                 del sys.modules[name]
+        for name in modules.keys() - sys.modules:  # helpers of a file that was to be loaded again
+            sys.modules[name] = modules[name]
         raise
     loaded.update(new)
 
@@ -321,7 +323,9 @@ def _check_together(plugins: Mapping[str, Plugin]) -> None:
         effects.order()
     except registry.DeclarationError as error:
         guilty = [w for w, p in plugins.items() if any(cls.fault in error.names for cls in p.models)]
-        raise InputError(f"{', '.join(guilty or plugins) or 'plug-ins'}: {error}") from None
+        earlier = [p.file or p.name for p in loaded.values() if any(cls.fault in error.names for cls in p.models)]
+        hint = "" if guilty or not earlier else f"; an earlier scene has loaded {earlier[0]}: start Python again"
+        raise InputError(f"{', '.join(guilty or plugins) or 'plug-ins'}: {error}{hint}") from None
 
 
 @contextlib.contextmanager

@@ -18,8 +18,8 @@ scalars (everything else). These rules protect a store against kills, power loss
   rebuilt.
 """
 
-from .arrays import EFFECT_RULE, LAYERS, MASK_RULES, REQUIRED_LAYERS, SCALARS, SEMANTIC, Array, Member
-from .bucket import OWN, Bucket, Url
+from .arrays import EFFECT_RULE, LAYERS, MASK_RULES, REQUIRED_LAYERS, SCALARS, SEMANTIC, Array
+from .bucket import OWN, Url
 from .check import (
     FaultCounts,
     Planned,
@@ -39,7 +39,7 @@ from .check import (
 )
 from .codec import Encoded, SharedChunks, encode, mask_union
 from .files import Files, Location, files_of, located
-from .group import MOST_DOCUMENT_BYTES, check_free, create, is_store, open_dataset, open_store, write_samples
+from .group import check_free, create, is_store, open_dataset, open_store, write_samples
 from .layout import drawn_table, is_sealed, sealed
 from .metadata import append_samples, recover
 from .opened import Store

@@ -18,7 +18,7 @@ import stat
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from datetime import datetime
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TypeVar
 
@@ -369,7 +369,7 @@ class Disk:
         written = {}
         for name in self.names(folder):
             with contextlib.suppress(OSError):
-                written[name] = datetime.fromtimestamp(os.lstat(self.path / folder / name).st_mtime)
+                written[name] = datetime.fromtimestamp(os.lstat(self.path / folder / name).st_mtime, UTC)
         return written
 
     def stamp(self, name: str) -> object:
@@ -422,7 +422,7 @@ class Disk:
     def create(self, files: Iterable[tuple[str, bytes]], *, old: bool) -> None:
         """Make a store of these files, the root last, in place of an `old` store; it appears when it is whole.
 
-        Raises OSError if that is impossible.
+        The caller holds the lock of the store. Raises OSError if that is impossible; an old store stays then.
         """
         target = self.path.absolute()
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -432,18 +432,18 @@ class Disk:
                 remove_whole(left)
             hidden.mkdir()
             write(hidden, files)
-            if old:
-                rename(target, retired)
-            elif target.is_dir():
-                target.rmdir()
             try:
+                if old:
+                    rename(target, retired)
+                elif target.is_dir():
+                    target.rmdir()
                 rename(hidden, target)
-            except OSError:
-                if old and not target.exists():
-                    rename(retired, target)
+            except BaseException:
+                if old and retired.exists() and not os.path.lexists(target):
+                    os.replace(retired, target)
                 raise
         finally:
-            for left in (hidden, retired):
+            for left in (hidden, retired) if os.path.lexists(target) else (hidden,):
                 with contextlib.suppress(OSError):
                     remove_whole(left)
 

@@ -43,7 +43,8 @@ def create(path: str | os.PathLike[str] | Url, spec: StoreSpec, samples: int, *,
     """Create a store of `samples` unfinished samples and open it for writing.
 
     The store appears under its name only after all its files are written. `overwrite` replaces an existing store;
-    a folder that holds anything else is never replaced. Raises InputError if the path cannot be used.
+    a folder that holds anything else is never replaced. The caller holds the lock of the store. Raises
+    InputError if the path cannot be used.
     """
     target = located(path)
     files = files_of(target)

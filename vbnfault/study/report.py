@@ -199,9 +199,9 @@ def _images(results: StudyResults, folder: Path) -> list[tuple[str, list[dict[st
             continue
         ends = {"best": (extremes.best, extremes.best_row), "worst": (extremes.worst, extremes.worst_row)}
         for name, (value, row) in ends.items():
-            image = cv2.imread(str(folder / f"{metric}_{name}.png"), cv2.IMREAD_COLOR_RGB)
+            image = cv2.imread(str(folder / f"{metric}_{name}.png"))
             if image is not None:
-                url = image_url(np.asarray(image, np.uint8), _IMAGE_PX)
+                url = image_url(np.ascontiguousarray(image[..., ::-1], np.uint8), _IMAGE_PX)
                 shown = number_text(value, unit=results.about(metric, "unit"))
                 of_row = results.table.slice(row, 1).to_pylist()[0]
                 coarse = max(image.shape) < _COARSE_PX

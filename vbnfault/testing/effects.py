@@ -116,7 +116,9 @@ def check_effect(
 def _check_declaration(effect: type[Effect]) -> None:
     """Check the class attributes and the fields of an effect."""
     assert "name" in effect.__dict__, "is a base class without a name"
-    assert effect.name in registry(), "is not registered"
+    known = registry().get(effect.name)
+    assert known is not None, "is not registered"
+    assert known.__qualname__ == effect.__qualname__, f"has the name of another class, {known.__qualname__}"
     assert effect.__dict__.get("__doc__"), "has no docstring"
     try:
         order()

@@ -38,6 +38,9 @@ _LEAST_SPREAD = 0.25  # fraction of a ghost's image that is magnified less than 
 # because their reflectances vary faster with the angle.
 _SPECTRUM, _SPECTRUM_OF_FILMS, _FILMS_NM = 13, 16, 800.0
 _SPECTRUM_AT_ONCE = 1 << 20
+_DARK = (
+    1e-6  # of the most light at any wavelength: with less, behind a filter, rays cannot stand for those beside it
+)
 _LEAST_SHARE = 1e-2  # of a ghost's light in a band that a wavelength must have to be drawn in it
 _UNEVEN = 2.0  # ratio of the areas of neighbouring cells above which the image is uneven
 
@@ -446,10 +449,11 @@ class GhostSpectra:
         grids = (tuple(nm.tolist()) for nm in (self.nodes_nm, self.traced_nm[::step], self.light_nm))
         shares = _shares(self.bands, *grids)
         mean = np.einsum("sgn,skbn->gkb", self.true, shares)
-        total = mean.sum(axis=1, keepdims=True)
-        mean[mean < _LEAST_SHARE * total] = 0  # not worth the drawing
-        mean *= total / np.maximum(mean.sum(axis=1, keepdims=True), 1e-300)
+        total = np.maximum(mean.sum(axis=1, keepdims=True), 0)  # splines may swing below 0 beside steep edges
         traced = self.traced[:, ::step, None]
+        dark = traced < _DARK * traced.max(axis=1, keepdims=True, initial=0)
+        mean[(mean < _LEAST_SHARE * total) | dark] = 0  # not worth the drawing
+        mean *= total / np.maximum(mean.sum(axis=1, keepdims=True), 1e-300)
         return np.asarray(np.where(traced > 0, mean / np.where(traced > 0, traced, 1), 0))
 
 
