@@ -422,6 +422,8 @@ def test_models_are_named() -> None:
                 fault, value = model.at(model.severity.value(position, width_px))
                 assert isinstance(fault, model.type)
                 assert value > 0
+    # a fault of the scene that does not fit the camera is none of a calibration's concern
+    assert severity.models_of("quickstart", ["vignetting/lens"], {"camera.lens": "tessar_50_f2p8"})
     kept = severity.models_of("quickstart", overrides={"faults.dust_on_optics.peak_dn": 150})
     assert next(model for model in kept if model.fault == "dust_on_optics").keys == {"peak_dn": 150}
     with pytest.raises(InputError, match=r"model 'vigneting': no such model with a severity \(did you mean"):

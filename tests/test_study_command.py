@@ -46,6 +46,7 @@ def test_a_dry_run_says_how_much_a_study_evaluates_and_writes_nothing(
         ("factor[15].low=1", "factor[15].low = 1: factor is a list; its entries are 0 to 14"),
         ("metrics.names[0]=straylight_total", "did you mean straylight_total_e?"),
         ("scene.samples=[999]", "scene.samples: sample 999: must be below dataset.samples = "),
+        ("scene.plan.sun_facing_nominal_fraction=1.0", "plan.sun_facing_nominal_fraction"),
     ],
 )
 def test_what_is_wrong_is_one_sentence(

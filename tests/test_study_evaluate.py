@@ -13,6 +13,7 @@ import tomli_w
 from conftest import small_scene
 from PIL import Image
 
+from vbnfault.camera import Camera
 from vbnfault.core import llvm, resources
 from vbnfault.core.errors import InputError, VbnfaultError
 from vbnfault.core.llvm import backend
@@ -120,16 +121,21 @@ def test_the_view_is_rendered_once_and_each_factor_moves_only_its_own_stages(
         renders.append(1)
         return render_view(*inputs)
 
+    exposures: list[int] = []
+    expose = Camera.expose
+    monkeypatch.setattr(Camera, "expose", lambda *a, **k: exposures.append(1) or expose(*a, **k))
     monkeypatch.setattr(evaluate_module, "render_view", counted)
     base = evaluator.evaluate(point(NOMINAL, role="A"))
     events = evaluator.kept.events
     for key in NOMINAL:
-        before = dict(events)
+        before, exposed = dict(events), len(exposures)
         evaluator.evaluate(
             point(NOMINAL | {key: NOMINAL[key] * 1.01 + 1e-4 + (5 if key.endswith("blades") else 0)})
         )
         moved = {stage for stage in events if events[stage] != before.get(stage, 0)}
         assert not moved & STAYS[key.partition(".")[0]], key
+        if not key.startswith("sun.") and key != "detector.full_well_e":  # the direct image is found
+            assert len(exposures) == exposed, key
     assert events["render"] <= 1
     assert len(renders) <= 1
     # the results of the base row are held, however many rows came in between

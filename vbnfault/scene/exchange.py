@@ -92,21 +92,17 @@ def pitches(
     pitch_deg[:] = pitch[view_of.ravel()]
 
 
-def draw(
+def sun_out_of_view(
     scene: Scene,
     samples: NDArray[np.int64],
     stratum: NDArray[np.uint8],
-    light: NDArray[np.int64],
-    paired: NDArray[np.bool_],
     block: NDArray[np.int64],
-) -> dict[str, NDArray[np.float64]]:
-    """Return the first views, as `redraw.draw`, in which samples of a block exchange pitches at first."""
-    drawn = redraw.uniform(scene, samples, stratum, light, paired)
+    drawn: dict[str, NDArray[np.float64]],
+) -> None:
+    """Exchange pitches, in place, between Sun-averted samples of a block, so that fewer of them look at the Sun."""
     if redraw.strata(scene)[SUN_AVERTED].reference == "sun":
         averted, least = np.where(stratum == SUN_AVERTED, block, -1), redraw.least_sun_angle_deg(scene)
         pitches(samples, averted, drawn["roll_deg"], drawn["pitch_deg"], least)
-    redraw.keep_sun_out_of_view(scene, samples, stratum, drawn, 0)
-    return drawn
 
 
 def view(plan: Plan, scene: Scene, index: int, attempt: int) -> dict[str, float]:

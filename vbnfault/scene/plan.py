@@ -16,6 +16,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -176,10 +177,10 @@ def make_plan(
     aim = np.concatenate([p[2] for p in parts]) if scene.is_aimed else None
     if aim is not None:
         variables = aims.draw(scene, draw, aim, 0)
-    elif scene.exchanges_views:
-        variables = exchange.draw(scene, draw, stratum, light, paired, block)
     else:
-        variables = redraw.draw(scene, draw, stratum, light, paired)
+        exchanged = partial(exchange.sun_out_of_view, scene, draw, stratum, block)
+        keyed = {"exchange": exchanged} if scene.exchanges_views else {}
+        variables = redraw.draw(scene, draw, stratum, light, paired, **keyed)
     return Plan(
         faults=tuple(faults),
         variables=variables,

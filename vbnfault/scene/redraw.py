@@ -2,11 +2,12 @@
 
 Where a view cannot be used, the whole view is drawn again within the same bounds. The views that are kept therefore
 follow the table's distribution, under the condition that they can be used. `scene.exchange` and `scene.aims` are
-other rules, with the same functions `draw` and `view`.
+other rules, with a function `view` of the same form.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -70,26 +71,13 @@ def draw(
     paired: NDArray[np.bool_],
     *,
     attempt: int = 0,
-) -> dict[str, NDArray[np.float64]]:
-    """Return draws of all variables as `uniform` does, and keep the Sun out of view of the Sun-averted samples."""
-    drawn = uniform(scene, samples, stratum, light, paired, attempt=attempt)
-    keep_sun_out_of_view(scene, samples, stratum, drawn, attempt)
-    return drawn
-
-
-def uniform(
-    scene: Scene,
-    samples: NDArray[np.int64],
-    stratum: NDArray[np.uint8],
-    light: NDArray[np.int64],
-    paired: NDArray[np.bool_],
-    *,
-    attempt: int = 0,
+    exchange: Callable[[dict[str, NDArray[np.float64]]], None] | None = None,
 ) -> dict[str, NDArray[np.float64]]:
     """Return uniform draws of all variables within the bounds of each sample's stratum, float64[n] each.
 
     `attempt` counts from 0; later attempts are redraws. Paired samples draw the Sun within the bounds of both
     strata, with the key of one of the two. They keep this Sun at every attempt, unless views are exchanged.
+    `exchange` may exchange values, in place, before Sun-averted samples that look at the Sun are drawn again.
     """
     sun_attempt = attempt if scene.exchanges_views else 0
     drawn = {}
@@ -102,6 +90,9 @@ def uniform(
         else:
             u = keyed_random.keyed_uniform(scene.dataset.seed, samples, "plan", f"{name}/{attempt}")
         drawn[name] = lo + u * (hi - lo)
+    if exchange is not None:
+        exchange(drawn)
+    keep_sun_out_of_view(scene, samples, stratum, drawn, attempt)
     return drawn
 
 

@@ -1,6 +1,6 @@
 """Evaluate points of a study at views of a scene, and compute again only what a factor moves.
 
-    render ▶ direct image ▶ exposure ▶ ghosts, starburst, glare, veil ▶ metrics
+    render ▶ metered light ▶ ghosts, starburst, glare, veil ▶ metrics
 
 A view is rendered once; optics, Sun and detector act on its radiance. The results of each stage are kept with all
 that the stage depends on (`kept`), a few of them at a time, so that the result of an evaluation does not depend on
@@ -44,7 +44,6 @@ from ..pipeline.resolve import resolve
 from ..pipeline.session import Session
 from ..pipeline.spec import Injection, SampleSpec
 from ..scene.config import Scene, configure_faults
-from ..world.cameras import base_camera
 from . import chosen_fault, image_metrics
 from . import navigation_metrics as nav
 from .factors import Factors, Setting, StudyScene, base_scene, changed_scene
@@ -93,12 +92,13 @@ class SceneEvaluator:
             plain = [StudyScene(self._base)]
             if spec.models is not None:
                 plain = [self.scene_of(self._base.dataset.seed, model) for model in spec.models.compare]
-            configure_faults(plain[0].scene)
+            # a session also draws the plan of its scene and checks its faults
+            cameras = [Session(made.scene, source=self._source).base_camera for made in plain]
             self._chosen_faults = chosen_fault.choices(spec)
             for choice in self._chosen_faults:
                 made = self.scene_of(spec.scene.seeds[0], "", ((chosen_fault.SCENE_KEY, choice),))
                 configure_faults(made.scene, f"{chosen_fault.KEY} = {choice!r}")
-            self._nominal_camera = camera = base_camera(plain[0].scene)
+            self._nominal_camera = camera = cameras[0]
             adding = [name for made in plain for name, f in made.faults.items() if f.soft_layer.endswith("_added")]
             self._adding = adding[0] if adding else ""  # the fault that adds light
             frame = FaultContext(camera=camera).frame
@@ -268,13 +268,13 @@ class SceneEvaluator:
     def _seen(self, view: RenderedView, evaluation: Evaluation, made: StudyScene, setting: Setting) -> RenderedView:
         """Return a rendered view with the scene, the camera and the Sun of an evaluation.
 
-        What the stages share between the samples of a view is kept by all that this view differs in.
+        What the stages share between the samples of a view is kept by all that this view differs in but its camera,
+        which is in the keys of the stages.
         """
         scene = made.scene
         camera = self._camera(replace(view.spec, scene=scene), setting)
         pose, rendering = with_sun(view, setting.sun)
-        optics = camera.lens, camera.lens_changes
-        key = (made.render_key, evaluation.view, view.number, tuple(setting.sun.items()), scene.camera, optics)
+        key = (made.render_key, evaluation.view, view.number, tuple(setting.sun.items()), scene.camera)
         return RenderedView(
             spec=replace(view.spec, scene=scene, faults=made.faults, taken_with=camera),
             pose=pose,

@@ -206,10 +206,12 @@ class StudyScene:
 
 def base_scene(spec: StudySpec) -> Scene:
     """Return the scene of a study without factors. Raises InputError, also for a wrong fault or model."""
+    values = {key: value for key, value in spec.scene.overrides.items() if value != {}}
+    scene = read_scene(spec.scene.base, values)
     # an empty table, such as that of a fault without keys, adds to the scene what it lacks
-    own = read_scene(spec.scene.base).resolved()
-    values = {key: value for key, value in spec.scene.overrides.items() if value != {} or not _table(own, key)}
-    scene = read_scene(spec.scene.base, dict(sorted(values.items(), key=lambda item: item[1] == {})))
+    lacking = [key for key in spec.scene.overrides if key not in values and not _table(scene.resolved(), key)]
+    if lacking:
+        scene = read_scene(spec.scene.base, values | {key: {} for key in lacking})
     largest = max(spec.scene.views)
     if largest >= scene.dataset.samples:
         raise InputError(

@@ -107,7 +107,7 @@ def _metric(unit: str, source: str = "", better: Literal["low", "high"] = "low")
 
     def add(value: Value) -> Value:
         name, words = value.__name__, returned(value)
-        description = words[0].upper() + words[1:]
+        description = words[:1].upper() + words[1:]
         _ALL[name] = Metric(name=name, unit=unit, description=description, source=source, better=better), value
         return value
 

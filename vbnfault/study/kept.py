@@ -13,7 +13,7 @@ from ..core.shared_results import SharedResults
 T = TypeVar("T")
 
 # How many results of each stage are kept beside those of the base row A of a Sobol design; default: two.
-_KEPT = {"render": 1, "exposure": 8}
+_KEPT = {"render": 1}
 
 
 class Kept:
@@ -79,7 +79,7 @@ class Kept:
             self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
 
     def of_view(self, view: Hashable) -> SharedResults:
-        """Return where the stages of the pipeline keep what evaluations of an equal view share."""
+        """Return results of the pipeline's stages that evaluations with an equal `view` share."""
         return _OfView(self, view)
 
 

@@ -250,7 +250,7 @@ def models_of(
     InputError
         A name is unknown or has no severity, or the scene has no such model.
     """
-    tables = config.load_scene(scene, overrides).faults
+    tables = config.read_scene(scene, overrides).faults
     known: dict[str, ModelUnderTest] = {}
     of_scene = []
     for fault, models in registry().items():
@@ -312,7 +312,7 @@ def evaluate_models(
     VbnfaultError
         Fewer than half of the views exist.
     """
-    camera = config.load_scene(views.scene, views.overrides).camera
+    camera = config.read_scene(views.scene, views.overrides).camera
     detectors = {model.name: _detector(model, camera) for model in models}
     groups = _groups(models, views, detectors)
     planned = sum(group.count for group in groups)
@@ -343,7 +343,7 @@ def compute_levels(
 
     Parameters and errors: as `evaluate_models`. Raises InputError, too, if the file was made in another manner.
     """
-    camera = config.load_scene(views.scene, views.overrides).camera
+    camera = config.read_scene(views.scene, views.overrides).camera
     lenses = views.lenses or (camera.lens,)
     table = SeverityTable(
         description="values that cost navigation the same, by fault class and model",
@@ -438,7 +438,7 @@ def _detector(model: ModelUnderTest, camera: CameraTable) -> str:
 
 def _groups(models: Sequence[ModelUnderTest], views: ViewOptions, detectors: Mapping[str, str]) -> list[ViewGroup]:
     """Return the groups of views: for each lens, sensor and side of the sky one for each site."""
-    scene = config.load_scene(views.scene, views.overrides)
+    scene = config.read_scene(views.scene, views.overrides)
     groups: list[ViewGroup] = []
     first = 0
     for lens, name in enumerate(views.lenses or (scene.camera.lens,)):
