@@ -178,9 +178,8 @@ def make_plan(
     if aim is not None:
         variables = aims.draw(scene, draw, aim, 0)
     else:
-        exchanged = partial(exchange.sun_out_of_view, scene, draw, stratum, block)
-        keyed = {"exchange": exchanged} if scene.exchanges_views else {}
-        variables = redraw.draw(scene, draw, stratum, light, paired, **keyed)
+        exchanged = partial(exchange.sun_out_of_view, scene, draw, stratum, block) if scene.exchanges_views else None
+        variables = redraw.draw(scene, draw, stratum, light, paired, exchange=exchanged)
     return Plan(
         faults=tuple(faults),
         variables=variables,
