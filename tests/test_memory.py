@@ -72,7 +72,7 @@ def test_twins_leave_no_light_behind(session: Session) -> None:
 def test_samples_leave_nothing_behind(session: Session) -> None:
     """Once caches are full, rounds of three samples add less than a plane to what Python and numpy hold.
 
-    What is left behind grows with every round; the least growth leaves out what threads of the process hold for a time.
+    What is left behind grows with every round; the least growth leaves out what other threads hold for a time.
     """
     held = []
     tracemalloc.start()

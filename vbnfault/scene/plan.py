@@ -178,8 +178,9 @@ def make_plan(
     if aim is not None:
         variables = aims.draw(scene, draw, aim, 0)
     else:
-        exchanged = partial(exchange.sun_out_of_view, scene, draw, stratum, block) if scene.exchanges_views else None
-        variables = redraw.draw(scene, draw, stratum, light, paired, exchange=exchanged)
+        exchanged = partial(exchange.sun_out_of_view, scene, draw, stratum, block)
+        rule = exchanged if scene.exchanges_views else None
+        variables = redraw.draw(scene, draw, stratum, light, paired, exchange=rule)
     return Plan(
         faults=tuple(faults),
         variables=variables,
