@@ -30,8 +30,8 @@ from vbnfault.lens import load_lens, scaled_to_field
 from vbnfault.lens.coating import NAMES
 from vbnfault.lens.imaging import RealLens
 from vbnfault.lens.prescription import Prescription
+from vbnfault.lens.straylight.bundles import name_of, routes
 from vbnfault.lens.straylight.irradiance import FlareModel
-from vbnfault.lens.straylight.paraxial import pairs
 from vbnfault.lens.straylight.settings import SensorGrid
 
 F64 = NDArray[np.float64]
@@ -59,7 +59,8 @@ def reference(lens: Prescription, suns_deg: list[float], step_nm: float) -> F64:
 def total(made: FlareModel, sun_deg: float) -> F64:
     """Return the flux of all ghosts over the Sun's irradiance, float64[band] in mm²."""
     # with 48 rays across, the ghosts of a Sun on the axis have errors of 2 %
-    return np.asarray(sum(made.flux_mm2(sun_deg, AZIMUTH_DEG, pairs(made.lens), across=192).values()))
+    names = [name_of(route) for route in routes(made.lens)]
+    return np.asarray(sum(made.flux_mm2(sun_deg, AZIMUTH_DEG, names, across=192).values()))
 
 
 def ghosts(lens: Prescription, sun_deg: float, bands: int) -> F64:

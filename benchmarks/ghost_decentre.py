@@ -17,8 +17,9 @@ import argparse
 import numpy as np
 
 from vbnfault.lens import Prescription, load_lens
+from vbnfault.lens.paraxial import along
 from vbnfault.lens.rays import ghost, transmittance
-from vbnfault.lens.straylight.paraxial import along, pairs
+from vbnfault.lens.straylight.bundles import name_of, routes
 
 _MOST = 8  # ghosts, those with most light
 
@@ -65,7 +66,9 @@ def main() -> None:
     arguments = parser.parse_args()
     lens = load_lens(arguments.lens)
     tilt, vertex = np.radians(arguments.tilt_arcmin / 60), lens.vertices_mm
-    brightest = sorted(pairs(lens), key=lambda pair: -transmittance(lens, ghost(lens, *pair)))[:_MOST]
+    brightest = sorted(
+        [name_of(r) for r in routes(lens)], key=lambda pair: -transmittance(lens, ghost(lens, *pair))
+    )[:_MOST]
     print("shift / px of the ghosts of", ", ".join(f"{a}-{b}" for a, b in brightest))
     for rows in elements(lens):
         centres = {row: vertex[row] - vertex[rows[0]] for row in rows}

@@ -26,8 +26,9 @@ from vbnfault.core import resources
 from vbnfault.core.spectra import Bands
 from vbnfault.lens import Prescription, load_lens, paraxial_properties
 from vbnfault.lens.glass import D_NM
+from vbnfault.lens.paraxial import along
 from vbnfault.lens.rays import axial_transmittance, ghost, transmittance
-from vbnfault.lens.straylight.paraxial import along, pairs
+from vbnfault.lens.straylight.bundles import name_of, routes
 from vbnfault.lens.straylight.scatter import ROUGHNESS_NM, Cleanliness, veiling_glare
 from vbnfault.lens.straylight.settings import VEIL_FRACTION
 
@@ -70,7 +71,7 @@ def index_of(
 def _ghosts_sr(lens: Prescription, wavelength_nm: float) -> float:
     """Return Σ T_g Ω in sr over all ghosts of two reflections, at the centre of the sensor."""
     total = 0.0
-    for pair in pairs(lens):
+    for pair in [name_of(r) for r in routes(lens)]:
         path = ghost(lens, *pair)
         whole, met = along(lens, path, wavelength_nm)
         # rays that arrive at the centre: θ = -r M00 / M01

@@ -5,7 +5,7 @@ The rays are the tests' own: they are traced one by one, without the tables of `
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,7 @@ from vbnfault.lens import (
 )
 from vbnfault.lens.glass import D_NM
 from vbnfault.lens.rays import real_pupil_diameter_mm, trace
+from vbnfault.lens.straylight.irradiance import traced_ghosts
 
 F64 = NDArray[np.float64]
 
@@ -34,6 +35,7 @@ LENSES = {
     "heliar_100_f3p5": (5.0, 12.0, 20.0, 28.0),
     "biotar_100_f1p4": (5.0, 12.0, 20.0, 25.0),
 }
+paraxial_ghosts = partial(traced_ghosts, model="paraxial")
 PITCH_UM, SIDE_PX = 5.5, 1024
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import small_scene
+from lens_kit import paraxial_ghosts
 from test_faults_kit import flat_electrons
 from typer.testing import CliRunner
 
@@ -30,12 +31,11 @@ from vbnfault.lens import (
     scaled_to_focal_length,
     stopped_down,
 )
-from vbnfault.lens.footprint import Footprint
+from vbnfault.lens.beams import Footprint
 from vbnfault.lens.glass import D_NM
 from vbnfault.lens.imaging import point_spreads
 from vbnfault.lens.prescription_file import to_table
 from vbnfault.lens.rays import trace
-from vbnfault.lens.straylight.paraxial import paraxial_ghosts
 from vbnfault.lens.straylight.scatter import Cleanliness, GlareLayout, veiling_glare
 from vbnfault.lens.straylight.starburst import starburst
 from vbnfault.scene import config

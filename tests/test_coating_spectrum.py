@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import tmm
 from conftest import needs_llvm
+from lens_kit import paraxial_ghosts
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from test_faults_kit import make_context
@@ -24,8 +25,8 @@ from vbnfault.faults.straylight_lens import channel_bands
 from vbnfault.lens import Prescription, load_lens, parse_lens, scaled_to_field
 from vbnfault.lens.coating import Layer
 from vbnfault.lens.imaging import RealLens
+from vbnfault.lens.straylight.bundles import name_of, routes
 from vbnfault.lens.straylight.irradiance import FlareModel
-from vbnfault.lens.straylight.paraxial import pairs, paraxial_ghosts
 from vbnfault.lens.straylight.scene import in_channels
 from vbnfault.lens.straylight.settings import SensorGrid
 from vbnfault.lens.straylight.total import anew
@@ -88,6 +89,10 @@ def context(lens: Prescription, bands: int, detector: ThreeColourDetector) -> Fa
         sun_irradiance_W_m2_nm=spectra.solar_band_irradiance_W_m2_nm(nodes, 1.0),
         sun_angular_radius_rad=spectra.sun_angular_radius_rad(1.0),
     )
+
+
+def pairs(lens: Prescription) -> list[tuple[int, ...]]:
+    return [name_of(route) for route in routes(lens)]
 
 
 def detector(kind: type[ThreeColourDetector] = Narrow) -> ThreeColourDetector:

@@ -20,8 +20,7 @@ from vbnfault.core.errors import InputError
 from vbnfault.detector import ThreeColourDetector
 from vbnfault.faults import FaultContext, dust_lens
 from vbnfault.lens import RealLens, ThinLens, load_lens, paraxial_properties, scaled_to_field, stopped_down
-from vbnfault.lens.beams import beams
-from vbnfault.lens.footprint import Footprint, disc_overlap
+from vbnfault.lens.beams import Footprint, beams, disc_overlap
 from vbnfault.lens.image_frame import ImageFrame
 from vbnfault.lens.rays import real_pupil_diameter_mm, trace
 

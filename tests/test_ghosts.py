@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import needs_llvm, render_threads
+from lens_kit import paraxial_ghosts
 from test_lens import BACK, GLASS, STOP
 
 from vbnfault.core.errors import InputError
@@ -18,9 +19,8 @@ from vbnfault.lens.prescription import Prescription
 from vbnfault.lens.rays import path_of, trace
 from vbnfault.lens.straylight import ghosts, irradiance
 from vbnfault.lens.straylight.bundles import Rays, Spots, Tracer, name_of, routes
-from vbnfault.lens.straylight.ghosts import boxes, lit_cells, traced_ghosts
-from vbnfault.lens.straylight.irradiance import FlareModel, disc_samples
-from vbnfault.lens.straylight.paraxial import paraxial_ghosts
+from vbnfault.lens.straylight.ghosts import boxes, lit_cells
+from vbnfault.lens.straylight.irradiance import FlareModel, disc_samples, traced_ghosts
 from vbnfault.lens.straylight.raster import _EDGE_NODES, EDGE_HIGH, EDGE_LOW, Sums, edge_profiles
 from vbnfault.lens.straylight.settings import GhostSettings, SensorGrid
 
@@ -180,9 +180,10 @@ def test_flux_converges_with_the_number_of_rays() -> None:
     assert worst[-1] < 0.003
 
 
-def test_ghosts_turn_with_the_sun_and_lie_on_the_axis_under_it() -> None:
+@pytest.mark.parametrize("model_", ["traced", "paraxial"])
+def test_ghosts_turn_with_the_sun_and_lie_on_the_axis_under_it(model_: str) -> None:
     lens = load_lens("nikkor_35_f2p8")
-    one, other = (traced_ghosts(lens, 9.0, azimuth_deg=a, across=96) for a in (0.0, 130.0))
+    one, other = (traced_ghosts(lens, 9.0, azimuth_deg=a, across=96, model=model_) for a in (0.0, 130.0))
     turn = np.radians(130.0)
     for a, b in zip(one, other, strict=True):
         assert a.pair == b.pair
@@ -191,7 +192,7 @@ def test_ghosts_turn_with_the_sun_and_lie_on_the_axis_under_it() -> None:
         expected = (x * np.cos(turn) - y * np.sin(turn), x * np.sin(turn) + y * np.cos(turn))
         assert b.centroid_mm == pytest.approx(expected, abs=1e-4)
         assert abs(y) < 2e-3 * a.rms_radius_mm
-    for ghost in traced_ghosts(lens, 0.0, across=96):
+    for ghost in traced_ghosts(lens, 0.0, across=96, model=model_):
         assert np.hypot(*ghost.centroid_mm) < 1e-3 * ghost.rms_radius_mm
 
 

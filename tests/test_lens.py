@@ -18,11 +18,11 @@ from vbnfault.lens import load_lens, paraxial_properties, parse_lens, scaled_to_
 from vbnfault.lens import rays as trace_module
 from vbnfault.lens.coating import NAMES, Layer, design, mean_reflectance, reflect_transmit
 from vbnfault.lens.glass import AIR, GLASSES, from_abbe
-from vbnfault.lens.paraxial import gap, refraction, system
+from vbnfault.lens.paraxial import along, gap, refraction, system
 from vbnfault.lens.prescription import Surface
 from vbnfault.lens.prescription_file import write_lens
 from vbnfault.lens.rays import ghost, real_pupil_diameter_mm, trace
-from vbnfault.lens.straylight import paraxial
+from vbnfault.lens.straylight.bundles import routes
 
 # (EFL, BFD, f-number by the paraxial pupil), the patents' rows recomputed
 PUBLISHED = {
@@ -401,20 +401,8 @@ def test_a_lens_without_a_source_with_its_stop_behind_reads_well(
 
 def test_ghost_matrices_are_the_published_ones() -> None:
     lens = load_lens("nikkor_28_f2p8")
-    assert len(paraxial.pairs(lens)) == 66  # 12 interfaces: the stop and an air-air dummy left out
+    assert len(routes(lens)) == 66  # 12 interfaces: the stop and an air-air dummy left out
     for (a, b), expected in GHOSTS.items():
-        matrix, met = paraxial.along(lens, ghost(lens, a, b))
+        matrix, met = along(lens, ghost(lens, a, b))
         np.testing.assert_allclose(matrix[0], expected, rtol=2e-5)
         assert len(met) == len(ghost(lens, a, b))
-
-
-def test_a_source_on_the_axis_gives_centred_ghosts_and_an_azimuth_turns_them() -> None:
-    lens = load_lens("nikkor_35_f2p8")
-    for found in paraxial.paraxial_ghosts(lens, 0.0):
-        np.testing.assert_allclose(found.centroid_mm, 0, atol=1e-9)
-    right, turned = paraxial.paraxial_ghosts(lens, 10.0), paraxial.paraxial_ghosts(lens, 10.0, azimuth_deg=90.0)
-    assert len(right) == len(turned)
-    for a, b in zip(right, turned, strict=True):
-        assert a.pair == b.pair
-        np.testing.assert_allclose(a.centroid_mm[::-1], b.centroid_mm, atol=1e-9 + 1e-9 * a.rms_radius_mm)
-        assert a.flux_fraction == pytest.approx(b.flux_fraction, rel=1e-9)

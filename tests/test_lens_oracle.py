@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from conftest import needs_llvm
+from lens_kit import paraxial_ghosts
 from test_lens import BACK, GLASS, STOP
 from test_zemax import TRIPLET
 
@@ -19,7 +20,6 @@ from vbnfault.lens import Prescription, load_lens, paraxial_properties, parse_le
 from vbnfault.lens.coating import mean_reflectance
 from vbnfault.lens.glass import C_NM, D_NM, F_NM, from_abbe
 from vbnfault.lens.rays import ghost, trace, transmittance
-from vbnfault.lens.straylight.paraxial import paraxial_ghosts
 
 if TYPE_CHECKING:
     import sequential_oracle as oracle
@@ -347,7 +347,7 @@ def test_traced_ghosts_against_the_sequential_trace(name: str, sun_deg: float) -
     if sun_deg != 8.0 and name not in ALL_ANGLES and not os.environ.get(WHOLE):
         pytest.skip(f"takes two seconds a case: of these lenses 8 degrees alone, unless {WHOLE} is set")
     needs_llvm()
-    from vbnfault.lens.straylight.ghosts import traced_ghosts
+    from vbnfault.lens.straylight.irradiance import traced_ghosts
 
     lens, wavelength = load_lens(name), WAVELENGTH_NM.get(name, D_NM)
     traced = traced_ghosts(lens, sun_deg, azimuth_deg=AZIMUTH_DEG, bands=Bands.lines(wavelength), only=PAIRS[name])
@@ -413,7 +413,7 @@ def test_rays_of_ghosts_through_plates_and_off_the_sensor(name: str) -> None:
 
 def test_traced_ghosts_off_the_sensor() -> None:
     needs_llvm()
-    from vbnfault.lens.straylight.ghosts import traced_ghosts
+    from vbnfault.lens.straylight.irradiance import traced_ghosts
 
     lens = load_lens("nikkor_28_f2p8_camera").coated("none")
     rows = len(lens.surfaces)

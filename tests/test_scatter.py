@@ -18,10 +18,9 @@ from vbnfault.core import resources
 from vbnfault.core.errors import InputError
 from vbnfault.core.spectra import Bands
 from vbnfault.lens import Prescription, load_lens, paraxial_properties, parse_lens
-from vbnfault.lens.paraxial import gap, refraction, system
+from vbnfault.lens.paraxial import gap, mirrors, refraction, system
 from vbnfault.lens.rays import forward, transmittance
 from vbnfault.lens.straylight import particles, scatter
-from vbnfault.lens.straylight.paraxial import mirrors
 from vbnfault.lens.straylight.particles import (
     DUST_INDEX,
     particle_bsdf,

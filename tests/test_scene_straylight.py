@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import needs_llvm, small_scene
+from lens_kit import paraxial_ghosts
 from numpy.typing import NDArray
 from test_faults_kit import flat_electrons, make_context
 
@@ -23,8 +24,8 @@ from vbnfault.lens import ThinLens, load_lens, paraxial_properties
 from vbnfault.lens.prescription import Prescription
 from vbnfault.lens.straylight import ghost_response
 from vbnfault.lens.straylight.bundles import Tracer
-from vbnfault.lens.straylight.ghosts import boxes, lit_cells, traced_ghosts
-from vbnfault.lens.straylight.paraxial import paraxial_ghosts
+from vbnfault.lens.straylight.ghosts import boxes, lit_cells
+from vbnfault.lens.straylight.irradiance import traced_ghosts
 from vbnfault.lens.straylight.scatter import Cleanliness
 from vbnfault.lens.straylight.scene import PointSources, RenderGrid, SceneInLens, surrounding_grids
 from vbnfault.lens.straylight.scene_convolution import POINT_SPREAD_PX, starburst_of_source, wing_fraction

@@ -19,7 +19,7 @@ from vbnfault.core.errors import InputError, VbnfaultError
 from vbnfault.core.llvm import backend
 from vbnfault.core.spectra import solar_irradiance_W_m2_nm
 from vbnfault.lens import load_lens
-from vbnfault.lens.changes import Change, changed
+from vbnfault.lens.adapt import Change, changed
 from vbnfault.lens.coating import mean_reflectance
 from vbnfault.pipeline.rendering import render_view
 from vbnfault.study import evaluate as evaluate_module

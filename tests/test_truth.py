@@ -19,7 +19,7 @@ from vbnfault.camera import Camera
 from vbnfault.core import frames
 from vbnfault.detector import ThreeColourDetector
 from vbnfault.lens import RealLens, load_lens, scaled_to_field
-from vbnfault.lens.aperture import stopped_down
+from vbnfault.lens.adapt import stopped_down
 from vbnfault.lens.glass import D_NM
 from vbnfault.lens.mapping import chief_heights_mm, fitted
 from vbnfault.lens.prescription import Prescription

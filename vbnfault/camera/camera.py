@@ -14,7 +14,7 @@ from ..core.quantities import Electrons, Irradiance, Radiance
 from ..core.sundisc import Projection
 from ..detector import Detector, MosaicDetector
 from ..lens import Lens
-from ..lens.changes import Change
+from ..lens.adapt import Change
 
 
 @dataclass(frozen=True, kw_only=True)

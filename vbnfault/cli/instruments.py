@@ -28,7 +28,7 @@ from .options import (
 )
 
 if TYPE_CHECKING:
-    from ..lens.straylight.paraxial import Ghost
+    from ..lens.straylight.ghosts import Ghost
 
 _PANEL = "Lenses and sensors"
 _BRIGHTEST = 10  # ghosts that `flare` prints

@@ -1,6 +1,6 @@
 """Simulate dust by physics: grains on a lens surface or on the sensor's window, in the beams that cross them.
 
-A pixel loses the fraction of its beam's footprint that grains cover (`lens.footprint` computes it by exact rays):
+A pixel loses the fraction of its beam's footprint that grains cover (`lens.beams` computes it by exact rays):
 
     τ = 1 - Σ (1 - t_g) · |grain ∩ footprint| / |footprint|.
 
@@ -40,12 +40,12 @@ from numpy.typing import NDArray
 from scipy.special import j1
 
 from ..lens import RealLens, load_lens
+from ..lens.beams import Footprint
 from ..lens.coating import reflect_transmit
-from ..lens.footprint import Footprint
 from ..lens.glass import D_NM
 from ..lens.image_frame import ImageFrame
+from ..lens.paraxial import along
 from ..lens.rays import forward
-from ..lens.straylight.paraxial import along
 from ..lens.straylight.particles import DUST_INDEX
 from .context import FaultContext, Params
 from .contract import LensFault

@@ -39,7 +39,7 @@ from ..core.quantities import Electrons, Radiance
 from ..core.spectra import Bands
 from ..lens import Prescription
 from ..lens.image_frame import ImageFrame
-from ..lens.straylight.paraxial import Ghost
+from ..lens.straylight.ghosts import Ghost
 from ..lens.straylight.particles import CLEANLINESS_LIMITS
 from ..lens.straylight.scatter import ROUGHNESS_NM_LIMITS, Cleanliness
 from ..lens.straylight.scene import PointSources, RenderGrid, SceneInLens, in_channels, surrounding_grids

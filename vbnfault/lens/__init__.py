@@ -1,6 +1,6 @@
 """Map scene radiance to irradiance on the sensor plane, with an ideal lens or a real one."""
 
-from .aperture import closed_to, open_f_number, stopped_down
+from .adapt import closed_to, open_f_number, stopped_down
 from .imaging import RealLens
 from .interface import Lens
 from .paraxial import ParaxialProperties, paraxial_properties, scaled_to_field, scaled_to_focal_length

@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core import file_contents
-from .aperture import stopped_down
+from .adapt import OF_COATINGS, Change, changed, stopped_down
 from .beams import Beams, beams
-from .changes import OF_COATINGS, Change, changed
 from .imaging import RealLens
 from .interface import Lens
 from .paraxial import scaled_to_focal_length

@@ -5,11 +5,13 @@ A ray is the vector (height, slope) in a plane through the axis; each step throu
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache, reduce
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ..core.errors import InputError
 from .glass import D_NM
@@ -115,3 +117,73 @@ def scaled_to_field(lens: Prescription, fov_deg: float, sensor_mm: float) -> Pre
     Distortion is not taken into account. `Prescription.scaled` lists what keeps its size.
     """
     return scaled_to_focal_length(lens, sensor_mm / 2 / float(np.tan(np.radians(fov_deg / 2))))
+
+
+# --- paths with reflections ---------------------------------------------------------------------------------------
+
+
+def mirrors(lens: Prescription) -> tuple[int, ...]:
+    """Return the rows that reflect: not the stop, nor a surface with the same medium on both sides."""
+    index = lens.indices()
+    return tuple(k for k in range(len(lens.surfaces)) if index[k] != index[k + 1])
+
+
+def along(lens: Prescription, path: Sequence[tuple[int, bool]], wavelength_nm: ArrayLike = D_NM) -> tuple[F64, F64]:
+    """Return the matrices of a path from the plane of the first vertex.
+
+    Parameters
+    ----------
+    path
+        (row, whether it reflects) of each surface met; the sensor is the row behind the last surface.
+    wavelength_nm
+        Of any shape, written ... below.
+
+    Returns
+    -------
+    matrix : float64[..., 2, 2]
+        To the sensor.
+    met : float64[step, ..., 2, 2]
+        To each surface met.
+    """
+    wavelength = np.asarray(wavelength_nm, dtype=np.float64)
+    index, vertex = _media(lens, tuple(wavelength.ravel().tolist()))
+    # plain numbers for one wavelength: many times faster than arrays of one
+    index = index[:, 0].tolist() if wavelength.ndim == 0 else index.reshape(len(index), *wavelength.shape)
+    curvatures = [*(s.curvature_per_mm for s in lens.surfaces), 0.0]
+    # a height or slope is this pair of factors times height and slope in the plane of the first vertex
+    (h0, h1), (s0, s1) = (1.0, 0.0), (0.0, 1.0)
+    met, onward, before = [], True, 0
+    for row, mirror in path:
+        gap = abs(vertex[row] - vertex[before])
+        h0, h1 = h0 + gap * s0, h1 + gap * s1
+        met.append(_matrix(wavelength, h0, h1, s0, s1))
+        sense = curvatures[row] if onward else -curvatures[row]
+        if mirror:
+            bend = 2 * sense
+            s0, s1, onward = s0 + bend * h0, s1 + bend * h1, not onward
+        else:
+            into, out = (index[row], index[row + 1]) if onward else (index[row + 1], index[row])
+            power, ratio = (into - out) * sense / out, into / out
+            s0, s1 = power * h0 + ratio * s0, power * h1 + ratio * s1
+        before = row
+    gap = vertex[-1] - vertex[before]
+    return _matrix(wavelength, h0 + gap * s0, h1 + gap * s1, s0, s1), np.array(met)
+
+
+def _matrix(wavelength: F64, h0: Any, h1: Any, s0: Any, s1: Any) -> Any:
+    """Return matrices of the rows (h0, h1) and (s0, s1), float64[..., 2, 2]."""
+    if wavelength.ndim == 0:
+        return np.array(((h0, h1), (s0, s1)))
+    parts = np.broadcast_arrays(h0, h1, s0, s1, wavelength)[:4]
+    return np.stack(parts, axis=-1).reshape(*wavelength.shape, 2, 2)
+
+
+@lru_cache(maxsize=32)
+def _media(lens: Prescription, wavelength_nm: tuple[float, ...]) -> tuple[F64, F64]:
+    """Return the indices of all media, float64[row + 1, wavelength], and the vertices with that of the sensor."""
+    wavelength = np.array(wavelength_nm)
+    index = np.stack([np.ones(wavelength.shape), *(s.medium.index(wavelength) for s in lens.surfaces)])
+    vertex = np.append(lens.vertices_mm, lens.vertices_mm[-1] + paraxial_properties(lens).bfd_mm)
+    for array in (index, vertex):
+        array.setflags(write=False)
+    return index, vertex

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from .aperture import axial_beam_diameter_mm
+from .adapt import axial_beam_diameter_mm
 from .mapping import fan_heights_mm, inclined_rays, relative_radii
 from .paraxial import paraxial_properties
 from .prescription import Prescription

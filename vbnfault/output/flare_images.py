@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from functools import partial
 from numbers import Real
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,8 @@ from ..detector import ThreeColourDetector
 from ..faults import FaultContext, registry
 from ..lens import Prescription, ThinLens, load_lens, paraxial_properties
 from ..lens.rays import axial_transmittance
-from ..lens.straylight.paraxial import Ghost, paraxial_ghosts
+from ..lens.straylight.ghosts import Ghost
+from ..lens.straylight.irradiance import traced_ghosts
 from ..lens.straylight.scatter import Cleanliness
 from ..lens.straylight.settings import VEIL_FRACTION, GhostSettings, SensorGrid, StraylightSettings, SunSource
 from ..lens.straylight.total import SunInLens
@@ -186,15 +186,17 @@ def ghosts(request: FlareRequest, progress: Callable[[int], None] | None = None)
 
     `progress` is called with 1 after each wavelength.
     """
-    from ..lens.straylight.ghosts import traced_ghosts
-
     nm = request.wavelength_nm
-    sun = Bands.sunlight(float(nm[0]), float(nm[-1]))
-    made = paraxial_ghosts
-    if request.model == "traced":
-        across = None if len(nm) == 1 else _ACROSS_SPECTRUM
-        made = partial(traced_ghosts, reflections=request.reflections, across=across)
-    return made(request.lens, request.sun_deg, azimuth_deg=request.azimuth_deg, bands=sun, progress=progress)
+    return traced_ghosts(
+        request.lens,
+        request.sun_deg,
+        azimuth_deg=request.azimuth_deg,
+        bands=Bands.sunlight(float(nm[0]), float(nm[-1])),
+        model=request.model,
+        reflections=request.reflections,
+        across=None if len(nm) == 1 else _ACROSS_SPECTRUM,
+        progress=progress,
+    )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

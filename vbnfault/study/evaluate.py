@@ -32,7 +32,7 @@ from ..core.errors import InputError, in_file, shown
 from ..core.spectra import Bands
 from ..core.tables import did_you_mean
 from ..faults import Fault, FaultContext
-from ..lens.changes import changed
+from ..lens.adapt import changed
 from ..lens.straylight.irradiance import flare_model
 from ..lens.straylight.scatter import GlareLayout
 from ..lens.straylight.settings import GhostSettings, SensorGrid

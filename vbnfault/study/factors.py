@@ -41,7 +41,7 @@ from ..core.errors import InputError, shown
 from ..core.tables import did_you_mean
 from ..faults import Fault, from_dict, registry
 from ..lens import Prescription
-from ..lens.changes import Change
+from ..lens.adapt import Change
 from ..scene.config import Scene, parse_scene, read_scene
 from ..scene.instrument import OF_THE_DETECTOR
 from . import chosen_fault

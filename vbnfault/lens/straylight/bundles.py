@@ -31,10 +31,9 @@ from ...core.errors import InputError
 from ...core.llvm import backend
 from ...core.spectra import Bands
 from ..coating import Layer, reflect_transmit
-from ..paraxial import paraxial_properties
+from ..paraxial import along, mirrors, paraxial_properties
 from ..prescription import Prescription
 from ..rays import path_of
-from .paraxial import along, mirrors
 from .steps import Step, StopBlades, arrived, meet
 
 F64 = NDArray[np.float64]
@@ -290,7 +289,7 @@ class Tracer:
 
     A ray is lost (clipped) outside `rims_mm`, float64[row]: the semi-diameter of each round rim; the sensor's is
     infinite. `steps.meet` clips at these rims. `irradiance.ParaxialTracer` clips paraxial rays at the same rims.
-    A stop with blades does not use `rims_mm` but `steps.StopBlades`. `paraxial.paraxial_ghosts` has separate rims.
+    A stop with blades does not use `rims_mm` but `steps.StopBlades`.
     From `rims_mm`, `ghosts` also computes first boxes and `irradiance` the widths of soft edges.
     """
 

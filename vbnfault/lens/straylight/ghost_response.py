@@ -34,16 +34,16 @@ from ...core.array_files import ArrayFiles, code_hash
 from ...core.llvm import backend
 from ...core.spectra import Bands
 from ..prescription import Prescription
-from .bundles import Rays, Spots, Tracer
+from .bundles import Rays, Spots
 from .ghosts import GhostSpectra, boxes, lit_cells
-from .irradiance import ParaxialTracer
+from .irradiance import TRACERS
 from .settings import GhostSettings, SensorGrid
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 RESPONSES = ArrayFiles(kind="ghosts", content="response of ghosts")
-_SOURCES = ("bundles", "ghost_response", "ghosts", "irradiance", "paraxial", "settings", "steps")
+_SOURCES = ("bundles", "ghost_response", "ghosts", "irradiance", "settings", "steps")
 _OF_LENSES = ("coating", "glass", "paraxial", "prescription", "rays")
 
 _NARROWINGS = 3  # times that the box of a ghost's rays is narrowed to those that arrive near the sensor
@@ -225,8 +225,9 @@ class _Tracing:
         self, lens: Prescription, bands: Bands, cells: PolarCells, settings: GhostSettings, loss: float
     ) -> None:
         self.cells, self.bands = cells, len(bands)
-        kind = Tracer if settings.model == "traced" else ParaxialTracer
-        whole = kind(lens.with_round_stop(), bands.nodes_nm, reflections=settings.reflections, bands=bands)
+        whole = TRACERS[settings.model](
+            lens.with_round_stop(), bands.nodes_nm, reflections=settings.reflections, bands=bands
+        )
         self.middle = len(bands.nodes_nm) // 2
         self.routes = len(whole.routes)
         self.tracer = whole.worn(loss) if loss and self.routes else whole

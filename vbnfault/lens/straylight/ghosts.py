@@ -8,7 +8,7 @@ Flux, position and size of the ghost are then sums over a fine grid of rays in i
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -20,9 +20,7 @@ from scipy.interpolate import CubicSpline
 from ...core.llvm import backend
 from ...core.spectra import Bands, hat_weights
 from ..paraxial import paraxial_properties
-from ..prescription import Prescription
 from .bundles import Rays, Spots, Tracer, name_of
-from .paraxial import AT_D_LINE, Ghost, mean_ghost
 
 F64 = NDArray[np.float64]
 
@@ -43,6 +41,48 @@ _DARK = (
 )
 _LEAST_SHARE = 1e-2  # of a ghost's light in a band that a wavelength must have to be drawn in it
 _UNEVEN = 2.0  # ratio of the areas of neighbouring cells above which the image is uneven
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ghost:
+    """Describe one ghost of a far point source.
+
+    Attributes
+    ----------
+    pair
+        The reflecting rows, the one nearer the front first.
+    flux_fraction
+        Flux on the unbounded sensor plane over (source irradiance × cos(angle) × area of the paraxial entrance
+        pupil at the d line).
+    centroid_mm, rms_radius_mm
+        Position of the centroid on the sensor, from the axis, and flux-weighted rms radius about it.
+    peak_irradiance_fraction
+        Peak irradiance over the source's irradiance at the entrance.
+    """
+
+    pair: tuple[int, int]
+    flux_fraction: float
+    centroid_mm: tuple[float, float]
+    rms_radius_mm: float
+    peak_irradiance_fraction: float
+
+
+def mean_ghost(rows: Sequence[tuple[float, Ghost]]) -> Ghost:
+    """Return the mean over wavelengths of one ghost, from (fraction of the entering light, ghost) for each."""
+    fraction = np.array([weight for weight, _ in rows])
+    flux = fraction * [ghost.flux_fraction for _, ghost in rows]
+    centroids = np.array([ghost.centroid_mm for _, ghost in rows])
+    centre = flux @ centroids / flux.sum()
+    square = [
+        g.rms_radius_mm**2 + float(((p - centre) ** 2).sum()) for (_, g), p in zip(rows, centroids, strict=True)
+    ]
+    return replace(
+        rows[0][1],
+        flux_fraction=float(flux.sum()),
+        centroid_mm=(float(centre[0]), float(centre[1])),
+        rms_radius_mm=float(np.sqrt(flux @ square / flux.sum())),
+        peak_irradiance_fraction=float(fraction @ [ghost.peak_irradiance_fraction for _, ghost in rows]),
+    )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -276,63 +316,6 @@ def _spread(
             steep |= np.pad(jump, pad)
     uneven = np.where(steep.reshape(len(x), -1), lit, 0).sum(axis=1) / total
     return peak, magnification, folded, uneven
-
-
-@lru_cache(maxsize=8)
-def tracer(lens: Prescription, bands: Bands, reflections: int = 2) -> Tracer:
-    """Return the tracer of a lens at the nodes of bands; it is cached."""
-    return Tracer(lens, bands.nodes_nm, reflections=reflections, bands=bands)
-
-
-def traced_ghosts(
-    lens: Prescription,
-    sun_deg: float,
-    *,
-    azimuth_deg: float = 0.0,
-    bands: Bands = AT_D_LINE,
-    reflections: int = 2,
-    across: int | None = None,
-    only: Collection[tuple[int, ...]] | None = None,
-    progress: Callable[[int], None] | None = None,
-) -> tuple[Ghost, ...]:
-    """Return the ghosts of a far point source by exact rays, in the form of `paraxial.paraxial_ghosts`.
-
-    The peak is the largest irradiance of a cell of a coarser grid.
-
-    Parameters
-    ----------
-    bands
-        One band, whose mean is returned.
-    reflections
-        2, or 4 to include ghosts of four reflections.
-    across
-        Number of rays along either side of each ghost's box. Default: `FINE`, and `FINE_OF_FOUR` for the many faint
-        ghosts of four reflections.
-    only
-        Names of the ghosts to trace: the pair of rows, the smaller first. Default: all.
-    progress
-        Called with 1 after each wavelength.
-    """
-    turn = np.radians(azimuth_deg)
-    made = tracer(lens, bands, reflections).turned(turn)
-    rays, _ = boxes(made, sun_deg)
-    if only is not None:
-        rays = rays.take(named(made, rays, only))
-    if not len(rays):
-        return ()
-    four = np.array([len(made.routes[r]) > 2 for r in rays.route])
-    parts = [(~four, FINE), (four, FINE_OF_FOUR)] if across is None else [(four | True, across)]
-    weights = GhostSpectra.of(made, rays).weights(1)[..., 0]
-    of_name = {name_of(made.routes[route]): own for route, own in zip(rays.route, weights, strict=True)}
-    by_name: dict[tuple[int, ...], list[tuple[float, Ghost]]] = {}
-    for k in range(len(made.wavelength_nm)):
-        for chosen, count in parts:
-            at_node = replace(rays.take(chosen), wavelength=np.full(int(chosen.sum()), k))
-            for ghost in traced(made, at_node, sun_deg, turn, count) if len(at_node) else ():
-                by_name.setdefault(ghost.pair, []).append((float(of_name[ghost.pair][k]), ghost))
-        if progress is not None:
-            progress(1)
-    return tuple(mean_ghost(of) for _, of in sorted(by_name.items()))
 
 
 def named(made: Tracer, rays: Rays, names: Collection[tuple[int, ...]]) -> NDArray[np.bool_]:

@@ -12,7 +12,7 @@ focus, its disc is sampled instead.
 from __future__ import annotations
 
 import copy
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, Unpack
@@ -23,10 +23,23 @@ from numpy.typing import NDArray
 from ...core.errors import InputError
 from ...core.llvm import backend
 from ...core.spectra import Bands
+from ..glass import D_NM
+from ..paraxial import along
 from ..prescription import Prescription
 from .bundles import Rays, Spots, TraceOptions, Tracer, name_of
-from .ghosts import Arrivals, GhostSpectra, boxes, fluxes_mm2, named, traced
-from .paraxial import Ghost, along, mean_ghost
+from .ghosts import (
+    FINE,
+    FINE_OF_FOUR,
+    PEAK,
+    Arrivals,
+    Ghost,
+    GhostSpectra,
+    boxes,
+    fluxes_mm2,
+    mean_ghost,
+    named,
+    traced,
+)
 from .pyramid import LEVELS, Canvas
 from .raster import PARTS, BundleDrawing, Sums, edge_kind
 from .settings import TRACED, GhostSettings, SensorGrid
@@ -35,7 +48,7 @@ from .steps import FRINGES_END, stretched
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-MODELS = ("traced", "paraxial")
+AT_D_LINE = Bands.lines(D_NM)
 # Twice as many rays are traced across a ghost whose uneven fraction is larger, and across one that aberrations
 # spread (`_Detail.spread_out`).
 _UNEVEN = 0.3
@@ -142,9 +155,99 @@ class ParaxialTracer(Tracer):
         return spots
 
 
-def _at_node(rays: Rays, node: int) -> Rays:
-    """Return the bundles at one wavelength of the tracer, by its index."""
-    return replace(rays, wavelength=np.full(len(rays), node))
+TRACERS: Mapping[str, type[Tracer]] = {"traced": Tracer, "paraxial": ParaxialTracer}
+
+
+# --- the table of ghosts ----------------------------------------------------------------------------------------
+
+
+@lru_cache(maxsize=8)
+def _tracer(lens: Prescription, bands: Bands, model: str, reflections: int) -> Tracer:
+    """Return the tracer of a lens at the nodes of bands; it is cached."""
+    return TRACERS[model](lens, bands.nodes_nm, reflections=reflections, bands=bands)
+
+
+def traced_ghosts(
+    lens: Prescription,
+    sun_deg: float,
+    *,
+    azimuth_deg: float = 0.0,
+    bands: Bands = AT_D_LINE,
+    model: str = "traced",
+    reflections: int = 2,
+    across: int | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> tuple[Ghost, ...]:
+    """Return the ghosts of a far point source at an angle from the axis, towards an azimuth (0: +x).
+
+    The peak is the largest irradiance of a cell of a coarser grid. Ghosts without rays are left out.
+
+    Parameters
+    ----------
+    bands
+        One band, whose mean is returned.
+    model
+        As `GhostSettings.model`.
+    reflections
+        2, or 4 to include ghosts of four reflections.
+    across
+        Number of rays along either side of each ghost's box. Default: `FINE`, and `FINE_OF_FOUR` for the many faint
+        ghosts of four reflections.
+    progress
+        Called with 1 after each wavelength.
+    """
+    turn = float(np.radians(azimuth_deg))
+    made = _tracer(lens, bands, model, reflections).turned(turn)
+    rays, _ = boxes(made, sun_deg)
+    if not len(rays):
+        return ()
+    four = np.array([len(made.routes[r]) > 2 for r in rays.route])
+    parts = [(rays.take(~four), FINE, PEAK), (rays.take(four), FINE_OF_FOUR, PEAK)]
+    if across is not None:
+        parts = [(rays, across, PEAK)]
+    nodes, weights = range(len(made.wavelength_nm)), GhostSpectra.of(made, rays).weights(1)[..., 0]
+    by_name = _at_nodes(made, parts, nodes, _by_name(made, rays, weights), (sun_deg, turn), progress)
+    return tuple(mean_ghost(of) for _, of in sorted(by_name.items()))
+
+
+def _by_name(made: Tracer, rays: Rays, values: F64) -> dict[tuple[int, ...], F64]:
+    """Return the values of each bundle by the name of its ghost."""
+    return {name_of(made.routes[route]): own for route, own in zip(rays.route, values, strict=True)}
+
+
+def _at_nodes(
+    made: Tracer,
+    parts: Sequence[tuple[Rays, int, int]],
+    nodes: Iterable[int],
+    weights: Mapping[tuple[int, ...], F64],
+    sun: tuple[float, float],
+    progress: Callable[[int], None] | None = None,
+) -> dict[tuple[int, ...], list[tuple[float, Ghost]]]:
+    """Return each ghost at all nodes, by its name, with its weight at that node.
+
+    Parameters
+    ----------
+    parts
+        Bundles, and how many rays across give flux and peak (`ghosts.traced`).
+    nodes
+        Wavelengths of the tracer, by their indices.
+    weights
+        float64[node] of each ghost.
+    sun
+        The Sun's angle in degrees and its azimuth in radians.
+    """
+    by_name: dict[tuple[int, ...], list[tuple[float, Ghost]]] = {}
+    for k, node in enumerate(nodes):
+        for rays, across, peak_across in parts:
+            at_node = replace(rays, wavelength=np.full(len(rays), node))
+            for ghost in traced(made, at_node, *sun, across, peak_across):
+                by_name.setdefault(ghost.pair, []).append((float(weights[ghost.pair][k]), ghost))
+        if progress is not None:
+            progress(1)
+    return by_name
+
+
+# --- images -----------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -217,16 +320,15 @@ class FlareModel:
         settings: GhostSettings = TRACED,
     ) -> None:
         model, shape, pitch_mm = settings.model, sensor.shape, sensor.pitch_mm
-        if model not in MODELS:
-            raise InputError(f"model = {model!r}: must be one of {', '.join(MODELS)}")
+        if model not in TRACERS:
+            raise InputError(f"model = {model!r}: must be one of {', '.join(TRACERS)}")
         self.lens = lens
         self.bands, self.nodes_nm = bands, bands.nodes_nm
         self.canvas = Canvas(shape=shape, pitch_mm=pitch_mm, bands=len(bands))
         self.sun_radius_rad = sun_radius_rad
-        kind = Tracer if model == "traced" else ParaxialTracer
         at = np.arange((len(self.nodes_nm) - 1) * _SUBDIVISIONS + 1) / _SUBDIVISIONS
         self._fine = np.interp(at, np.arange(len(self.nodes_nm)), self.nodes_nm)
-        self._tracer = kind(lens, self._fine, reflections=settings.reflections, bands=bands)
+        self._tracer = TRACERS[model](lens, self._fine, reflections=settings.reflections, bands=bands)
         if lens.hood is not None:
             shift = sun_radius_rad * lens.hood.length_mm / lens.hood.radius_mm  # of the edge's shadow
             self._tracer.hood_width = max(shift, self._tracer.hood_width)
@@ -408,8 +510,7 @@ class FlareModel:
             traced_mm2 = fluxes_mm2(made, at_nodes, sun_deg, across).reshape(len(rays), len(nodes))
             spectra = GhostSpectra.of(made, rays, step=_SUBDIVISIONS)
             by_band = np.einsum("gk,gkb->gb", traced_mm2, spectra.weights(_SUBDIVISIONS))
-            for route, own in zip(rays.route, by_band, strict=True):
-                flux[name_of(made.routes[route])] += own
+            flux |= _by_name(made, rays, by_band)
         return flux
 
     def ghosts(
@@ -426,12 +527,9 @@ class FlareModel:
         rays, _, spectra = self._bright(made, rays.take(shown), arrivals.take(shown), np.inf)
         if not len(rays):
             return ()
-        weights = spectra.weights(_SUBDIVISIONS).mean(axis=2)
-        of_name = {name_of(made.routes[route]): own for route, own in zip(rays.route, weights, strict=True)}
-        by_name: dict[tuple[int, ...], list[tuple[float, Ghost]]] = {}
-        for k in range(len(self.nodes_nm)):
-            for ghost in traced(made, _at_node(rays, k * _SUBDIVISIONS), sun_deg, turn, across, across):
-                by_name.setdefault(ghost.pair, []).append((float(of_name[ghost.pair][k]), ghost))
+        weights = _by_name(made, rays, spectra.weights(_SUBDIVISIONS).mean(axis=2))
+        nodes = range(0, len(self._fine), _SUBDIVISIONS)
+        by_name = _at_nodes(made, [(rays, across, across)], nodes, weights, (sun_deg, turn))
         peak = {name: sum(part * g.peak_irradiance_fraction for part, g in of) for name, of in by_name.items()}
         highest = sorted(sorted(by_name), key=lambda name: -peak[name])[:most]
         return tuple(mean_ghost(by_name[name]) for name in sorted(highest))
@@ -590,6 +688,3 @@ def flare_model(
 ) -> FlareModel:
     """Return the model of a lens and a sensor; it is cached."""
     return FlareModel(lens, bands, sensor, sun_radius_rad=sun_radius_rad, settings=settings)
-
-
-__all__ = ["MODELS", "FlareModel", "disc_samples", "flare_model"]

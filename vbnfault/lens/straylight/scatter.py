@@ -16,12 +16,11 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import exprel
 
 from ...core.spectra import Bands
-from ..footprint import disc_overlap
-from ..paraxial import paraxial_properties
+from ..beams import disc_overlap
+from ..paraxial import along, mirrors, paraxial_properties
 from ..prescription import Prescription
 from ..rays import axial_transmittance, forward
 from ..thin import beyond_frame, cos4_map
-from .paraxial import along, mirrors
 from .particles import CLEANLINESS_LIMITS, checked, particle_bsdf, particle_scatter_fraction
 
 F32 = NDArray[np.float32]

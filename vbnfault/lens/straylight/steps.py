@@ -12,7 +12,6 @@ to ghosts:
 - `meet` (for exact rays) and `irradiance.ParaxialTracer.trace` (for paraxial rays). Round rims have the radii
   `bundles.Tracer.rims_mm`. For a stop with blades, `StopBlades.relative_radius` gives the rim.
 - `bundles.Tracer._hood_rim`, for both: the edge of a hood before the lens.
-- `paraxial.paraxial_ghosts`, which reads the radii from the prescription and treats the stop as round.
 
 Code that uses the rims without clipping a ghost, and that a rim of another shape also concerns:
 `ghosts._paraxial_boxes` (first boxes of rays), `irradiance.FlareModel._soften` (widths of soft edges), and
