@@ -13,7 +13,6 @@ from scipy.ndimage import map_coordinates
 from scipy.special import j0, j1
 
 from vbnfault.core import spectra
-from vbnfault.core.errors import InputError
 from vbnfault.core.spectra import Bands
 from vbnfault.lens import Prescription, load_lens, paraxial_properties, parse_lens, scaled_to_focal_length
 from vbnfault.lens.prescription import Surface
@@ -66,10 +65,6 @@ def bands_of(nodes_nm: F64, half_width_nm: float | None) -> Bands:
     return Bands.of(nm, np.maximum(1 - np.abs(nm - nodes_nm[:, None]) / half_width_nm, 0))
 
 
-def airy(v: F64) -> F64:
-    return (2 * j1(v) / np.where(v == 0, 1, v)) ** 2 + (v == 0)
-
-
 def distance_and_angle(shape: tuple[int, int], pitch: float = 1.0) -> tuple[F64, F64]:
     """From the middle sample of the frame of odd size, the angle from +x towards +y (down)."""
     y, x = np.mgrid[: shape[0], : shape[1]] - (np.array(shape)[:, None, None] - 1) / 2
@@ -105,39 +100,10 @@ def fraunhofer_psf(
 # --- a point source ---------------------------------------------------------------------------------------------
 
 
-def test_a_round_stop_gives_the_airy_pattern_to_the_third_ring() -> None:
-    stop = lens_with().surfaces[0]
-    psf, pitch = fraunhofer_psf(stop, NM, samples=1024, across=128)
-    assert psf.sum() == pytest.approx(1, abs=1e-12)
-    # area of the pupil / (λ f)² is the peak per area; of the flux 2 / πv lies beyond the frame's v = 64 π
-    peak = math.pi / 4 * DIAMETER_MM**2 / (NM * 1e-6 * 100.0) ** 2 * pitch**2
-    assert psf[512, 512] == pytest.approx(peak, rel=4e-3)
-    y, x = np.mgrid[:1024, :1024] - 512.0
-    v = math.pi * DIAMETER_MM * np.hypot(x, y) * pitch / (NM * 1e-6 * 100.0)
-    near = v < 13.3  # the fourth dark ring
-    crest = np.minimum(1, 8 / (math.pi * np.maximum(v, 1) ** 3))  # the rings' heights, cos² = 1 of J₁
-    wrong = np.abs(psf / psf[512, 512] - airy(v)) / crest
-    assert wrong[near].max() < 0.01
-    # and each ring where it belongs: J₂'s zeros
-    row = psf[512, 512:] / psf[512, 512]
-    place = v[512, 512:]
-    for zero in (5.1356, 8.4172, 11.6198):
-        around = np.flatnonzero(np.abs(place - zero) < 0.8)
-        a, b, _ = np.polyfit(place[around], row[around], 2)
-        top = around[np.argmax(row[around])]
-        assert -b / (2 * a) == pytest.approx(zero, rel=0.01)
-        assert row[top] == pytest.approx(float(airy(place[top])), rel=0.01)
-
-
 @pytest.mark.parametrize("blades", [5, 6, 7, 8, 9])
 def test_even_blades_give_as_many_spikes_and_odd_ones_twice_as_many(blades: int) -> None:
     expected = blades * (1 + blades % 2)
-    stop = lens_with(blades).surfaces[0]
-    psf, _ = fraunhofer_psf(stop, NM, samples=512, across=128)
     angle = np.linspace(0, 2 * np.pi, 1440, endpoint=False)
-    radius = np.arange(100.0, 180.0)[:, None]  # 25 to 45 fringes of the whole pupil, averaged
-    rings = map_coordinates(psf, [256 + radius * np.sin(angle), 256 + radius * np.cos(angle)], order=1)
-    assert count_spikes((rings * radius**2).mean(axis=0)) == expected
     frame = starburst(lens_with(blades), sun_radius_rad=1e-3, table=(224, 1024)).image(
         frame_at((0, 0), np.array([NM]), (401, 401), 0.02)
     )[0]
@@ -145,26 +111,15 @@ def test_even_blades_give_as_many_spikes_and_odd_ones_twice_as_many(blades: int)
     assert count_spikes(circle) == expected
 
 
-def test_the_pattern_grows_with_the_wavelength_and_turns_with_the_stop() -> None:
-    stop = lens_with().surfaces[0]
-    dark = []
-    for nm in (450.0, 675.0):
-        psf, pitch = fraunhofer_psf(stop, nm, samples=1024, across=64)
-        dark.append((10 + int(np.argmin(psf[512, 522:540]))) * pitch)
-    # 1.2197 λ f / D, found to half a sample of λ f / 16 D
-    assert dark == pytest.approx([1.2197 * nm * 1e-6 * 100 / DIAMETER_MM for nm in (450.0, 675.0)], rel=0.03)
-    assert dark[1] / dark[0] == pytest.approx(1.5, rel=1e-9)
-    # three blades, the first corner at 17°: normals of edges at 77° and every 60° from there on
-    turned = lens_with(3, rotation_deg=17.0)
-    psf, _ = fraunhofer_psf(turned.surfaces[0], NM, samples=513, across=128)
-    frame = starburst(turned, sun_radius_rad=1e-3, table=(224, 1024)).image(
+def test_the_pattern_turns_with_the_stop() -> None:
+    """Three blades, the first corner at 17°: normals of edges at 77° and every 60° from there on."""
+    frame = starburst(lens_with(3, rotation_deg=17.0), sun_radius_rad=1e-3, table=(224, 1024)).image(
         frame_at((0, 0), np.array([NM]), (513, 513), 0.02)
     )[0]
-    for picture in (psf, frame):
-        r, angle = distance_and_angle(picture.shape)
-        ring = (r > 120) & (r < 200)
-        bright = np.angle(np.sum((picture * r**2)[ring] * np.exp(6j * angle[ring]))) / 6
-        assert math.degrees(bright) % 60 == pytest.approx(17.0, abs=0.5)
+    r, angle = distance_and_angle(frame.shape)
+    ring = (r > 120) & (r < 200)
+    bright = np.angle(np.sum((frame * r**2)[ring] * np.exp(6j * angle[ring]))) / 6
+    assert math.degrees(bright) % 60 == pytest.approx(17.0, abs=0.5)
 
 
 # --- the Sun's disc against the transform of the pupil ----------------------------------------------------------
@@ -361,10 +316,3 @@ def test_eight_bands_are_what_each_is_alone(blades: int, rounding: float) -> Non
         alone = burst.image(frame_at((0.1, 0), nodes[k : k + 1], (101, 101), 0.08, half_width_nm=0))[0]
         lit = alone > 0
         np.testing.assert_allclose(together[k][lit], alone[lit], rtol=0.02)
-
-
-def test_what_does_not_fit_is_refused() -> None:
-    with pytest.raises(InputError, match=r"sun_radius_rad = 0"):
-        starburst(lens_with(), sun_radius_rad=0)
-    with pytest.raises(InputError, match=r"table = \(224, 65\)"):
-        starburst(lens_with(), sun_radius_rad=1e-3, table=(224, 65))

@@ -312,7 +312,7 @@ def test_light_that_has_met_the_rims_is_not_vignetted_again(model: str, vignetti
         np.testing.assert_allclose(apart.merged.array, whole.array, rtol=1e-5)
 
 
-@pytest.mark.parametrize("moved", [{"hood_offset": 0.6}, {"decentre": 0.7}, {"hood_offset": 0.4, "decentre": 0.4}])
+@pytest.mark.parametrize("moved", [{"hood_offset": 0.6}, {"decentre": 0.7}, {"hood_offset": 10.0}])
 def test_a_moved_hood_or_ring_takes_of_the_sun_what_it_takes_of_its_beam(moved: dict[str, float]) -> None:
     """All light past the rims loses the fraction that the scene loses by the fault at the Sun's pixel."""
     where = thin_context(12.0)
@@ -337,17 +337,6 @@ def test_a_moved_hood_or_ring_takes_of_the_sun_what_it_takes_of_its_beam(moved: 
     assert expected < 0.95
     # the Sun lies within half a pixel of that pixel's centre, where the map changes by less than 1 %
     np.testing.assert_allclose(past[1], past[0] * np.float32(expected), rtol=0.01)
-
-
-def test_a_hood_in_front_of_the_sun_leaves_none_of_its_light() -> None:
-    where = thin_context(12.0)
-    stray = from_dict("straylight", {"model": "paraxial"}, source="test")
-    before, _ = direct_sun(where, 12.0)
-    lit = stray.on_light(before, stray.draw(where, np.random.default_rng(1)), where)
-    rims = from_dict("vignetting", {"model": "lens", "hood_offset": 10.0}, source="test")
-    after = rims.on_light(lit, rims.draw(where, np.random.default_rng(2)), where).past_rims
-    assert after is not None
-    np.testing.assert_array_equal(after, 0)
 
 
 def test_the_sun_in_a_build_is_vignetted_once() -> None:
@@ -399,38 +388,6 @@ def test_the_sun_in_a_build_is_vignetted_once() -> None:
     np.testing.assert_allclose(plain.past_rims.sum(axis=(0, 1), dtype=np.float64), admitted, rtol=1e-4)
     np.testing.assert_array_equal(plain.past_rims, dimmed.past_rims)
     assert dimmed.array[0].sum() < plain.array[0].sum() or not plain.array[0].any()
-
-
-def test_the_mask_level_is_that_of_the_mask() -> None:
-    """The mask holds the pixels that change by `mask_level_dn` or more, the effect all that change."""
-    from conftest import small_scene
-
-    from vbnfault.dataset import store_spec
-    from vbnfault.pipeline import Session
-    from vbnfault.scene import config
-
-    table = small_scene(
-        camera={"width_px": 48, "height_px": 48},
-        plan={"faulty_fraction": 1.0, "mode": "per_class"},
-        dataset={"layers": ["clean", "mask_effect"]},
-    )
-    table["faults"] = {"straylight": {"model": "texture", "mask_level_dn": 40}}
-    session = Session(config.parse_scene(table, source="test"))
-    seen = 0
-    for index in range(8):
-        frame = session.frame(index)
-        if "straylight" not in frame.drawn:
-            continue
-        development, draws = frame.injection.development, frame.injection.draws
-        with_it, without = (development.image(d, noisy=False).array.astype(int) for d in (draws, {}))
-        change = np.abs(with_it - without).max(axis=2)
-        np.testing.assert_array_equal(frame.labels.masks[0], change >= 40)
-        np.testing.assert_array_equal(frame.labels.effects["straylight"], change >= 1)
-        seen += (frame.labels.masks[0] != frame.labels.effects["straylight"]).any()
-    assert seen
-    spec = store_spec(session, [16])
-    assert spec.mask_kinds == ("strong effect",)
-    assert "mask_level_dn = 40 DN" in spec.mask_rules[0]
 
 
 # --- the veil ----------------------------------------------------------------------------------------------------
