@@ -171,19 +171,13 @@ def _reflectances(lens: Prescription, wavelength_nm: tuple[float, ...]) -> tuple
     return coated, bare
 
 
-def surface_reflectances(lens: Prescription, wavelength_nm: F64, coating_loss: float) -> F64:
-    """Return the reflectance of every surface at normal incidence with worn coatings, float64[row, band].
+def worn(lens: Prescription, wavelength_nm: F64, coating_loss: float) -> F64:
+    """Return the transmittance of the surfaces with worn coatings, over that with whole coatings, float64[band].
 
     `coating_loss` is the fraction of the coatings' area that is gone, in [0, 1].
     """
-    coated, bare = _reflectances(lens, tuple(float(w) for w in wavelength_nm))
-    return np.asarray(coated + coating_loss * (bare - coated))
-
-
-def worn(lens: Prescription, wavelength_nm: F64, coating_loss: float) -> F64:
-    """Return the transmittance of the surfaces with worn coatings, over that with whole coatings, float64[band]."""
-    passes, passed = (1 - surface_reflectances(lens, wavelength_nm, loss) for loss in (coating_loss, 0.0))
-    return np.asarray(np.prod(passes / passed, axis=0))
+    coated, bare = _reflectances(lens, tuple(wavelength_nm.tolist()))
+    return np.asarray(np.prod((1 - (coated + coating_loss * (bare - coated))) / (1 - coated), axis=0))
 
 
 def colours(params: Params, context: FaultContext) -> F64:

@@ -7,21 +7,3 @@ from .paraxial import ParaxialProperties, paraxial_properties, scaled_to_field, 
 from .prescription import Prescription, Surface
 from .prescription_file import load_lens, parse_lens
 from .thin import Halo, ThinLens
-
-__all__ = [
-    "Halo",
-    "Lens",
-    "ParaxialProperties",
-    "Prescription",
-    "RealLens",
-    "Surface",
-    "ThinLens",
-    "closed_to",
-    "load_lens",
-    "open_f_number",
-    "paraxial_properties",
-    "parse_lens",
-    "scaled_to_field",
-    "scaled_to_focal_length",
-    "stopped_down",
-]

@@ -7,12 +7,13 @@ Airy's recursion runs over the interfaces from the substrate outwards. A medium 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import Field
 
 from ..core.errors import InputError
+from ..core.tables import table_class
 
 F64 = NDArray[np.float64]
 
@@ -21,13 +22,13 @@ _MGF2, _HIGH = 1.38, 2.05  # indices of magnesium fluoride and of a mixed oxide
 NAMES = ("none", "mgf2", "v", "bbar")
 
 
-@dataclass(frozen=True, kw_only=True)
+@table_class()
 class Layer:
-    """Describe one film of a coating: its index n + ik and its thickness."""
+    """Give one layer of a coating: its index n + ik and its thickness."""
 
-    n: float
-    thickness_nm: float
-    k: float = 0.0
+    n: float = Field(ge=0.01, le=10, description="refractive index")
+    k: float = Field(0.0, ge=0, le=20, description="extinction coefficient")
+    thickness_nm: float = Field(ge=0, le=1e5, description="thickness of the layer")
 
 
 def design(name: str, glass_index: float) -> tuple[Layer, ...]:

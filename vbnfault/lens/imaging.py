@@ -338,8 +338,7 @@ class RealLens:
     @cached_property
     def _corner(self) -> float:
         """Return the image height of the frame's corner, with the reach of the point spread, in EFL."""
-        half = np.hypot(self.width_px / 2 + REACH_PX, self.height_px / 2 + REACH_PX)
-        return float(half * self.pixel_pitch_um * 1e-3 / paraxial_properties(self._round).efl_mm)
+        return float(self._most_px * self.pixel_pitch_um * 1e-3 / paraxial_properties(self._round).efl_mm)
 
     @cached_property
     def _slopes(self) -> F64:

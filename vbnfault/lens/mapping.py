@@ -245,8 +245,6 @@ def field_map(slope: F64, chief: ChiefHeights, model: RadialModel, focal_length_
 # --- the model --------------------------------------------------------------------------------------------------
 
 
-COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-
 # Residuals below this count as equal. The lowest degree then wins: its coefficients are better determined.
 _ENOUGH_PX = 0.001
 # A model that follows all heights of the lens may fold. Then the outermost heights get less weight, until a model

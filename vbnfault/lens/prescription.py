@@ -13,7 +13,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import Field
 
+from ..core.tables import table_class
 from .coating import DESIGN_NM, Layer, design
 from .glass import AIR, CLEAR, D_NM, Glass, Transmittance
 
@@ -105,16 +107,17 @@ class Surface:
         return np.asarray(self.semi_diameter_mm * (edge + (1 - edge) * self.blade_rounding))
 
 
-@dataclass(frozen=True, kw_only=True)
+@table_class()
 class Hood:
-    """Describe a hood: a round edge of `radius_mm`, `length_mm` before the first vertex, around the axis.
+    """Describe a hood before the lens, which keeps light from the side out of it; its edge is round.
 
-    It keeps light out that comes from the side. Its wall between this edge and the lens may be a cylinder or a
-    cone, and is black.
+    Its wall between this edge and the lens may be a cylinder or a cone, and is black.
     """
 
-    length_mm: float
-    radius_mm: float
+    length_mm: float = Field(gt=0, le=1e6, description="distance of its edge before the first vertex")
+    radius_mm: float = Field(
+        gt=0, le=1e6, description="radius of its edge, at least that of the first surface's rim"
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

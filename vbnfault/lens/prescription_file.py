@@ -68,14 +68,6 @@ class TransmittanceTable(Table):
         return self
 
 
-class CoatingLayer(Table):
-    """Give one layer of a coating."""
-
-    n: float = Field(ge=0.01, le=10, description="refractive index")
-    k: float = Field(0.0, ge=0, le=20, description="extinction coefficient")
-    thickness_nm: float = Field(ge=0, le=1e5, description="thickness of the layer")
-
-
 class SurfaceRow(Table):
     """Describe one surface of revolution and the medium behind it."""
 
@@ -92,7 +84,7 @@ class SurfaceRow(Table):
     glass: str | GlassTable | None = Field(
         None, description="the medium by name or by a dispersion formula, in place of nd and vd"
     )
-    coating: str | tuple[CoatingLayer, ...] = Field(
+    coating: str | tuple[Layer, ...] = Field(
         "none", description="none, mgf2, v or bbar, or layers in the order in which light from the front meets them"
     )
     internal_transmittance_10mm: Fraction | TransmittanceTable | None = Field(
@@ -146,15 +138,6 @@ Row = Annotated[
 ]
 
 
-class HoodTable(Table):
-    """Describe a hood before the lens, which keeps light from the side out of it; its edge is round."""
-
-    length_mm: float = Field(gt=0, le=1e6, description="distance of its edge before the first vertex")
-    radius_mm: float = Field(
-        gt=0, le=1e6, description="radius of its edge, at least that of the first surface's rim"
-    )
-
-
 class PrescriptionFile(Table):
     """Describe a lens by its surfaces, front to back, with air in front and behind."""
 
@@ -163,7 +146,7 @@ class PrescriptionFile(Table):
     glass_catalogues: tuple[str, ...] = Field(
         (), description="glass catalogues (.agf) whose glasses the rows may name; paths from the file's folder"
     )
-    hood: HoodTable | None = Field(None, description="what stands before the lens; default: nothing")
+    hood: Hood | None = Field(None, description="what stands before the lens; default: nothing")
     surface: tuple[Row, ...] = Field(min_length=1, description="rows of the prescription, counted from 0")
 
     @model_validator(mode="after")
@@ -260,7 +243,7 @@ def _prescription(file: PrescriptionFile, source: str, catalogues: Sequence[Glas
         source=file.source,
         surfaces=surfaces,
         sensor_reflectance=file.sensor_reflectance,
-        hood=None if file.hood is None else Hood(**file.hood.model_dump()),
+        hood=file.hood,
     )
     _check(lens, source)
     return lens
@@ -326,10 +309,10 @@ def _transmittance(given: float | TransmittanceTable | None, medium: Glass) -> T
     return (D_NM,), (given,)
 
 
-def _coating(given: str | tuple[CoatingLayer, ...], front: Glass, back: Glass, where: str) -> tuple[Layer, ...]:
+def _coating(given: str | tuple[Layer, ...], front: Glass, back: Glass, where: str) -> tuple[Layer, ...]:
     """Return the layers of a row's coating, in the order in which light from the front meets them."""
     if isinstance(given, tuple):
-        return tuple(Layer(**layer.model_dump()) for layer in given)
+        return given
     try:
         layers = facing_air(given, front, back)
     except InputError as error:

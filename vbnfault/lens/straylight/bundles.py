@@ -22,7 +22,7 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import combinations
 from types import SimpleNamespace
-from typing import Any, TypedDict, Unpack
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,14 +72,7 @@ class Rays:
 
     def take(self, chosen: NDArray[Any]) -> Rays:
         """Return some of the bundles."""
-        return Rays(
-            route=self.route[chosen],
-            wavelength=self.wavelength[chosen],
-            box_mm=self.box_mm[chosen],
-            direction=self.direction[chosen],
-            disc=None if self.disc is None else self.disc[chosen],
-            light=None if self.light is None else self.light[chosen],
-        )
+        return Rays(**{name: None if of is None else of[chosen] for name, of in vars(self).items()})
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,26 +106,6 @@ class Spots:
     fraction: Any
     radius: Any
     margin: Any = None
-
-
-class TraceOptions(TypedDict, total=False):
-    """Name the options of `Tracer.trace`.
-
-    Attributes
-    ----------
-    centred
-        Whether rays start in the middles of the cells of the box. Otherwise rays start on the lattice of the box,
-        which includes the edges of the box and is rounded if `Rays.disc` is not 0.
-    halved
-        Whether to trace only one side of the plane of axis and Sun if all boxes are symmetric about this plane.
-    stretch
-        float64[step], at least 0: fraction by which the part of the margin beyond `steps.FRINGES_END` is
-        lengthened at each step. Default: 0.
-    """
-
-    centred: bool
-    halved: bool
-    stretch: F64
 
 
 def _paired(first: NDArray[Any], second: NDArray[Any]) -> NDArray[np.uint64]:
@@ -421,7 +394,10 @@ class Tracer:
         rays: Rays,
         across: int | NDArray[np.int64],
         width: F64 | None = None,
-        **options: Unpack[TraceOptions],
+        *,
+        centred: bool = False,
+        halved: bool = True,
+        stretch: F64 | None = None,
     ) -> Spots:
         """Trace a lattice of rays of every bundle.
 
@@ -432,24 +408,28 @@ class Tracer:
         width
             float64[step]: width of the rim's soft edge at each step of each route, in radii of the rim. Without
             widths, margins are not computed, and rays that miss a surface or are totally reflected become nan.
-        options
-            See `TraceOptions`; by default not centred, halved, and without stretch.
+        centred
+            Whether rays start in the middles of the cells of the box. Otherwise rays start on the lattice of the
+            box, which includes the edges of the box and is rounded if `Rays.disc` is not 0.
+        halved
+            Whether to trace only one side of the plane of axis and Sun if all boxes are symmetric about this plane.
+        stretch
+            float64[step], at least 0: fraction by which the part of the margin beyond `steps.FRINGES_END` is
+            lengthened at each step; default: 0.
         """
         side = np.broadcast_to(np.asarray(across, dtype=np.int64), len(rays))
-        centred = options.get("centred", False)
-        even = options.get("halved", True) and not rays.direction[:, 1].any() and not rays.box_mm[:, 1].any()
+        even = halved and not rays.direction[:, 1].any() and not rays.box_mm[:, 1].any()
         be = backend()
         dr = be.dr
         start = self._start(rays, side, centred, even)
         count, soft = dr.width(start.x), width is not None
         per_width = (np.zeros(len(self.rows)) if width is None else 1 / width).astype(np.float32)
-        stretch = options.get("stretch", np.zeros(len(self.rows))).astype(np.float32)
         sides = 2 if even and self._bladed else 1
         none, unit = dr.zeros(be.Float, count), dr.full(be.Float, 1, count)
         outside, margin = self._hood_rim(start)
         rim = (outside * outside, margin) if soft else (outside * outside,)
         ray = (start.x, start.y, none, start.dx, start.dy, start.dz, unit, *(rim * sides))
-        ray, last = self._followed(ray, start, per_width, stretch, soft)
+        ray, last = self._followed(ray, start, per_width, self._stretched(stretch), soft)
         both = arrived(ray, last, soft)
         dr.eval(both)
         if not even:
@@ -460,6 +440,10 @@ class Tracer:
             dr.scatter(out, mirrored, start.mirrored)
         dr.eval(whole)
         return Spots(rays, side, *whole)
+
+    def _stretched(self, stretch: F64 | None) -> NDArray[np.float32]:
+        """Return the option `stretch` of `trace`, float32[step]."""
+        return (np.zeros(len(self.rows)) if stretch is None else stretch).astype(np.float32)
 
     def _hood_rim(self, start: Any) -> tuple[Any, Any]:
         """Return the relative radius of each ray at the hood, and its margin there, as in `Spots`."""

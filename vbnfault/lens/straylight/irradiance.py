@@ -15,7 +15,7 @@ import copy
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any, Unpack
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,7 @@ from ...core.spectra import Bands
 from ..glass import D_NM
 from ..paraxial import along
 from ..prescription import Prescription
-from .bundles import Rays, Spots, TraceOptions, Tracer, name_of
+from .bundles import Rays, Spots, Tracer, name_of
 from .ghosts import (
     FINE,
     FINE_OF_FOUR,
@@ -105,7 +105,10 @@ class ParaxialTracer(Tracer):
         rays: Rays,
         across: int | NDArray[np.int64],
         width: F64 | None = None,
-        **options: Unpack[TraceOptions],
+        *,
+        centred: bool = False,
+        halved: bool = True,
+        stretch: F64 | None = None,
     ) -> Spots:
         """Trace paraxial rays as `Tracer.trace` traces exact ones; the slope of a ray is the tangent of its angle.
 
@@ -114,9 +117,9 @@ class ParaxialTracer(Tracer):
         be, t, f = backend(), self._tables, self._paraxial
         dr = be.dr
         side = np.broadcast_to(np.asarray(across, dtype=np.int64), len(rays))
-        start = self._start(rays, side, options.get("centred", False), False)
+        start = self._start(rays, side, centred, False)
         per_width = be.Float((np.zeros(len(self.rows)) if width is None else 1 / width).astype(np.float32))
-        stretch = be.Float(options.get("stretch", np.zeros(len(self.rows))).astype(np.float32))
+        beyond_edge = be.Float(self._stretched(stretch))
         blades = self._blades
         x, y = start.x, start.y
         sx, sy = start.dx / start.dz, start.dy / start.dz
@@ -137,7 +140,7 @@ class ParaxialTracer(Tracer):
                 blade = blades.relative_radius(hx, hy)
                 beyond = dr.select(dr.gather(be.UInt32, t["stop"], step) == 1, blade, beyond)
             inside = (1 - beyond) * dr.gather(be.Float, per_width, step)
-            margin = dr.minimum(margin, stretched(inside, dr.gather(be.Float, stretch, step)))
+            margin = dr.minimum(margin, stretched(inside, dr.gather(be.Float, beyond_edge, step)))
             return step + 1, dr.maximum(radius, beyond), margin
 
         first = (dr.gather(be.UInt32, t["start"], start.route), *self._hood_rim(start))

@@ -47,7 +47,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.errors import InputError
 from ...core.spectra import Bands
 from ..paraxial import paraxial_properties
 from ..prescription import Prescription, Surface
@@ -240,19 +239,10 @@ def _mixed(layers: F32, mix: F32, out: F32) -> None:
 def starburst(lens: Prescription, *, sun_radius_rad: float, table: tuple[int, int] = (224, 4096)) -> Starburst:
     """Return the starburst of a lens.
 
-    The tables of the starburst have `table` radii and angles. The defaults are fine enough for frames up to 1500
-    pixels wide.
-
-    Raises
-    ------
-    InputError
-        A value is out of range.
+    The tables of the starburst have `table` radii, 16 or more, and angles, an even number from 64 on. The defaults
+    are fine enough for frames up to 1500 pixels wide.
     """
     radii, angles = table
-    if not 0 < sun_radius_rad < 0.5:
-        raise InputError(f"sun_radius_rad = {sun_radius_rad!r}: must be above 0 and below 0.5")
-    if radii < 16 or angles < 64 or angles % 2:
-        raise InputError(f"table = {table}: must be 16 or more radii, and an even number of angles, 64 or more")
     optics = paraxial_properties(lens)
     return Starburst(
         efl_mm=optics.efl_mm,
