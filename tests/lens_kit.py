@@ -109,3 +109,12 @@ def bundle(lens: RealLens, slope: float, wavelength_nm: float, side: int = 121) 
     found = rays(lens, slope, x, y, wavelength_nm)
     at = found.points_mm[-1, found.arrives, :2] * 1e3 / lens.pixel_pitch_um
     return at, float(found.arrives.sum() * (2 * half / side) ** 2)
+
+
+def lens_area(d: Any, a: float, b: float) -> F64:
+    """Overlap of discs of radii a and b, in the form with Heron's root, complete and empty overlaps included."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        one = a * a * np.arccos((d * d + a * a - b * b) / (2 * d * a))
+        other = b * b * np.arccos((d * d + b * b - a * a) / (2 * d * b))
+        root = np.sqrt((-d + a + b) * (d + a - b) * (d - a + b) * (d + a + b)) / 2
+    return np.where(d >= a + b, 0.0, np.where(d <= abs(a - b), np.pi * min(a, b) ** 2, one + other - root))

@@ -126,8 +126,6 @@ def forward(lens: Prescription) -> tuple[tuple[int, str], ...]:
 
 def unfolded(lens: Prescription, a: int, b: int) -> tuple[tuple[int, str], ...]:
     """(row, what happens) of the ghost of rows a < b: to b, back to a, and on to the sensor."""
-    if not 0 <= a < b < len(lens.surfaces):
-        raise ValueError(f"no ghost of rows {a} and {b}: they must rise, within 0 to {len(lens.surfaces) - 1}")
     sequence = [(row, "onward") for row in range(b)]
     sequence += [(b, "turns back")]
     sequence += [(row, "back") for row in range(b - 1, a, -1)]

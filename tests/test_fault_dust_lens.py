@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from lens_kit import lens_area
 from numpy.typing import NDArray
 from scipy.special import j0, j1
 from test_faults_kit import flat_electrons, make, make_context, rng
@@ -88,15 +89,6 @@ def transmission(params: dict[str, Any], context: FaultContext) -> F64:
     fault = make("dust_on_optics", model="defocused")
     grey = flat_electrons(context)
     return np.asarray((fault.apply(grey, params, context).array / grey.array)[..., 1], dtype=np.float64)
-
-
-def lens_area(d: F64, a: float, b: float) -> F64:
-    """Overlap of discs of radii a and b, in the form with Heron's root, complete and empty overlaps included."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        one = a * a * np.arccos((d * d + a * a - b * b) / (2 * d * a))
-        other = b * b * np.arccos((d * d + b * b - a * a) / (2 * d * b))
-        root = np.sqrt((-d + a + b) * (d + a - b) * (d - a + b) * (d + a + b)) / 2
-    return np.where(d >= a + b, 0.0, np.where(d <= abs(a - b), np.pi * min(a, b) ** 2, one + other - root))
 
 
 def test_overlap_of_discs() -> None:

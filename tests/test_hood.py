@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import needs_llvm
+from lens_kit import lens_area
 from test_scene_straylight import SINGLET, behind, flux_of
 
 from vbnfault.core.errors import VbnfaultError
@@ -36,17 +37,8 @@ def hooded(tmp_path_factory: pytest.TempPathFactory) -> Prescription:
 
 
 def overlap(shift: float) -> float:
-    """The part of a circle of radius `RIM` within another one, by the sagittas of both segments."""
-    if shift <= RADIUS - RIM:
-        return 1.0
-    if shift >= RADIUS + RIM:
-        return 0.0
-    middle = (shift**2 + RIM**2 - RADIUS**2) / (2 * shift)  # of the common chord, from the small circle's centre
-    half_small, half_large = np.arccos(middle / RIM), np.arccos((shift - middle) / RADIUS)
-    area = RIM**2 * (half_small - np.sin(2 * half_small) / 2) + RADIUS**2 * (
-        half_large - np.sin(2 * half_large) / 2
-    )
-    return float(area / (np.pi * RIM**2))
+    """The part of a circle of radius `RIM` within the hood's edge, in closed form."""
+    return float(lens_area(max(shift, 1e-9), RIM, RADIUS) / (np.pi * RIM**2))
 
 
 @pytest.mark.parametrize("kind", [Tracer, ParaxialTracer])

@@ -18,6 +18,7 @@ from vbnfault.core.quantities import Electrons, Radiance
 from vbnfault.core.spectra import Bands
 from vbnfault.detector import ThreeColourDetector
 from vbnfault.faults import FaultContext, from_dict, registry
+from vbnfault.faults.straylight_lens import channel_bands
 from vbnfault.lens import (
     Prescription,
     RealLens,
@@ -29,7 +30,7 @@ from vbnfault.lens import (
 )
 from vbnfault.lens.coating import mean_reflectance
 from vbnfault.lens.straylight.scatter import Cleanliness
-from vbnfault.lens.straylight.settings import DirectPath, GhostSettings, SensorGrid, StraylightSettings, SunSource
+from vbnfault.lens.straylight.settings import GhostSettings, SensorGrid, StraylightSettings, SunSource
 from vbnfault.lens.straylight.total import SunInLens, SunStraylight
 from vbnfault.output import flare_images
 
@@ -247,29 +248,10 @@ def test_a_frame_with_all_straylight_holds_what_enters(camera: str, sun_deg: flo
     x = (np.arange(SIZE) + 0.5 - SIZE / 2) / where.camera.focal_length_px
     caught = ((1 + x[None, :] ** 2 + x[:, None] ** 2) ** -2).sum() / np.pi / where.camera.focal_length_px**2
     # what of the Sun's light leaves the frame, from the model itself, checked by a wider frame above
-    pitch_mm = where.camera.detector.pixel_pitch_um * 1e-3
-    lens = where.frame.prescription(params["lens"], params["coating"])
-    area = where.camera.lens.pupil_area_mm2([np.tan(np.radians(sun_deg)), 0.0])
-    assert where.sun_xy_px is not None
-    nm = spectra.fine_nodes_nm(NODES)
-    sensed = where.camera.detector.electron_rates(nm) * spectra.solar_irradiance_W_m2_nm(nm)
-    found = SunInLens(
-        lens=lens,
-        bands=Bands.of(nm, sensed),
-        sensor=SensorGrid(shape=where.shape, pitch_mm=pitch_mm),
-        sun=SunSource(
-            angle_deg=sun_deg,
-            radius_rad=spectra.sun_angular_radius_rad(1.0),
-            image_xy_mm=(float((where.sun_xy_px[0] - SIZE / 2) * pitch_mm), 0.0),
-        ),
-        settings=StraylightSettings(cleanliness=Cleanliness(level=200.0, roughness_nm=1.0), veil_fraction=0.02),
-        path=DirectPath(
-            transmittance=where.camera.lens.transmittance(nm),
-            admitted_mm2=float(area[0] * np.cos(np.radians(sun_deg))),
-            beam_fraction=float(area[0] / area[1]),
-        ),
-    ).straylight()
-    to_e = np.trapezoid(sensed, nm, axis=1) * where.camera.exposure_s / pitch_mm**2
+    source = fault.sun_in_lens(params, where)
+    assert source is not None
+    found = source.straylight()
+    to_e = channel_bands(where)[1] * where.camera.exposure_s / source.sensor.pitch_mm**2
     gone = to_e * beyond_mm2(found)
     ghosts = to_e * found.ghosts.flux_mm2
     total = after.past_rims.sum(axis=(0, 1), dtype=np.float64) + gone - scene_e * (1 - kept) * caught

@@ -27,7 +27,7 @@ class Layer:
     """Give one layer of a coating: its index n + ik and its thickness."""
 
     n: float = Field(ge=0.01, le=10, description="refractive index")
-    k: float = Field(0.0, ge=0, le=20, description="extinction coefficient")
+    k: float = Field(default=0.0, ge=0, le=20, description="extinction coefficient")
     thickness_nm: float = Field(ge=0, le=1e5, description="thickness of the layer")
 
 

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from ..core import file_contents
 from .adapt import OF_COATINGS, Change, changed, stopped_down
 from .beams import Beams, beams
-from .imaging import RealLens
-from .interface import Lens
+from .imaging import Lens, RealLens
 from .paraxial import scaled_to_focal_length
 from .prescription import Prescription
 from .prescription_file import load_lens

@@ -53,6 +53,7 @@ from .point_spread import (
 from .prescription import Prescription
 from .rays import axial_transmittance
 from .resampling import RadialTables, Resampling, table_distances
+from .thin import ThinLens
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -85,7 +86,7 @@ class FrameCoverage:
 class RealLens:
     """Image through a prescription at its final scale, with a sensor behind it.
 
-    It has the interface `Lens`.
+    It answers the same questions as a `ThinLens`.
 
     Attributes
     ----------
@@ -549,6 +550,11 @@ class RealLens:
             render_shape=(self.height_px + 2 * gy, self.width_px + 2 * gx),
             reach_px=self._most_px,
         )
+
+
+# The lenses of a camera. Code above this package asks a lens what it does and never which class it has, so that
+# another kind of lens only has to answer the same questions. Lenses are immutable and hashable.
+Lens = ThinLens | RealLens
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

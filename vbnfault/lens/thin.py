@@ -44,8 +44,8 @@ F64 = NDArray[np.float64]
 class ThinLens:
     """Describe a thin lens; `focus_distance_m` is the object distance in focus (inf: focused at infinity).
 
-    `halo` is its point spread, None for an ideal image; pixels then subtend `pixel_rad`. It has the interface
-    `Lens`.
+    `halo` is its point spread, None for an ideal image; pixels then subtend `pixel_rad`. It answers the
+    same questions as a `RealLens`.
     """
 
     focal_length_mm: float

@@ -170,53 +170,27 @@ def rounded(u: Any, v: Any, disc: Any) -> tuple[Any, Any]:
     return u * wide, v * high
 
 
-@dataclass(frozen=True, eq=False)
-class _PathSteps:
-    """Hold the steps of all paths, path after path.
+_STEP = np.dtype(
+    [("row", np.int64), ("mirror", bool), ("medium", np.int64), ("other", np.int64), ("gap_mm", float)]
+)
 
-    Attributes
-    ----------
-    row
-        uint32[step]: row of the surface; the row behind the last surface is the sensor.
-    mirror
-        bool[step]: whether the surface reflects.
-    medium, other
-        int64[step]: media before and behind the surface, counted from 0 in front of the lens.
-    gap_mm
-        float64[step]: distance of the last step's vertex behind the vertex of this step.
-    last_gap_mm
-        float64[path]: distance of the last vertex of a path behind the sensor.
+
+def _steps_of(paths: Sequence[Sequence[tuple[int, bool]]], vertex_mm: F64) -> tuple[NDArray[Any], F64]:
+    """Return the steps of all paths, path after path, and how far the last vertex of each lies behind the sensor.
+
+    The last of `vertex_mm` is the vertex of the sensor. A step has the row of its surface (the row behind the last
+    surface is the sensor), whether the surface reflects, the media before and behind it, counted from 0 in front of
+    the lens, and the distance of the last step's vertex behind its own.
     """
-
-    row: NDArray[np.uint32]
-    mirror: NDArray[np.bool_]
-    medium: NDArray[np.int64]
-    other: NDArray[np.int64]
-    gap_mm: F64
-    last_gap_mm: F64
-
-    @classmethod
-    def of(cls, paths: Sequence[Sequence[tuple[int, bool]]], vertex_mm: F64) -> _PathSteps:
-        """Return the steps of paths; the last of `vertex_mm` is the vertex of the sensor."""
-        row, mirror, medium, other, gap, last = [], [], [], [], [], []
-        for path in paths:
-            onward, before = True, 0
-            for k, reflects in path:
-                row.append(k)
-                mirror.append(reflects)
-                medium.append(k if onward else k + 1)
-                other.append(k + 1 if onward else k)
-                gap.append(vertex_mm[before] - vertex_mm[k])
-                before, onward = k, onward ^ reflects
-            last.append(vertex_mm[before] - vertex_mm[-1])
-        return cls(
-            row=np.array(row, dtype=np.uint32),
-            mirror=np.array(mirror, dtype=bool),
-            medium=np.array(medium, dtype=np.int64),
-            other=np.array(other, dtype=np.int64),
-            gap_mm=np.array(gap, dtype=np.float64),
-            last_gap_mm=np.array(last, dtype=np.float64),
-        )
+    steps, last = [], []
+    for path in paths:
+        onward, before = True, 0
+        for k, reflects in path:
+            media = (k, k + 1) if onward else (k + 1, k)
+            steps.append((k, reflects, *media, vertex_mm[before] - vertex_mm[k]))
+            before, onward = k, onward ^ reflects
+        last.append(vertex_mm[before] - vertex_mm[-1])
+    return np.array(steps, dtype=_STEP), np.array(last, dtype=np.float64)
 
 
 @lru_cache(maxsize=96)
@@ -295,15 +269,17 @@ class Tracer:
     def _upload(self) -> dict[str, Any]:
         """Compute the tables of all steps, and return the tables that are stored on the device."""
         be, lens = backend(), self.lens
-        steps = _PathSteps.of(self._paths, np.append(lens.vertices_mm, lens.vertices_mm[-1] + self.sensor_mm))
+        vertex_mm = np.append(lens.vertices_mm, lens.vertices_mm[-1] + self.sensor_mm)
+        steps, last_gap_mm = _steps_of(self._paths, vertex_mm)
+        rows, mirror = steps["row"].astype(np.uint32), steps["mirror"]
+        medium, other, gap_mm = (np.array(steps[name]) for name in ("medium", "other", "gap_mm"))
         index = np.stack([np.append(lens.indices(w), 1.0) for w in self.wavelength_nm])
         absorption = np.zeros((len(self.light_nm), index.shape[1]))
         for k, surface in enumerate(lens.surfaces):
             absorption[:, k + 1] = surface.absorption_per_mm(self.light_nm)
         self._absorbs = bool(absorption.any())
-        rows, medium = steps.row, steps.medium
         # index into the fractions of `_fractions`: 0 reflected from the front, 1 from behind, 2 transmitted
-        use = np.where(steps.mirror, medium != rows, 2)
+        use = np.where(mirror, medium != rows, 2)
         self.rows = rows
         self._look_up = rows.astype(np.int64) * 3 + use
         middle = lens.indices(float(np.median(self.wavelength_nm)))
@@ -312,20 +288,18 @@ class Tracer:
         aspheric = _aspheric_terms(lens)
         flat = [s.curvature_per_mm for s in lens.surfaces] + [0.0]
         conic = [1 + s.conic for s in lens.surfaces] + [1.0]
-        ratio = index[:, medium] / index[:, steps.other]
+        ratio = index[:, medium] / index[:, other]
         curvature, per_rim = np.array(flat)[rows], (1 / self.rims_mm)[rows]
         # each step fetches few but wide records, because fetches take most of the time
-        self._look_up_word = ((rows * 3 + use) * self._cosines * 2 + steps.mirror.astype(np.int64)).astype(
-            np.uint32
-        )
+        self._look_up_word = ((rows * 3 + use) * self._cosines * 2 + mirror.astype(np.int64)).astype(np.uint32)
         tables = {
             "row": be.UInt32(rows),
             "stop": be.UInt32((rows == lens.stop).astype(np.uint32)),
-            "place": be.UInt64(_paired(steps.gap_mm, curvature)),
+            "place": be.UInt64(_paired(gap_mm, curvature)),
             "bend": be.UInt64(_paired(ratio, np.broadcast_to(per_rim, (len(index), len(rows))))),
             "end": be.UInt32(self.first_step[1:].astype(np.uint32)),
             "start": be.UInt32(self.first_step[:-1].astype(np.uint32)),
-            "last": be.Float(steps.last_gap_mm.astype(np.float32)),
+            "last": be.Float(last_gap_mm.astype(np.float32)),
             "conic": be.Float(np.array(conic, dtype=np.float32)),
             "per_rim": be.Float(per_rim.astype(np.float32)),
             "absorption": be.Float(self._around(absorption).astype(np.float32).ravel()),

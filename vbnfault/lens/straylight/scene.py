@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from ...core import spectra
 from ...core.spectra import Bands
-from ..interface import Lens
+from ..imaging import Lens
 from ..paraxial import paraxial_properties
 from ..prescription import Prescription
 from ..rays import axial_transmittance
