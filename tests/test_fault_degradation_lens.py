@@ -186,19 +186,6 @@ def test_cells_of_several_pixels_tell_as_much(monkeypatch: pytest.MonkeyPatch) -
     assert np.abs(coarse - exact).mean() < 2e-3 * scene.mean()
 
 
-def test_a_flat_field_stays_flat() -> None:
-    where = make_context(512)
-    found = (
-        applied(flat_electrons(where), NONE | {"haze": 0.2, "haze_slope": -2.5}, where)
-        / flat_electrons(where).array
-    )
-    assert np.ptp(found) < 1e-4
-    # but for what goes farther than a frame's width: of the sphere's share, (1 + ...)
-    reach = 512 / where.camera.focal_length_px
-    inside, _ = quad(lambda b: 2 * np.pi * b * float(haze_kernel(np.array(b), 0.02, -2.5)), 0, reach, points=[0.02])
-    assert 0.8 + 0.2 * inside - 1e-3 < found.mean() < 1
-
-
 def test_the_suns_light_is_not_clipped() -> None:
     where = make_context(256)
     params = NONE | {"haze": 0.05}
@@ -252,19 +239,6 @@ def test_a_worn_coating_reflects_as_its_parts_do() -> None:
     for loss in (0.0, 0.4, 1.0):
         expected = ((1 - film - loss * (bare - film)) / (1 - film)) ** 2
         np.testing.assert_allclose(worn(lens, nodes, loss), expected, rtol=1e-6)
-
-
-def test_dose_reddens_and_darkens() -> None:
-    where = make_context(64)
-    before = np.ones(3)
-    for dose in (100.0, 1000.0, 5000.0):
-        after = colours(NONE | {"dose_krad": dose}, where)
-        assert (after < before).all()
-        assert after[0] > after[1] > after[2]  # red, green, blue
-        before = after
-    np.testing.assert_allclose(colours(NONE, where), 1.0, rtol=1e-12)
-    worn_ones = [colours(NONE | {"coating_loss": loss}, where) for loss in (0.0, 0.2, 0.6, 1.0)]
-    assert (np.diff(worn_ones, axis=0) < -1e-3).all()
 
 
 def test_colours_weigh_every_nanometre_as_the_detector_does() -> None:

@@ -11,7 +11,6 @@ from conftest import needs_llvm, render_threads
 from lens_kit import paraxial_ghosts
 from test_lens import BACK, GLASS, STOP
 
-from vbnfault.core.errors import InputError
 from vbnfault.core.spectra import Bands
 from vbnfault.lens import load_lens, paraxial_properties, parse_lens, scaled_to_focal_length
 from vbnfault.lens.glass import D_NM
@@ -426,16 +425,6 @@ def test_soft_edges() -> None:
     points = disc_samples(3)
     assert len(points) == 37
     assert (points**2).sum(axis=1).mean() == pytest.approx(0.5, rel=0.02)
-
-
-def test_a_sun_that_cannot_be() -> None:
-    made = model(load_lens("tessar_50_f2p8"))
-    with pytest.raises(InputError, match=r"sun_deg = 90: must be from 0 to below 90"):
-        made.image(90.0)
-    with pytest.raises(InputError, match="model = 'exact'"):
-        model(load_lens("tessar_50_f2p8"), model="exact")
-    with pytest.raises(InputError, match="reflections = 3"):
-        routes(load_lens("tessar_50_f2p8"), 3)
 
 
 @pytest.mark.parametrize("kind", ["traced", "paraxial"])

@@ -13,7 +13,6 @@ from scipy.integrate import quad
 from scipy.special import j1
 
 from vbnfault.core import resources
-from vbnfault.core.errors import InputError
 from vbnfault.core.spectra import Bands
 from vbnfault.lens import Prescription, load_lens, paraxial_properties, parse_lens
 from vbnfault.lens.paraxial import gap, mirrors, refraction, system
@@ -401,16 +400,3 @@ def test_a_baffle_against_a_grid() -> None:
 
 
 # --- bad input --------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("cleanliness", "words"),
-    [
-        (Cleanliness(roughness_nm=-1.0), "roughness_nm = -1: must be from 0 to 50"),
-        (Cleanliness(level=-3.0), "cleanliness_level = -3: must be from 0 to 1000"),
-    ],
-)
-def test_bad_values_are_told(cleanliness: Cleanliness, words: str) -> None:
-    with pytest.raises(InputError) as told:
-        veiling_glare(singlet(), GREEN, sun_deg=1.0, cleanliness=cleanliness)
-    assert str(told.value) == words

@@ -27,7 +27,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.errors import InputError
 from ...core.llvm import backend
 from ...core.spectra import Bands
 from ..coating import Layer, reflect_transmit
@@ -128,8 +127,6 @@ def routes(lens: Prescription, reflections: int = 2) -> tuple[tuple[int, ...], .
     two = [(b, a) for a, b in combinations(rows, 2)]
     if reflections == 2:
         return tuple(two)
-    if reflections != 4:
-        raise InputError(f"reflections = {reflections}: must be 2 or 4")
     return (*two, *(first + second for first in two for second in two if second[0] > first[1]))
 
 

@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.errors import InputError
 from ...core.llvm import backend
 from ...core.spectra import Bands
 from ..glass import D_NM
@@ -323,8 +322,6 @@ class FlareModel:
         settings: GhostSettings = TRACED,
     ) -> None:
         model, shape, pitch_mm = settings.model, sensor.shape, sensor.pitch_mm
-        if model not in TRACERS:
-            raise InputError(f"model = {model!r}: must be one of {', '.join(TRACERS)}")
         self.lens = lens
         self.bands, self.nodes_nm = bands, bands.nodes_nm
         self.canvas = Canvas(shape=shape, pitch_mm=pitch_mm, bands=len(bands))
@@ -445,18 +442,11 @@ class FlareModel:
         Parameters
         ----------
         sun_deg, azimuth_deg
-            Angle of the Sun from the axis, and its azimuth (0: +x, right; 90°: +y, down): the direct image lies at
-            +f tan θ in that direction.
+            Angle of the Sun from the axis, from 0 to below 90, and its azimuth (0: +x, right; 90°: +y, down): the
+            direct image lies at +f tan θ in that direction.
         only
             Pair of reflecting rows of the only ghost to draw; default: all.
-
-        Raises
-        ------
-        InputError
-            The angle is 90° or more.
         """
-        if not 0 <= sun_deg < 90:
-            raise InputError(f"sun_deg = {sun_deg:g}: must be from 0 to below 90")
         return self._drawn(sun_deg, float(np.radians(azimuth_deg)), only).irradiance()
 
     def _drawn(self, sun_deg: float, turn: float, only: tuple[int, int] | None) -> Sums:

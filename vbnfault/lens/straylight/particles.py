@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import j1
 
 from ...core.array_files import ArrayFiles, code_hash
-from ...core.errors import InputError
 from ..coating import reflect_transmit
 from ..glass import D_NM, RANGE_NM
 
@@ -34,15 +33,6 @@ _MIE_LARGEST = 500.0  # size parameter above which diffraction and geometrical o
 _TABLES = ArrayFiles(kind="mie", content="table of dust's scattering")
 _BIN = 0.01  # width of bins in ln(size parameter)
 _ANGLES = 321
-
-
-def checked(name: str, value: ArrayLike, low: float, high: float) -> F64:
-    """Return a value as float64. Raises InputError if any part of the value is out of range."""
-    array = np.asarray(value, dtype=np.float64)
-    wrong = ~((array >= low) & (array <= high))
-    if wrong.any():
-        raise InputError(f"{name} = {array[wrong].flat[0]:g}: must be from {low:g} to {high:g}")
-    return array
 
 
 def particle_count(level: float, diameter_um: ArrayLike) -> F64:
@@ -192,13 +182,8 @@ def particle_bsdf(
 
     Particles are spheres with the sizes of IEST-STD-CC1246, from 1 µm to `cleanliness_level` µm. The light
     falls on them along the normal, and each particle scatters independently of the others.
-
-    Raises
-    ------
-    InputError
-        The level is outside 0 (clean) to 1000.
     """
-    level = float(checked("cleanliness_level", cleanliness_level, *CLEANLINESS_LIMITS))
+    level = float(cleanliness_level)
     intensity, _ = _dust(level, float(wavelength_nm), index)
     b = np.abs(np.asarray(beta, dtype=np.float64))
     if level <= _SMALLEST_UM:
@@ -215,5 +200,4 @@ def particle_scatter_fraction(
     cleanliness_level: float, wavelength_nm: float, *, index: complex = DUST_INDEX
 ) -> float:
     """Return the fraction of light that the particles of `particle_bsdf` scatter forwards."""
-    level = float(checked("cleanliness_level", cleanliness_level, *CLEANLINESS_LIMITS))
-    return _dust(level, float(wavelength_nm), index)[1]
+    return _dust(float(cleanliness_level), float(wavelength_nm), index)[1]

@@ -21,7 +21,7 @@ from ..paraxial import along, mirrors, paraxial_properties
 from ..prescription import Prescription
 from ..rays import axial_transmittance, forward
 from ..thin import beyond_frame, cos4_map
-from .particles import CLEANLINESS_LIMITS, checked, particle_bsdf, particle_scatter_fraction
+from .particles import particle_bsdf, particle_scatter_fraction
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -97,14 +97,8 @@ class Harvey:
         """Return the model with TIS = (2π Δn σ/λ)², where σ is the rms roughness of spatial frequencies up to 1/λ.
 
         `index_step` is Δn; for a mirror Δn is 2.
-
-        Raises
-        ------
-        InputError
-            The roughness is outside 0 to 50 nm.
         """
-        sigma = float(checked("roughness_nm", roughness_nm, *ROUGHNESS_NM_LIMITS))
-        total = (2 * np.pi * index_step * sigma / wavelength_nm) ** 2
+        total = (2 * np.pi * index_step * roughness_nm / wavelength_nm) ** 2
         return cls(b0=float(total / cls(b0=1.0, L=L, S=S).tis), L=L, S=S)
 
     def bsdf(self, beta: ArrayLike) -> F64:
@@ -321,7 +315,7 @@ class _Surfaces:
 @lru_cache(maxsize=64)
 def _surfaces(lens: Prescription, wavelength_nm: float, cleanliness: Cleanliness) -> _Surfaces:
     """Return the scatter of a lens's surfaces at a wavelength."""
-    level = float(checked("cleanliness_level", cleanliness.level, *CLEANLINESS_LIMITS))
+    level = float(cleanliness.level)
     figures, path = paraxial_properties(lens, wavelength_nm), forward(lens)
     rows = list(mirrors(lens))
     index = lens.indices(wavelength_nm)

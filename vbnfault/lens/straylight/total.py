@@ -258,11 +258,6 @@ class SunInLens:
             float64[band]: what a second of the Sun's irradiance gives in the channel of each band; default: 1.
         once
             Remembers parts that other samples or evaluations need too.
-
-        Raises
-        ------
-        InputError
-            A value is out of range.
         """
         lens, bands, sensor, sun, settings = self.lens, self.bands, self.sensor, self.sun, self.settings
         optics = paraxial_properties(lens)
