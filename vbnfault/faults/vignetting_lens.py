@@ -124,12 +124,8 @@ class LensVignetting(LensFault):
 
 
 def _factor(params: Params, context: FaultContext) -> F32:
-    """Return the factor on the light of a sample."""
-    return factor(params, context.frame)
-
-
-def factor(params: Params, frame: ImageFrame) -> F32:
-    """Return the factor on the light, float32[y, x] in [0, 1]."""
+    """Return the factor on the light of a sample, float32[y, x] in [0, 1]."""
+    frame = context.frame
     left = _share_left(params, frame)
     return left if frame.lens.falls_off else left * _illumination(frame, params["lens"])
 
@@ -140,10 +136,8 @@ def share_left(params: Params, frame: ImageFrame, slope: F64) -> float:
     `slope` float64[2] holds the direction's tangents to the right and down. The direction may lie outside the
     frame.
     """
-    beams = frame.beams(params["lens"])
-    stop_mm = beams.lens.surfaces[beams.lens.stop].semi_diameter_mm
     x, y = np.asarray(slope, dtype=np.float64)[:, None]
-    return float(_left_of(params, beams, stop_mm, x, y)[0])
+    return float(_left_of(params, frame.beams(params["lens"]), x, y)[0])
 
 
 @lru_cache(maxsize=2)
@@ -197,7 +191,6 @@ def _lines(beams: Beams) -> tuple[F64, F64]:
 def _share_left(params: Params, frame: ImageFrame) -> F32:
     """Return the fraction of each beam's light that clears ring and hood, float32[y, x] in [0, 1]."""
     beams = frame.beams(params["lens"])
-    stop_mm = beams.lens.surfaces[beams.lens.stop].semi_diameter_mm
     focal_px = frame.lens.focal_length_mm * 1e3 / frame.pixel_pitch_um
     # the edge of a far hood is as wide as the beam projected through it
     soft_px = focal_px * beams.rim_mm[0].mean() / max(params["hood_distance_mm"], 1e-3)
@@ -208,11 +201,11 @@ def _share_left(params: Params, frame: ImageFrame) -> F32:
     left = np.empty(x.size, dtype=np.float32)
     for start in range(0, len(left), _TOGETHER):
         some = slice(start, start + _TOGETHER)
-        left[some] = _left_of(params, beams, stop_mm, x[some].astype(np.float64), y[some].astype(np.float64))
+        left[some] = _left_of(params, beams, x[some].astype(np.float64), y[some].astype(np.float64))
     return frame.between_nodes(left.reshape(slopes[0].shape), step)
 
 
-def _left_of(params: Params, beams: Beams, stop_mm: float, slope_x: F64, slope_y: F64) -> F64:
+def _left_of(params: Params, beams: Beams, slope_x: F64, slope_y: F64) -> F64:
     """Return the fraction left of the beams of the directions, float64[n].
 
     Along a line of rays, the light within a distance of the beam's middle is proportional to the square of that
@@ -231,7 +224,7 @@ def _left_of(params: Params, beams: Beams, stop_mm: float, slope_x: F64, slope_y
     first, last = np.zeros(to_rim.shape[2:]), np.ones(to_rim.shape[2:])
     openings = (
         (before, to_rim[0], params["hood_offset_mm"], params["hood_radius_mm"]),
-        (begin[1], to_rim[1], params["decentre_mm"], stop_mm),
+        (begin[1], to_rim[1], params["decentre_mm"], beams.lens.surfaces[beams.lens.stop].semi_diameter_mm),
     )
     for start, onwards, (x, y), radius in openings:
         # middle of the opening in the axes of the beam, outwards and across

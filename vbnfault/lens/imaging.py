@@ -45,10 +45,10 @@ from .point_spread import (
     REACH_PX,
     FieldBundles,
     PointSpreads,
-    Tiles,
     field_bundles,
     kernels_of_spots,
     spot_diagrams,
+    tiles,
 )
 from .prescription import Prescription
 from .rays import axial_transmittance
@@ -455,7 +455,7 @@ class RealLens:
         a render changes the power of a point by up to 26 %.
         """
         self._check(radiance)
-        bands = _key(radiance.wavelength_nm)
+        bands = tuple(radiance.wavelength_nm.tolist())
         tables, spreads = _tables(self, bands), _spreads(self, bands)
         array = np.empty((len(radiance.array), self.height_px, self.width_px), dtype=np.float32)
         fine, passes = radiance.fine, self.transmittance(radiance.wavelength_nm)
@@ -483,7 +483,7 @@ class RealLens:
         """
         if radiance.disc is None:
             return self.image(radiance)
-        bands, disc = _key(radiance.wavelength_nm), radiance.disc
+        bands, disc = tuple(radiance.wavelength_nm.tolist()), radiance.disc
         spreads = _spreads(self, bands)
         passes = self._passed(radiance.wavelength_nm)
         array = np.zeros((len(bands), self.height_px, self.width_px), dtype=np.float32)
@@ -507,7 +507,7 @@ class RealLens:
         Only distortion and lateral colour act: no light is lost and nothing is blurred.
         """
         self._check(radiance)
-        bands, disc = _key(radiance.wavelength_nm), radiance.disc
+        bands, disc = tuple(radiance.wavelength_nm.tolist()), radiance.disc
         tables = _tables(self, bands)
         source, fine = radiance.array, radiance.fine
         if disc is not None and radiance.sun is not None:
@@ -598,11 +598,6 @@ class ChiefRays:
         return np.asarray(np.interp(slope, mapped.slope, self.lens._beam_mm2(mapped.slope), right=0.0))
 
 
-def _key(wavelength_nm: F64) -> tuple[float, ...]:
-    """Return the wavelengths in the hashable form that caches need."""
-    return tuple(float(w) for w in wavelength_nm)
-
-
 @lru_cache(maxsize=64)
 def _map(lens: RealLens, wavelength_nm: float) -> FieldMap:
     """Return the map of one wavelength: the model at the d line, shifted by chief rays at the others."""
@@ -629,12 +624,13 @@ def _tables(lens: RealLens, wavelength_nm: tuple[float, ...]) -> RadialTables:
 @lru_cache(maxsize=8)
 def _spreads(lens: RealLens, wavelength_nm: tuple[float, ...]) -> PointSpreads:
     """Return the trimmed point spread functions of all tiles and bands."""
-    tiles = Tiles.of(lens.width_px + 2 * REACH_PX, lens.height_px + 2 * REACH_PX)
-    x = tiles.centre_x_px - (lens.width_px / 2 + REACH_PX)
-    y = tiles.centre_y_px - (lens.height_px / 2 + REACH_PX)
+    x, columns = tiles(lens.width_px + 2 * REACH_PX)
+    y, rows = tiles(lens.height_px + 2 * REACH_PX)
+    x, y = x - (lens.width_px / 2 + REACH_PX), y - (lens.height_px / 2 + REACH_PX)
     distance = np.hypot(x[None, :], y[:, None]).ravel() / lens.focal_length_px
     azimuth = np.arctan2(y[:, None], x[None, :]).ravel()
-    return tiles.spreads([point_spreads(lens, distance, azimuth, wavelength) for wavelength in wavelength_nm])
+    kernels = [point_spreads(lens, distance, azimuth, wavelength) for wavelength in wavelength_nm]
+    return PointSpreads.of(kernels, rows, columns)
 
 
 def point_spreads(lens: RealLens, distance: F64, azimuth_rad: F64, wavelength_nm: float) -> F32:

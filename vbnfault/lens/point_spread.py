@@ -177,6 +177,20 @@ class PointSpreads:
     rows: tuple[tuple[int, int, F32], ...]
     columns: tuple[tuple[int, int, F32], ...]
 
+    @classmethod
+    def of(
+        cls,
+        kernels_of_bands: Sequence[F32],
+        rows: tuple[tuple[int, int, F32], ...],
+        columns: tuple[tuple[int, int, F32], ...],
+    ) -> PointSpreads:
+        """Return the point spreads of the bands, each of kernels float32[tile, y, x], the tiles row by row."""
+        kernels = []
+        for stack in kernels_of_bands:
+            trimmed = iter([_trimmed(kernel) for kernel in stack])
+            kernels.append(tuple(tuple(next(trimmed) for _ in columns) for _ in rows))
+        return cls(kernels=tuple(kernels), rows=rows, columns=columns)
+
     def applied(self, light: F32, band: int) -> F32:
         """Return a band's light, float32[y, x], after each pixel's light is spread by the kernels of its tiles."""
         kernels = self.kernels[band]
@@ -212,7 +226,7 @@ def spread(light: F32, kernel: F32) -> F32:
     return np.asarray(out)
 
 
-def _tiles(size: int) -> tuple[F64, tuple[tuple[int, int, F32], ...]]:
+def tiles(size: int) -> tuple[F64, tuple[tuple[int, int, F32], ...]]:
     """Return the centres of the tiles along an axis, and start, stop and weights of each; all weights sum to 1."""
     count = max(1, round(size / _TILE_PX))
     edges = np.linspace(0, size, count + 1)
@@ -229,32 +243,6 @@ def _tiles(size: int) -> tuple[F64, tuple[tuple[int, int, F32], ...]]:
             weight *= np.clip((high - centre) / (2 * ramp), 0, 1)
         tiles.append((start, stop, weight.astype(np.float32)))
     return (edges[:-1] + edges[1:]) / 2, tuple(tiles)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Tiles:
-    """Hold the tiles of an image: centres in pixels along x and y, and start, stop and weights of each."""
-
-    centre_x_px: F64
-    centre_y_px: F64
-    rows: tuple[tuple[int, int, F32], ...]
-    columns: tuple[tuple[int, int, F32], ...]
-
-    @classmethod
-    def of(cls, width_px: int, height_px: int) -> Tiles:
-        """Return the tiles of an image of this size."""
-        centre_x, columns = _tiles(width_px)
-        centre_y, rows = _tiles(height_px)
-        return cls(centre_x_px=centre_x, centre_y_px=centre_y, rows=rows, columns=columns)
-
-    def spreads(self, kernels_of_bands: Sequence[F32]) -> PointSpreads:
-        """Return the point spreads of the bands, each of kernels float32[tile, y, x], the tiles row by row."""
-        across = len(self.columns)
-        kernels = []
-        for stack in kernels_of_bands:
-            trimmed = [_trimmed(kernel) for kernel in stack]
-            kernels.append(tuple(tuple(trimmed[k * across : (k + 1) * across]) for k in range(len(self.rows))))
-        return PointSpreads(kernels=tuple(kernels), rows=self.rows, columns=self.columns)
 
 
 # --- kernels -----------------------------------------------------------------------------------------------------

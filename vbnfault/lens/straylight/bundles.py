@@ -71,7 +71,8 @@ class Rays:
 
     def take(self, chosen: NDArray[Any]) -> Rays:
         """Return some of the bundles."""
-        return Rays(**{name: None if of is None else of[chosen] for name, of in vars(self).items()})
+        parts: dict[str, Any] = {name: None if of is None else of[chosen] for name, of in vars(self).items()}
+        return Rays(**parts)
 
 
 @dataclass(frozen=True, eq=False)
