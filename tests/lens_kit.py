@@ -5,6 +5,7 @@ The rays are the tests' own: they are traced one by one, without the tables of `
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache, partial
 from typing import Any
 
@@ -12,7 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vbnfault.camera import Camera
+from vbnfault.core import spectra
 from vbnfault.detector import ThreeColourDetector
+from vbnfault.faults import FaultContext
 from vbnfault.lens import (
     RealLens,
     ThinLens,
@@ -118,3 +121,14 @@ def lens_area(d: Any, a: float, b: float) -> F64:
         other = b * b * np.arccos((d * d + b * b - a * a) / (2 * d * b))
         root = np.sqrt((-d + a + b) * (d + a - b) * (d - a + b) * (d + a + b)) / 2
     return np.where(d >= a + b, 0.0, np.where(d <= abs(a - b), np.pi * min(a, b) ** 2, one + other - root))
+
+
+def sunlit(context: FaultContext, nodes_nm: F64, distance_au: float, **more: Any) -> FaultContext:
+    """Return a context with the Sun's light at a distance, in the bands of these nodes."""
+    return replace(
+        context,
+        wavelength_nm=nodes_nm,
+        sun_irradiance_W_m2_nm=spectra.solar_band_irradiance_W_m2_nm(nodes_nm, distance_au),
+        sun_angular_radius_rad=spectra.sun_angular_radius_rad(distance_au),
+        **more,
+    )

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import tmm
 from conftest import needs_llvm
-from lens_kit import paraxial_ghosts
+from lens_kit import paraxial_ghosts, sunlit
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from test_faults_kit import make_context
@@ -82,13 +82,8 @@ def with_films(lens: Prescription, films: tuple[Layer, ...]) -> Prescription:
 def context(lens: Prescription, bands: int, detector: ThreeColourDetector) -> FaultContext:
     real = RealLens(prescription=lens, width_px=SIZE, height_px=SIZE, pixel_pitch_um=20.0)
     nodes = spectra.band_nodes_nm(400.0, 700.0, bands)
-    return replace(
-        make_context(SIZE, sun=(0.75 * SIZE, 0.4 * SIZE)),
-        camera=Camera(lens=real, detector=detector, exposure_s=1e-3),
-        wavelength_nm=nodes,
-        sun_irradiance_W_m2_nm=spectra.solar_band_irradiance_W_m2_nm(nodes, 1.0),
-        sun_angular_radius_rad=spectra.sun_angular_radius_rad(1.0),
-    )
+    camera = Camera(lens=real, detector=detector, exposure_s=1e-3)
+    return sunlit(make_context(SIZE, sun=(0.75 * SIZE, 0.4 * SIZE)), nodes, 1.0, camera=camera)
 
 
 def pairs(lens: Prescription) -> list[tuple[int, ...]]:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import needs_llvm
+from lens_kit import sunlit
 from test_faults_kit import flat_electrons, make_context
 
 from vbnfault.core import spectra
@@ -30,14 +31,7 @@ SUN = (0.8 * SIZE, 0.35 * SIZE)
 
 def context(sun: tuple[float, float] | None = SUN, **more: Any) -> FaultContext:
     made = make_context(SIZE, sun=sun, exposure_s=1e-3)
-    nodes = spectra.band_nodes_nm(400.0, 700.0, 4)
-    return replace(
-        made,
-        wavelength_nm=nodes,
-        sun_irradiance_W_m2_nm=spectra.solar_band_irradiance_W_m2_nm(nodes, 3.0),
-        sun_angular_radius_rad=spectra.sun_angular_radius_rad(3.0),
-        **more,
-    )
+    return sunlit(made, spectra.band_nodes_nm(400.0, 700.0, 4), 3.0, **more)
 
 
 def light(model: str, where: FaultContext, **keys: Any) -> tuple[Any, dict[str, Any]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import replace
 from typing import Any
@@ -68,20 +67,6 @@ def test_light_that_lands_on_a_ring_of_the_sensor(name: str, distance_px: float)
     found = lens.relative_illumination(np.array([distance_px, 12.0]) / lens.focal_length_px)
     assert found[0] / found[1] == pytest.approx(expected, rel=0.015)
     assert found[0] < 0.9 * math.cos(math.atan(distance_px / lens.focal_length_px)) ** 4  # rims take their share
-
-
-@pytest.mark.parametrize("name", ["nikkor_35_f2p8", "biotar_100_f1p4"])
-def test_irradiance_on_the_axis(name: str) -> None:
-    """E = π T L / (4 N²) with the f-number of real rays; T by the coatings' own function."""
-    lens = real(name)
-    n = paraxial_properties(lens.prescription).efl_mm / real_pupil_diameter_mm(lens.prescription)
-    index = lens.prescription.indices(D_NM)
-    loss = [mean_reflectance((), a, b, 1.0, D_NM) for a, b in itertools.pairwise(index) if a != b]
-    share = float(np.prod(1 - np.array(loss)))
-    assert lens.transmission == pytest.approx(share, rel=1e-9)
-    patch = Radiance(array=np.full((1, 2, 3), 7.0, np.float32), wavelength_nm=np.array([D_NM]))
-    assert lens.f_number == pytest.approx(n, rel=0.01)
-    np.testing.assert_allclose(lens.on_axis(patch).array, 7 * math.pi * share / (4 * n**2), rtol=0.01)
 
 
 def test_coatings_and_glass_take_their_share() -> None:

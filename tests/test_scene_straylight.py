@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import needs_llvm, small_scene
-from lens_kit import paraxial_ghosts
+from lens_kit import paraxial_ghosts, sunlit
 from numpy.typing import NDArray
 from test_faults_kit import flat_electrons, make_context
 
@@ -485,13 +485,8 @@ def context(sun: tuple[float, float] | None, *, lit: bool = True, size: int = 64
     made = make_context(size, sun=sun, exposure_s=1e-3)
     nodes = spectra.band_nodes_nm(400.0, 700.0, 2)
     lit_disc = np.repeat(disc((size, size), 0.6, 0.6, 0.25), 2, axis=0) * np.float32(10)
-    return replace(
-        made,
-        wavelength_nm=nodes,
-        sun_irradiance_W_m2_nm=spectra.solar_band_irradiance_W_m2_nm(nodes, 3.0),
-        sun_angular_radius_rad=spectra.sun_angular_radius_rad(3.0),
-        radiance=Radiance(array=lit_disc, wavelength_nm=nodes) if lit else None,
-    )
+    radiance = Radiance(array=lit_disc, wavelength_nm=nodes) if lit else None
+    return sunlit(made, nodes, 3.0, radiance=radiance)
 
 
 def injected(where: FaultContext, light: Electrons, lens: Path, **keys: Any) -> tuple[F32, Any]:
