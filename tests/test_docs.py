@@ -24,7 +24,7 @@ from vbnfault.core.tables import json_schema
 from vbnfault.detector import Sensor
 from vbnfault.faults import registry
 from vbnfault.lens.prescription_file import PrescriptionFile
-from vbnfault.lens.straylight import ghosts
+from vbnfault.lens.straylight import irradiance
 from vbnfault.reflectance import registry as reflectances
 
 ROOT = Path(__file__).parents[1]
@@ -169,7 +169,7 @@ def test_every_block_runs_in_order(
     monkeypatch.setitem(FEWER, "--sample", most - 1)
     monkeypatch.setattr(vbnfault, "load_scene", small_scene)
     monkeypatch.setattr(vbnfault.study, "study", small_study)
-    monkeypatch.setattr(ghosts, "FINE", RAYS_ACROSS)
+    monkeypatch.setattr(irradiance, "FINE", RAYS_ACROSS)
     if "67p.obj" in page_text(page):
         # a user's own shape: the real comet's name, the embedded body's form
         body = load_body("embedded")

@@ -372,12 +372,6 @@ def _lobe_nodes() -> tuple[F64, F64]:
     return x, lobe(x)
 
 
-def lobe_tail() -> float:
-    """Return π x³ · lobe(x) for large x, where it is constant."""
-    nodes, values = _lobe_nodes()
-    return float(np.pi * nodes[-1] ** 3 * values[-1])
-
-
 def _lobe_table(x: F64) -> F64:
     """Return `lobe` by linear interpolation, within 1e-4; above `_SMOOTH` it falls as x⁻³."""
     nodes, values = _lobe_nodes()
@@ -431,7 +425,8 @@ def _lobes(radius_mm: F64, core: F64, sun: _Sun, stretch: float) -> tuple[F64, F
         float64[offset]: reflected intensity per mm² of squared radius.
     """
     k = 2 * np.pi * 1e6 / sun.wavelength_nm  # per mm
-    factor = lobe_tail() / (np.pi * k)
+    nodes, values = _lobe_nodes()
+    factor = float(np.pi * nodes[-1] ** 3 * values[-1]) / (np.pi * k)  # π x³ · lobe(x) is constant for large x
     knee = 2 / (k.mean() * np.median(radius_mm))
 
     # an offset is twice the sine of half the angle
