@@ -11,8 +11,9 @@ says what a disc there covers of them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from typing import Any
 
 import cv2
 import numpy as np
@@ -300,9 +301,8 @@ class Footprints:
     def part(self, where: tuple[slice, slice]) -> Footprints:
         """Return the footprints of some of the directions."""
         names = ("cos", "sin", "centre_mm", "area_mm2", "row")
-        parts: dict[str, F32] = {name: np.ascontiguousarray(getattr(self, name)[where]) for name in names}
-        brightness = tuple(np.ascontiguousarray(c[where]) for c in self.brightness)
-        return Footprints(**parts, brightness=brightness, table=self.table)
+        parts: dict[str, Any] = {name: np.ascontiguousarray(getattr(self, name)[where]) for name in names}
+        return replace(self, **parts, brightness=tuple(np.ascontiguousarray(c[where]) for c in self.brightness))
 
     def _from_middle(self, x_mm: float, y_mm: float) -> tuple[F32, F32]:
         """Return a position on the surface relative to the footprints' middles, along their azimuths and across."""

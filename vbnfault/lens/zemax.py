@@ -419,11 +419,7 @@ def _with_rims(
                 f"{surface.where}: DIAM: the semi-diameter is missing, and neither ENPD, FNUM nor other surfaces "
                 "give it; write it into the file"
             )
-        widest = (
-            math.inf
-            if surface.conic <= -1
-            else 1 / max(abs(surface.curvature) * math.sqrt(1 + surface.conic), 1e-99)
-        )
+        widest = 1 / max(abs(surface.curvature) * math.sqrt(max(1 + surface.conic, 0)), 1e-99)
         surface.semi_diameter = min(float(rim), _WITHIN * widest)  # paraxial heights may exceed a ball
     names = ", ".join(str(surfaces[1 + k].number) for k in missing)
     return f"; DIAM of SURF {names} from the paraxial beams of {cause}"
@@ -439,13 +435,8 @@ def _field_slope(head: Mapping[str, Sequence[str]], far: float, efl: float) -> f
     """Return the tangent of the largest field angle of a file; 0 where it names no field."""
     numbers = {key: [float(w) for w in words[1:] if is_number(w)] for key, words in head.items()}
     kind, _, count = (int(v) for v in ([*numbers.get("FTYP", []), 0, 0, 12])[:3])
-    most = max(
-        itertools.starmap(
-            math.hypot,
-            itertools.zip_longest(numbers.get("XFLN", [])[:count], numbers.get("YFLN", [])[:count], fillvalue=0.0),
-        ),
-        default=0.0,
-    )
+    x, y = (numbers.get(key, [])[:count] for key in ("XFLN", "YFLN"))
+    most = max((math.hypot(*field) for field in itertools.zip_longest(x, y, fillvalue=0.0)), default=0.0)
     if kind == 0:
         return math.tan(math.radians(min(most, 89.0)))
     return most / (efl if kind > 1 else far)  # of an image's height, or of the object's
