@@ -227,7 +227,7 @@ def ghost_truth(
     grid: int = 32,
 ) -> tuple[float, tuple[float, float], float]:
     """Flux fraction, centroid (x, y) in mm and r.m.s. radius in mm of a ghost, as in
-    `vbnfault.lens.straylight.paraxial.Ghost`.
+    `vbnfault.lens.straylight.ghosts.Ghost`.
 
     `grid`² cells fill the smallest box that holds the rays that pass, rays run through the middles of their
     quarters, and a quarter becomes a cell as long as that changes what it adds: edges, and rays near a critical
