@@ -251,7 +251,7 @@ def test_traced_ghosts_against_the_sequential_trace(name: str, sun_deg: float) -
     from vbnfault.lens.straylight.irradiance import traced_ghosts
 
     lens, wavelength = load_lens(name), WAVELENGTH_NM.get(name, D_NM)
-    traced = traced_ghosts(lens, sun_deg, azimuth_deg=AZIMUTH_DEG, bands=Bands.lines(wavelength), across=384)
+    traced = traced_ghosts(lens, sun_deg, azimuth_deg=AZIMUTH_DEG, bands=Bands.lines(wavelength))
     ghosts = {g.pair: g for g in traced}
     far = {}
     for pair in PAIRS[name]:
@@ -319,7 +319,7 @@ def test_traced_ghosts_off_the_sensor() -> None:
     lens = load_lens("nikkor_28_f2p8_camera").coated("none")
     rows = len(lens.surfaces)
     pairs = ((rows - 5, rows - 4), (rows - 2, rows))
-    found = {g.pair: g for g in traced_ghosts(lens, 8.0, azimuth_deg=AZIMUTH_DEG, across=384)}
+    found = {g.pair: g for g in traced_ghosts(lens, 8.0, azimuth_deg=AZIMUTH_DEG)}
     for pair in pairs:
         system = with_plane_at_sensor(lens) if pair[1] == rows else lens
         flux, centroid, rms = oracle.ghost_truth(system, *pair, 8.0, AZIMUTH_DEG)
