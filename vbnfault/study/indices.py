@@ -428,8 +428,8 @@ def _add_morris(arrays: dict[str, tuple[tuple[str, ...], _Array]], results: Resu
 def _add_delta(arrays: dict[str, tuple[tuple[str, ...], _Array]], results: Results) -> None:
     """Add the moment-independent index delta and the first-order index of given data, by SALib; means over blocks.
 
-    Delta needs 100 samples; from fewer it is nan. Its bootstrap has at most 20 resamples. Where nearly all values are
-    equal, a resample can have a single value, which has no density, and delta is nan, too.
+    Delta needs 100 samples; from fewer it is nan. Its bootstrap has at most 20 resamples. Where nearly all values
+    are equal, a resample can have a single value, which has no density, and delta is nan, too.
     """
     analyze = salib("analyze.delta", "design.method = 'latin_hypercube'").analyze
     design, table = results.design, results.design.spec.design
