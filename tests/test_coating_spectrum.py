@@ -196,8 +196,9 @@ def test_the_list_of_ghosts_has_the_means_of_both_coatings() -> None:
 
     for ghost in paraxial_ghosts(coated, 4.0, bands=sun):
         gain = sun.weights[0] @ light(both[1], ghost.pair) / light(both[0], ghost.pair)[0]
-        # both use the same rays; the light between the wavelengths of the list is a spline (3e-4 met)
-        assert ghost.flux_fraction == pytest.approx(plain[ghost.pair] * gain, rel=1e-3)
+        # both use the same rays; the light between the wavelengths of the list is a spline, and
+        # reflectances lie in tables over the cosine (2e-3 met)
+        assert ghost.flux_fraction == pytest.approx(plain[ghost.pair] * gain, rel=5e-3)
 
 
 @pytest.mark.parametrize("bands", [2, 5, 32])

@@ -353,7 +353,7 @@ def test_every_number_serves_at_both_ends_of_its_limits(
 
 @pytest.mark.parametrize("model", ["traced", "paraxial"])
 def test_limits_of_straylight_are_those_of_scatter(model: str) -> None:
-    """Scattering serves at both ends of the declared limits; it and the reader refuse what lies beyond."""
+    """Scattering serves at both ends of the declared limits; the reader refuses what lies beyond."""
     from vbnfault.lens.straylight import particles, scatter
 
     fields = registry()["straylight"][model].__dataclass_fields__
@@ -364,8 +364,6 @@ def test_limits_of_straylight_are_those_of_scatter(model: str) -> None:
         low, high = fields[key].metadata["limits"]
         assert np.isfinite([physics(low), physics(high)]).all()
         for beyond in (low - 1e-6, high * (1 + 1e-6)):
-            with pytest.raises(InputError, match=key):
-                physics(beyond)
             with pytest.raises(InputError, match=rf"faults\.straylight\.{key} = "):
                 from_dict("straylight", {"model": model, key: beyond}, source="test.toml")
 
