@@ -37,8 +37,8 @@ if TYPE_CHECKING:
     from .store import open_dataset
     from .study.run import study
 
-# public name → the module that defines it, and the name there if it is another; without one: the module itself. It is
-# loaded when the name is first used. `tests/test_api.py` compares this table with the imports above.
+# public name → the module that defines it, and the name there if it is another; without one: the module itself. It
+# is loaded when the name is first used. `tests/test_api.py` compares this table with the imports above.
 _HOMES = {
     "BuildOptions": "dataset",
     "DiscReflectance": "reflectance",
