@@ -20,8 +20,8 @@ from vbnfault.core import meshes, spectra
 from vbnfault.core.errors import InputError
 from vbnfault.pipeline import Session
 from vbnfault.scene.config import parse_scene
-from vbnfault.world import spacecraft
-from vbnfault.world.spacecraft import HingePose, Material, ModelPlacement, Part, Spacecraft, load_spacecraft
+from vbnfault.world import assemble, spacecraft
+from vbnfault.world.spacecraft import HingePose, Material, Part, Spacecraft, load_spacecraft
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
@@ -165,15 +165,12 @@ def test_units(obj: Path, unit: Any, metres: float) -> None:
 
 
 def test_placement(obj: Path) -> None:
-    placed = load_spacecraft(
-        obj, unit="cm", placement=ModelPlacement(roll_deg=90, yaw_deg=90, translation_B_m=(0.0, 0.5, -2.0))
-    )
+    keys = {"model": str(obj), "unit": "cm", "roll_deg": 90.0, "yaw_deg": 90.0, "translation_m": [0.0, 0.5, -2.0]}
+    placed = assemble.spacecraft(parse_scene({"title": "t", "spacecraft": keys}, source="t.toml"))
+    assert placed is not None
     # Rx(90) Rz(90): x -> y -> z, y -> -x, z -> -y
     x, y, z = load_spacecraft(obj).merged().vertices_B_m.T * 0.01
-    expected = np.stack([-y, -z + 0.5, x - 2.0], axis=1)
-    np.testing.assert_allclose(placed.merged().vertices_B_m, expected, atol=1e-6)
-    upright = ModelPlacement(yaw_deg=180).B_from_V  # the convention of GLB: y up, z forward, x left
-    np.testing.assert_allclose(upright, np.diag([-1.0, -1.0, 1.0]), atol=1e-15)
+    np.testing.assert_allclose(placed.vertices_B_m, np.stack([-y, -z + 0.5, x - 2.0], axis=1), atol=1e-6)
 
 
 # ------------------------------------------------------------------------------------ malformed input
