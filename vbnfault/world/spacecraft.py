@@ -281,8 +281,8 @@ def load_spacecraft(
     unit
         Unit of the file: "m", "cm" or "mm". The GLB standard uses metres.
     B_from_V, translation_B_m
-        Rotation float64[3, 3] from the file's axes V, and position of its origin, in B; by default they are those of
-        B. By convention GLB files have y up, z forward and x left; half a turn about z makes these the axes of B.
+        Rotation float64[3, 3] from the file's axes V, and position of its origin, in B; default: those of B. By
+        convention GLB files have y up, z forward and x left; half a turn about z makes these the axes of B.
     materials
         Settings for `make_material` by part or by the file's material. The first match applies: the part's path,
         its name, its parents' names from the nearest on, the file's material. Next follows a material of the file
