@@ -148,7 +148,8 @@ def test_patch_is_the_same_for_any_number_of_threads(body: Body, sites: tuple[Si
         with render_threads(count):
             built.append(build_patch(body, sites[1], PatchSpec(**coarse)))
     other = build_patch(body, sites[1], PatchSpec(**{**coarse, "seed": 2}))
-    assert np.abs(built[0].vertices_L_m[:20_000] - other.vertices_L_m[:20_000]).max() > 0.5
+    same = min(len(patch.vertices_L_m) for patch in (built[0], other))
+    assert np.abs(built[0].vertices_L_m[:same] - other.vertices_L_m[:same]).max() > 0.5
     for name in ("vertices_L_m", "faces", "dust", "boulder_diameter_m", "boulder_position_L_m"):
         np.testing.assert_array_equal(getattr(built[0], name), getattr(built[1], name))
 
