@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from conftest import small_scene
 from scipy.spatial.transform import Rotation
-from test_light import scene
-from test_render import NODES, UP, CountedScene, join, plane, sun, view
+from test_render import NODES, UP, CountedScene, join, plane, scene, sun, view
 
 from vbnfault import render
 from vbnfault.core import frames
