@@ -293,11 +293,3 @@ def test_the_identity_of_a_store_is_of_the_contents_of_its_map(tmp_path: Path) -
     assert first["body"]["albedo_map"]["file"].startswith("sha256:")
     assert first["body"]["albedo_map"] != other["body"]["albedo_map"]
     assert stored_scene({"scene": first, "blocks": [4]}).body.albedo_map is not None
-
-
-def test_a_relative_path_starts_from_the_scene_file(tmp_path: Path) -> None:
-    written(tmp_path / "map.png", quadrant())
-    (tmp_path / "s.toml").write_text('title = "t"\n[body.albedo_map]\nfile = "map.png"\n', encoding="utf-8")
-    albedo_map = config.load_scene(tmp_path / "s.toml").body.albedo_map
-    assert albedo_map is not None
-    assert albedo_map.file == str(tmp_path / "map.png")
