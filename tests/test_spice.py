@@ -175,14 +175,8 @@ SHAPE_FRAMES = {
     "Eros": (2000433, 11.363, 17.232, 326.08, 1639.38928, 0.0),  # eros_alex.tpc
     "Moon": (301, 269.9949, 66.5392, 38.3213, 13.17635815, -1.4e-12),  # pck00011.tpc, without its periodic terms
     "Ceres": (2000001, 291.42763, 66.76033, 170.309, 952.1532635, 0.0),  # CERES18D, dawn_ceres_v06.tpc
-    "Phobos": (
-        401,
-        317.67071657,
-        52.88627266,
-        35.1877444,
-        1128.84475928,
-        9.536137031212154e-9,
-    ),  # pck00011.tpc, too
+    # pck00011.tpc, too
+    "Phobos": (401, 317.67071657, 52.88627266, 35.1877444, 1128.84475928, 9.536137031212154e-9),
 }
 
 
@@ -271,26 +265,9 @@ def test_kernels_leave_nothing_behind(folder: Path) -> None:
     assert spiceypy.ktotal("ALL") == 0  # the pool of this process is the user's own
 
 
-def test_meta_kernels(folder: Path, tmp_path: Path) -> None:
-    meta = tmp_path / "all.tm"
-    listed = " ".join(f"'$K/{path.name}'" for path in all_of(folder))
-    text = (
-        f"KPL/MK\n\\begindata\nPATH_VALUES = ( '{folder}' )\nPATH_SYMBOLS = ( 'K' )\nKERNELS_TO_LOAD = ( {{}} )\n"
-    )
-    meta.write_text(text.format(listed))
-    with spice.kernels(meta):
-        assert np.linalg.norm(spice.sun_position_J_au(str(COMET), ET_S)) > 1
-    assert loaded() == 0
-    meta.write_text(text.format(listed + " '$K/lost.bsp'"))
-    sentence = (
-        rf"all\.tm: KERNELS_TO_LOAD names '\$K/lost\.bsp', which is missing; looked for {folder}/lost\.bsp\.$"
-    )
-    with pytest.raises(InputError, match=sentence), spice.kernels(meta):
-        pass
-    assert loaded() == 0
-
-
-@pytest.mark.parametrize("kind", ["relative", "working folder", "long", "continued", "crlf", "nested", "defining"])
+@pytest.mark.parametrize(
+    "kind", ["relative", "working folder", "long", "continued", "crlf", "nested", "defining", "lacking"]
+)
 def test_meta_kernels_as_agencies_and_users_write_them(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:
@@ -311,6 +288,8 @@ def test_meta_kernels_as_agencies_and_users_write_them(
     if kind == "defining":
         names.remove("a.tf")
         extra = FK.partition("\\begindata")[2].partition("\\begintext")[0]
+    if kind == "lacking":
+        names.append("lost.bsp")
     listed = ", ".join(f"'$K/{name}'" for name in names)
     text = (
         f"KPL/MK\n\\begindata\nPATH_VALUES = ( {value} )\nPATH_SYMBOLS = ( 'K' )\n{extra}"
@@ -322,6 +301,14 @@ def test_meta_kernels_as_agencies_and_users_write_them(
         (own / "outer.tm").write_text("KPL/MK\n\\begindata\nKERNELS_TO_LOAD = 'all.tm'\n\\begintext\n")
         meta = own / "outer.tm"
     monkeypatch.chdir(place.parent if kind == "working folder" else tmp_path)
+    if kind == "lacking":
+        sentence = (
+            rf"all\.tm: KERNELS_TO_LOAD names '\$K/lost\.bsp', which is missing; looked for {place}/lost\.bsp\.$"
+        )
+        with pytest.raises(InputError, match=sentence), spice.kernels(meta):
+            pass
+        assert loaded() == 0
+        return
     with spice.kernels(meta):
         assert np.linalg.norm(spice.sun_position_J_au(str(COMET), ET_S)) > 1
         assert spice.J_from_T("COMET_FIXED", ET_S).shape == (3, 3)  # the frame kernel too
@@ -402,10 +389,7 @@ def test_what_the_kernels_do_not_hold_is_said_in_a_sentence(folder: Path) -> Non
         return spice.pose_T(spacecraft, str(COMET), "COMET_FIXED", camera_frame, et_s, **more)
 
     cases = [
-        (
-            lambda: spice.sun_position_J_au(str(COMET), far),
-            r"Sun from 1000012 at JD 2456174\.\d+ TDB: .*no position",
-        ),
+        (lambda: spice.sun_position_J_au(str(COMET), far), r"Sun from 1000012 at JD 2456174\.\d+ .*no position"),
         (lambda: spice.sun_position_J_au("NOBODY", ET_S), "Sun from NOBODY at .*no body of that name"),
         (lambda: spice.J_from_T("NOFRAME", ET_S), "frame NOFRAME at .*: the kernels define no such frame"),
         (lambda: spice.J_from_T("IAU_EROS", ET_S), "frame IAU_EROS at "),
