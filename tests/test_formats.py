@@ -44,10 +44,6 @@ def both_counts(v: np.ndarray, f: np.ndarray) -> str:
     return f"{len(v):14d}{len(f):14d}\n" + rows(v, "%16.9f") + rows(f + 1, "%10d")
 
 
-def both_counts_numbered(v: np.ndarray, f: np.ndarray) -> str:
-    return f"{len(v)} {len(f)}\n" + rows(v, "%.9f", number_from=1) + rows(f + 1, "%d", number_from=1)
-
-
 def counts_apart_numbered(v: np.ndarray, f: np.ndarray) -> str:
     return f"{len(v)}\n" + rows(v, "%.9f", number_from=1) + f"{len(f)}\n" + rows(f + 1, "%d", number_from=1)
 
@@ -132,8 +128,7 @@ def vrml_sbn(v: np.ndarray, f: np.ndarray) -> str:
 VARIANTS: list[tuple[Callable[[np.ndarray, np.ndarray], str], str]] = [
     (both_counts, "tab"),
     (both_counts, "PLT"),
-    (both_counts_numbered, "plt"),
-    (counts_apart_numbered, "tab"),
+    (counts_apart_numbered, "plt"),
     (counts_apart, "txt"),
     (from_zero, "tab"),
     (osiris_ver, "ver"),

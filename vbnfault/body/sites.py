@@ -58,7 +58,7 @@ class Sites(Sequence[Site]):
     def __len__(self) -> int:
         return self._count
 
-    def __getitem__(self, index: int) -> Site:  # type: ignore[override]  # of slices nobody asks
+    def __getitem__(self, index: int) -> Site:  # type: ignore[override]  # no slices
         number = range(self._count)[index]
         if number not in self._made:
             self._made[number] = self._make(number)
