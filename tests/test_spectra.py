@@ -109,6 +109,11 @@ def test_angular_radius_of_the_sun(au: float, arcmin: float) -> None:
     assert np.degrees(spectra.sun_angular_radius_rad(au)) * 60 == pytest.approx(arcmin, abs=0.005)
 
 
+def test_constants_are_the_published_ones() -> None:
+    assert (spectra.AU_M, spectra.SUN_RADIUS_M) == (149_597_870_700, 695_700_000)
+    assert pytest.approx(1.98644586e-25, rel=1e-9) == spectra.PLANCK_J_S * spectra.LIGHT_SPEED_M_S  # CODATA hc
+
+
 # ----------------------------------------------------------------------------------------------- reflectances
 
 
