@@ -11,11 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from test_render import view
 
 from vbnfault.body import Body, ellipsoid
 from vbnfault.body.geometry import signed_volume, vertex_normals
 from vbnfault.core.errors import InputError
 from vbnfault.reflectance import BandReflectance, radiance_factor, registry
+from vbnfault.reflectance.hapke import COLUMNS
+from vbnfault.render.description import RenderInput, Sunlight
 from vbnfault.scene import bodies, config
 from vbnfault.world import assemble, ephemeris
 
@@ -178,53 +181,39 @@ def test_published_hapke_parameters_give_their_published_albedo(
     parameters: tuple[float, ...], albedo: float
 ) -> None:
     """Two digits are published: half a unit of the last."""
-    names = (
-        "single_scattering_albedo",
-        "asymmetry",
-        "shadow_hiding_amplitude",
-        "shadow_hiding_width",
-        "roughness_deg",
-    )
+    names = (*COLUMNS[:4], "roughness_deg")
     photometry = {"model": "hapke", "hapke": [{"wavelength_nm": 550.0} | dict(zip(names, parameters, strict=True))]}
-    body = {"shape": "ellipsoid", "semi_axes_m": [100.0] * 3, "photometry": photometry}
-    scene = config.parse_scene({"title": "t", "body": body}, source="t.toml")
+    scene = scene_of("x", body={"shape": "ellipsoid", "semi_axes_m": [100.0] * 3, "photometry": photometry})
     assert sphere_flux(assemble.ground_reflectance(scene), 1e-5)[0] == pytest.approx(albedo, abs=0.005)
 
 
 def shape_flux(body: Body, model: BandReflectance, phase_deg: float, turns: int = 6, pixels: int = 96) -> float:
     """Mean I/F over the visible cross-section of a body and its rotation, with the shadows that it casts on itself.
 
-    Camera and Sun lie in the plane of the equator.
+    Camera and Sun lie in the plane of the equator, far away.
     """
-    from vbnfault.render.runtime import mi
-    from vbnfault.render.vehicle import mesh_scene
+    from vbnfault import render
 
-    def vectors(array: Array) -> Any:
-        return mi.Vector3f(*(mi.Float(np.ascontiguousarray(c, dtype=np.float32)) for c in array.T))
-
-    vertices, faces = np.asarray(body.vertices_m), np.asarray(body.faces)
-    scene = mesh_scene("body", vertices.astype(np.float32), faces.astype(np.int32))
-    normals = np.cross(*(vertices[faces[:, k]] - vertices[faces[:, 0]] for k in (1, 2)))
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    reach = 1.05 * np.linalg.norm(vertices, axis=1).max()
-    grid = ((np.arange(pixels) + 0.5) / pixels * 2 - 1) * reach
-    across, upwards = (a.ravel()[:, None] for a in np.meshgrid(grid, grid))
-    total, seen = 0.0, 0
+    surface = render.TerrainMesh(body.vertices_m.astype(np.float32), body.faces, np.ones(len(body.faces), bool))
+    reach = 1.05 * np.linalg.norm(body.vertices_m, axis=1).max()
+    total = seen = 0.0
     for turn in np.arange(turns) * 2 * math.pi / turns:
-        view, east = np.array([[math.cos(turn), math.sin(turn), 0], [-math.sin(turn), math.cos(turn), 0]])
-        sun = math.cos(math.radians(phase_deg)) * view + math.sin(math.radians(phase_deg)) * east
-        start = across * east + upwards * np.array([0.0, 0, 1]) + 2 * reach * view
-        hit = scene.ray_intersect_preliminary(mi.Ray3f(vectors(start), mi.Vector3f(*map(float, -view))))
-        valid = np.array(hit.is_valid())
-        up, point = normals[np.array(hit.prim_index)[valid]], start[valid] - np.array(hit.t)[valid, None] * view
-        shadow = scene.ray_test(mi.Ray3f(vectors(point + 0.5 * up), mi.Vector3f(*map(float, sun))))
-        east_here = np.cross(up, [0.3, 0.5, 0.8])
-        east_here /= np.linalg.norm(east_here, axis=1, keepdims=True)
-        frame = np.stack([east_here, np.cross(up, east_here), up], axis=1)
-        factor = radiance_factor(model, frame @ sun, frame @ view)[0]
-        total += factor[(up @ sun > 0) & ~np.array(shadow)].sum()
-        seen += int(valid.sum())
-    return float(total / seen)
+        towards, east = np.array([[math.cos(turn), math.sin(turn), 0], [-math.sin(turn), math.cos(turn), 0]])
+        sun = math.cos(math.radians(phase_deg)) * towards + math.sin(math.radians(phase_deg)) * east
+        a_view = view(
+            1e4 * reach * towards, -towards, width=pixels, fov_deg=math.degrees(2e-4), start_m=9e3 * reach
+        )
+        a_scene = RenderInput(
+            view=a_view,
+            sun=Sunlight(direction_L=sun, angular_radius_rad=1e-5, irradiance_W_m2_nm=np.ones(1)),
+            wavelength_nm=np.array([550.0]),
+            reflectance=model,
+            samples_per_pixel=1,
+            key=1,
+        )
+        total += math.pi * float(render.direct(surface, a_scene).array.sum())
+        seen += float((render.truth(surface, a_view, a_scene.sun).semantic == 1).sum())
+    return total / seen
 
 
 def test_67p_has_its_published_phase_coefficient_with_the_shadows_of_its_shape() -> None:
@@ -263,7 +252,7 @@ def test_the_light_of_a_sphere_falls_to_nothing_behind_150_deg() -> None:
 )
 def test_a_wrong_phase_curve_is_refused(keys: dict[str, Any], sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
-        config.parse_scene({"title": "t", "body": {"photometry": {"model": "phase_curve"} | keys}}, source="t.toml")
+        scene_of("x", body={"photometry": {"model": "phase_curve"} | keys})
 
 
 # --- naming one is enough ---------------------------------------------------------------------------------------
@@ -289,15 +278,12 @@ def test_names_and_overrides() -> None:
     expected = scene_of("Bennu").body
     for name in ("bennu", "101955 Bennu", "(101955) BENNU", "1999 RQ36"):
         assert scene_of(name).body.model_copy(update={"name": "Bennu"}) == expected
-    own = config.parse_scene(
-        {
-            "title": "t",
-            "body": {"name": "Bennu", "rotation_period_h": 5.0, "photometry": {"dust_contrast": 0.1}},
-            "orbit": {"eccentricity": 0, "perihelion_au": 2, "inclination_deg": 0, "node_deg": 0}
-            | {"argument_deg": 0, "perihelion_jd": 2451545.0},
-            "spice": {"target": "BENNU"},
-        },
-        source="t.toml",
+    orbit = {"eccentricity": 0, "perihelion_au": 2, "inclination_deg": 0, "node_deg": 0, "argument_deg": 0}
+    own = scene_of(
+        "Bennu",
+        body={"name": "Bennu", "rotation_period_h": 5.0, "photometry": {"dust_contrast": 0.1}},
+        orbit=orbit | {"perihelion_jd": 2451545.0},
+        spice={"target": "BENNU"},
     )
     assert own.body.rotation_period_h == 5.0
     assert own.body.pole_ra_deg == expected.pole_ra_deg
@@ -305,11 +291,9 @@ def test_names_and_overrides() -> None:
     assert own.orbit is not None
     assert own.orbit.perihelion_au == 2
     assert (own.spice.target, scene_of("Bennu").spice.target) == ("BENNU", "2101955")
-    axes = config.parse_scene({"title": "t", "body": {"name": "Bennu", "semi_axes_m": [9.0, 9.0, 9.0]}}, source="t")
+    axes = scene_of("Bennu", body={"name": "Bennu", "semi_axes_m": [9.0, 9.0, 9.0]})
     assert axes.body.relief_m == 0  # that of the table fits its axes
-    other = config.parse_scene(
-        {"title": "t", "body": {"name": "Bennu", "photometry": {"model": "lambert"}}}, source="t"
-    )
+    other = scene_of("Bennu", body={"name": "Bennu", "photometry": {"model": "lambert"}})
     assert other.body.photometry == registry()["lambert"]()
 
 
@@ -338,9 +322,7 @@ def test_another_shape_is_told_what_it_has_of_the_named_body(tmp_path: Path) -> 
 
     path = tmp_path / "small.obj"
     trimesh.creation.icosphere(subdivisions=2, radius=0.05).export(path)
-    scene = config.parse_scene(
-        {"title": "t", "body": {"name": "Bennu", "shape": str(path), "density_kg_m3": 2000.0}}, source="t.toml"
-    )
+    scene = scene_of("Bennu", body={"name": "Bennu", "shape": str(path), "density_kg_m3": 2000.0})
     warning = assemble.values_of_another_body(scene, assemble.make_body(scene))
     assert "not 101955 Bennu, whose values it has for body.rotation_period_h = 4.29606," in warning
     assert "[body.photometry], [orbit]; give" in warning

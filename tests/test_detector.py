@@ -239,7 +239,9 @@ def test_electrons_expected_is_the_weighted_sum_of_the_bands() -> None:
     detector = ThreeColourDetector()
     light = np.random.default_rng(1).random((8, 37, 53), dtype=np.float32)
     got = detector.electrons_expected(Irradiance(array=light, wavelength_nm=NODES), 0.02)
-    weights = spectra.band_weights("nikon_5100", 0.5, NODES) * (5.5e-6) ** 2 * 0.02
+    weights = (
+        spectra.electron_weights(lambda nm: spectra.response("nikon_5100", nm, 0.5), NODES) * (5.5e-6) ** 2 * 0.02
+    )
     expected = np.einsum("cb,byx->yxc", weights, light.astype(np.float64))
     # eight products of float32 numbers: 8 · 6e-8
     np.testing.assert_allclose(got.array, expected, rtol=1e-6)

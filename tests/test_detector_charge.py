@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from vbnfault.core.architecture import READOUT_DIRECTIONS
+from vbnfault.core.quantities import READOUT_DIRECTIONS
 from vbnfault.detector import charge
 from vbnfault.detector.charge import (
     ChargeCloud,

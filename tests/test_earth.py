@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
+from poses_kit import columns_of, row
 
 from vbnfault import dataset, render
 from vbnfault.core import spectra
@@ -77,13 +77,9 @@ def test_the_light_of_the_whole_earth_is_as_measured() -> None:
     east = np.cross([0, 0, 1.0], sides)
     east /= np.linalg.norm(east, axis=1, keepdims=True)
     suns = np.cos(np.radians(phases_deg))[:, None] * sides + np.sin(np.radians(phases_deg))[:, None] * east
-    camera_from_T = np.stack([-east, np.cross(-sides, -east), -sides], axis=1)
-    quaternions = np.roll(Rotation.from_matrix(camera_from_T).as_quat(), 1, axis=1)
-    poses: dict[str, Any] = {"name": [str(k) for k in range(9)], "julian_date": [2457000.5] * 9}
-    poses |= {"sun_distance_au": [1.0] * 9}
-    poses |= {f"camera_{a}_T_m": distance_m * sides[:, k] for k, a in enumerate("xyz")}
-    poses |= {f"camera_from_T_{a}": quaternions[:, k] for k, a in enumerate("wxyz")}
-    poses |= {f"sun_{a}_T": suns[:, k] for k, a in enumerate("xyz")}
+    poses = columns_of(
+        [row(str(k), distance_m * sides[k], suns[k], sun_distance_au=1.0) for k in range(len(sides))]
+    )
     keys = {"camera.width_px": size_px, "camera.height_px": size_px, "camera.fov_deg": float(np.degrees(2 * half))}
     keys |= {"render.samples_per_pixel": 4, "dataset.layers": ["clean", "radiance"]}
     scene = config.load_scene("earth_observation", keys)
@@ -181,17 +177,10 @@ def test_a_camera_below_the_sun_sees_the_glint_of_the_sea() -> None:
     # the one whose surroundings within 5° are the freest
     free = [(opacity[directions @ d > 0.996].mean(), k) for k, d in enumerate(directions) if open_sea[k]]
     site = directions[min(free)[1]]
-    down = np.stack([np.cross(-site, [0, 0, 1]), np.zeros(3), -site])
-    down[0] /= np.linalg.norm(down[0])
-    down[1] = np.cross(down[2], down[0])
-    x, y, z, w = Rotation.from_matrix(down).as_quat()
-    row = [("name", "a"), ("julian_date", 2457000.5), ("sun_distance_au", 1.0)]
-    row += [(f"camera_{a}_T_m", 6.9e6 * v) for a, v in zip("xyz", site, strict=True)]
-    row += [(f"camera_from_T_{a}", v) for a, v in zip("wxyz", (w, x, y, z), strict=True)]
-    row += [(f"sun_{a}_T", v) for a, v in zip("xyz", site, strict=True)]
+    poses = columns_of([row("a", 6.9e6 * site, site, sun_distance_au=1.0)])
     keys = {"camera.width_px": 33, "camera.height_px": 33, "camera.fov_deg": 70.0, "render.samples_per_pixel": 4}
     scene = config.load_scene("earth_observation", {**keys, "dataset.layers": ["clean", "radiance"]})
-    red = Session(scene, poses={k: [v] for k, v in row}).simulate(0).layers["radiance"][-2]
+    red = Session(scene, poses=poses).simulate(0).layers["radiance"][-2]
     assert red[16, 16] > 2.5 * np.median(np.concatenate([red[0], red[-1], red[:, 0], red[:, -1]]))
 
 
@@ -229,16 +218,16 @@ def test_chapmans_function_against_quadrature() -> None:
             assert float(atmosphere.chapman(start, cosine, np)) == pytest.approx(exact, rel=0.005)
 
 
-def light(towards: F64, sun: F64, optical_depth: float, camera_m: float = 7e6) -> tuple[float, float]:
-    """Return what one line of sight gets from a camera on the x axis above a sphere, and what it leaves."""
-    z = towards / np.linalg.norm(towards)
-    x = np.cross([0.0, 0.0, 1.0], z)
-    x /= np.linalg.norm(x)
+def air_light(
+    L_from_C: F64, depth_m: Any, sun: F64, optical_depth: float, *, is_ground: Any, camera_m: float = 7e6
+) -> tuple[F64, F64]:
+    """Return what a row of pixels gets from a camera on the x axis above a sphere, and what it leaves."""
+    depth = np.array([depth_m], dtype=np.float32)
     view = View(
         position_L_m=np.array([camera_m, 0.0, 0.0]),
-        L_from_C=np.stack([x, np.cross(z, x), z], axis=1),
+        L_from_C=L_from_C,
         intrinsics=np.array([1e3, 1e3, 0.5, 0.5]),
-        width_px=1,
+        width_px=depth.shape[1],
         height_px=1,
     )
     air = render.Air(
@@ -248,12 +237,22 @@ def light(towards: F64, sun: F64, optical_depth: float, camera_m: float = 7e6) -
         optical_depth=np.array([optical_depth]),
         scale_height_m=SCALE_M,
     )
+    added, left = render.air_light(air, view, sun, depth, np.array([is_ground]))
+    return added[0, 0], left[0, 0]
+
+
+def light(towards: F64, sun: F64, optical_depth: float, camera_m: float = 7e6) -> tuple[float, float]:
+    """Return what one line of sight gets, and what it leaves."""
+    z = towards / np.linalg.norm(towards)
+    x = np.cross([0.0, 0.0, 1.0], z)
+    x /= np.linalg.norm(x)
     along = -camera_m * z[0]
     miss2 = camera_m**2 - along**2
     hits = miss2 < RADIUS_M**2 and along > 0
     depth = along - np.sqrt(RADIUS_M**2 - miss2) if hits else np.inf
-    added, left = render.air_light(air, view, sun, np.array([[depth]], dtype=np.float32), np.array([[hits]]))
-    return float(added[0, 0, 0]), float(left[0, 0, 0])
+    axes = np.stack([x, np.cross(z, x), z], axis=1)
+    added, left = air_light(axes, [depth], sun, optical_depth, is_ground=[hits], camera_m=camera_m)
+    return float(added[0]), float(left[0])
 
 
 def test_thin_air_has_its_closed_forms_at_nadir_and_limb() -> None:
@@ -308,24 +307,10 @@ def test_the_optical_depth_of_air_follows_its_published_values() -> None:
 
 def test_ground_behind_the_body_counts_as_the_body() -> None:
     """A ray between two facets may see the far side of the body. Its line of sight still ends near the ground."""
-    air = render.Air(
-        semi_axes_m=np.full(3, RADIUS_M),
-        centre_L_m=np.zeros(3),
-        T_from_L=np.eye(3),
-        optical_depth=np.array([0.1]),
-        scale_height_m=SCALE_M,
-    )
-    view = View(
-        position_L_m=np.array([7e6, 0.0, 0.0]),
-        L_from_C=np.array([[0.0, 0, -1], [1, 0, 0], [0, -1, 0]]),
-        intrinsics=np.array([1e3, 1e3, 0.5, 0.5]),
-        width_px=2,
-        height_px=1,
-    )
-    depth = np.array([[7e6 - RADIUS_M, 7e6 + RADIUS_M]], dtype=np.float32)
-    added, left = render.air_light(air, view, np.array([1.0, 0, 0]), depth, np.array([[True, True]]))
-    np.testing.assert_allclose(added[0, 0, 1], added[0, 0, 0], rtol=0.06)  # it ends 0.05 H below the sphere
-    np.testing.assert_allclose(left[0, 0, 1], left[0, 0, 0], rtol=0.06)
+    axes = np.array([[0.0, 0, -1], [1, 0, 0], [0, -1, 0]])
+    depth_m = [7e6 - RADIUS_M, 7e6 + RADIUS_M]
+    for near, far in air_light(axes, depth_m, np.array([1.0, 0, 0]), 0.1, is_ground=[True, True]):
+        assert far == pytest.approx(near, rel=0.06)  # it ends 0.05 H below the sphere
 
 
 def test_the_limb_of_the_scene_is_blue_and_thin_and_samples_repeat() -> None:

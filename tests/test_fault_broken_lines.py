@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from test_faults_kit import flat_rgbi, make, make_context, rng
 
-from vbnfault.core.architecture import ARCHITECTURES
 from vbnfault.core.errors import InputError
+from vbnfault.core.quantities import ARCHITECTURES
 from vbnfault.faults.broken_lines import TextureBrokenLines
 
 

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from test_faults_kit import flat_electrons, make, make_context, noisy, rng, with_mosaic
 
-from vbnfault.core.architecture import ARCHITECTURES
-from vbnfault.core.quantities import RawMosaic
+from vbnfault.core.quantities import ARCHITECTURES, RawMosaic
 from vbnfault.detector import load_sensor
 from vbnfault.detector.nodes import node_of
 from vbnfault.faults import FaultContext

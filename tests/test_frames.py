@@ -7,7 +7,6 @@ import pytest
 from conftest import small_scene
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation as Reference
 
 from vbnfault.core import frames
@@ -72,18 +71,11 @@ def test_azimuth_runs_from_north_to_east_and_elevation_upwards(
     np.testing.assert_allclose(frames.direction_L(azimuth, elevation), expected, atol=2e-16)
 
 
-@given(st.floats(0, 360, exclude_max=True), st.floats(-89.999, 89.999))
-def test_azimuth_and_elevation_round_trip(azimuth: float, elevation: float) -> None:
-    a, e = frames.azimuth_elevation_deg(frames.direction_L(azimuth, elevation))
-    # 1e-16 across the circle of radius cos(89.999°) = 1.7e-5 is 6e-12 rad of azimuth
-    assert 0 <= a < 360 or a == pytest.approx(360)
-    assert abs((a - azimuth + 180) % 360 - 180) < 1e-9
-    assert e == pytest.approx(elevation, abs=1e-9)
-
-
 @given(unit_vectors())
 def test_direction_round_trip_also_at_the_poles(direction: np.ndarray) -> None:
-    again = frames.direction_L(*frames.azimuth_elevation_deg(direction))
+    azimuth, elevation = frames.azimuth_elevation_deg(direction)
+    assert 0 <= azimuth < 360 or azimuth == pytest.approx(360)
+    again = frames.direction_L(azimuth, elevation)
     np.testing.assert_allclose(again, direction, atol=1e-15)
 
 
@@ -201,23 +193,16 @@ def test_minimal_rotation(source: np.ndarray, target: np.ndarray) -> None:
 
 
 @pytest.mark.parametrize("axis", [*np.eye(3), *-np.eye(3), frames.unit(np.array([0.3, -0.5, 0.2]))])
-def test_minimal_rotation_of_opposite_and_of_equal_vectors(axis: np.ndarray) -> None:
+def test_minimal_rotation_of_equal_of_opposite_and_of_nearly_opposite_vectors(axis: np.ndarray) -> None:
     assert_takes_by_the_smallest_angle(axis, -axis)
     np.testing.assert_allclose(frames.minimal_rotation(axis, axis), np.eye(3), atol=1e-15)
-
-
-@pytest.mark.parametrize(
-    "short_of_half_a_turn_rad",
-    [1e-3, 1e-5, 1.5e-6, 1e-9, 1e-12],
-)
-def test_minimal_rotation_close_to_opposite(short_of_half_a_turn_rad: float) -> None:
-    source = frames.unit(np.array([0.2, -0.7, 0.4]))
-    across = frames.unit(np.cross(source, [0.0, 0.0, 1.0]))
-    target = frames.unit(-np.cos(short_of_half_a_turn_rad) * source + np.sin(short_of_half_a_turn_rad) * across)
-    matrix = frames.minimal_rotation(source, target)
-    assert_proper_rotation(matrix)
-    # a bisector of length d is known to 1e-16 / d: 1e-8 is the best that both sides of any threshold can do
-    np.testing.assert_allclose(matrix @ source, target, atol=5e-8)
+    across = frames.unit(np.cross(axis, [0.3, 0.4, 0.8]))
+    for short_of_half_a_turn_rad in (1e-3, 1e-5, 1.5e-6, 1e-9, 1e-12):
+        target = frames.unit(-np.cos(short_of_half_a_turn_rad) * axis + np.sin(short_of_half_a_turn_rad) * across)
+        matrix = frames.minimal_rotation(axis, target)
+        assert_proper_rotation(matrix)
+        # a bisector of length d is known to 1e-16 / d: 1e-8 is the best that both sides of any threshold can do
+        np.testing.assert_allclose(matrix @ axis, target, atol=5e-8)
 
 
 # --------------------------------------------------------------------------------------------- orbit and spin
@@ -245,40 +230,7 @@ def test_distance_of_67p() -> None:
     assert np.linalg.norm(ORBIT.position_J_au(ORBIT.perihelion_jd)) == pytest.approx(ORBIT.perihelion_au, rel=1e-12)
 
 
-@pytest.mark.parametrize(
-    "eccentricity", [0.0, 0.3, 0.9, 0.99, 0.996, 0.9999, 1 - 1e-9, 1.0, 1 + 1e-9, 1.0001, 1.2, 3.0]
-)
-def test_any_conic_follows_newtons_law(eccentricity: float) -> None:
-    """Positions from 50 years before perihelion to 50 years after, against an integration of the motion."""
-    q, k = 0.5, 0.01720209895
-    orbit = frames.Orbit(
-        eccentricity=eccentricity,
-        perihelion_au=q,
-        inclination_deg=0.0,
-        node_deg=0.0,
-        argument_deg=0.0,
-        perihelion_jd=2457000.0,
-    )
-    days = 365.25 * np.array([0.0, 0.003, 0.02, 0.1, 0.3, 1.0, 3.0, 10.0, 25.0, 50.0])
-
-    def motion(_: float, state: np.ndarray) -> np.ndarray:
-        return np.concatenate([state[2:], -(k**2) * state[:2] / np.hypot(*state[:2]) ** 3])
-
-    # vis-viva at perihelion
-    start = [q, 0.0, 0.0, k * np.sqrt((1 + eccentricity) / q)]
-    found = solve_ivp(motion, (0, days[-1]), start, method="DOP853", rtol=1e-12, atol=1e-13, t_eval=days)
-    ecliptic = frames.rx(np.radians(-frames.OBLIQUITY_DEG))
-    after, before = (
-        np.array([ecliptic @ orbit.position_J_au(2457000.0 + sign * day) for day in days]) for sign in (1, -1)
-    )
-    # the integration's own error of the phase grows with the square of the revolutions: 141 of them at e = 0
-    np.testing.assert_allclose(after[:, :2], found.y[:2].T, atol=3e-7)
-    np.testing.assert_allclose(after[:, 2], 0, atol=1e-12)
-    # an orbit is its own mirror image in time
-    np.testing.assert_allclose(before, after * [1, -1, 1], atol=1e-9)
-
-
-@pytest.mark.parametrize("eccentricity", [0.0, 0.5, 0.9967, 1.0, 1.5, 100.0])
+@pytest.mark.parametrize("eccentricity", [0.0, 0.5, 0.9967, 1 - 1e-9, 1.0, 1 + 1e-9, 1.5, 100.0])
 @pytest.mark.parametrize("perihelion_au", [0.02, 30.0])
 def test_any_conic_is_solved_to_rounding(eccentricity: float, perihelion_au: float) -> None:
     """The time that a position stands for, by the textbook's three equations, is the date asked for."""
@@ -309,8 +261,13 @@ def test_any_conic_is_solved_to_rounding(eccentricity: float, perihelion_au: flo
     for days in (0.03125, 1.0, 32.0, 1024.0, 2.0**16, 2.0**21):
         if days > limit:
             break
-        x, y, _ = ecliptic @ orbit.position_J_au(2457000.0 + days)
+        x, y, z = ecliptic @ orbit.position_J_au(2457000.0 + days)
         r = np.hypot(x, y)
+        assert r + e * x == pytest.approx(q * (1 + e), rel=1e-9)  # the conic
+        # an orbit is its own mirror image in time
+        np.testing.assert_allclose(
+            ecliptic @ orbit.position_J_au(2457000.0 - days), [x, -y, z], rtol=1e-9, atol=1e-12 * r
+        )
         half = y / (r + x) if x > 0 else (r - x) / y
         # what rounding of the position and of the two frames means in time, and of the textbook's own difference
         # of nearly equal anomalies near perihelion

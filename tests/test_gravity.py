@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import polyhedral_gravity
 import pytest
 import trimesh
+from conftest import REAL_SHAPE
 
 from vbnfault.body import Body, load_body
 from vbnfault.body.geometry import face_normals_areas
 from vbnfault.body.gravity import GRAVITATIONAL_CONSTANT, PolyhedronGravity
 
-REAL_SHAPE = Path(__file__).parents[2] / "shared/data/shapes/67p_18k.obj"
 DENSITY = 537.8
 
 

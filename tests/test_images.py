@@ -143,7 +143,7 @@ def test_grey_of_tiff_means_what_its_tags_say() -> None:
         (tiff(grey < 100, photometric="miniswhite"), ~dark),
         (tiff(grey, photometric="palette", colormap=table), (table.T / 65535)[grey]),
         (tiff(grey, photometric="palette", colormap=table // 256), (table // 256).T[grey] / 255),
-        (tiff(grey.astype(np.int16)), grey[..., None] / 32767),
+        *((tiff(grey.astype(kind)), grey[..., None] / np.iinfo(kind).max) for kind in (np.int16, np.int32)),
         (tiff(grey, imagej=True), value),
         # 12 bits, two numbers in three bytes; 4095 is white
         (

@@ -9,45 +9,18 @@ import sys
 
 import numpy as np
 import pytest
-from conftest import render_threads
 from test_reflectance import SETS, by_angles, directions
-from test_render import NODES, UP, CountedScene, join, plane, sun, view
+from test_render import NODES, UP, CountedScene, ball, join, plane, scene, sun, view
 
 import vbnfault.render.bsdf  # noqa: F401 - registers Mitsuba's plug-ins
 from vbnfault import render
 from vbnfault.core import frames, spectra
-from vbnfault.reflectance import BandReflectance, DiscReflectance, radiance_factor, registry
+from vbnfault.reflectance import DiscReflectance, radiance_factor, registry
 from vbnfault.reflectance.disc import Lambert
-from vbnfault.reflectance.hapke import HAPKE_TABLES, hapke_at
-from vbnfault.render.description import RenderInput, Sunlight, View
+from vbnfault.reflectance.hapke import COLUMNS, HAPKE_TABLES, hapke_at
+from vbnfault.render.description import Sunlight
 from vbnfault.render.runtime import dr, mi
 from vbnfault.render.sampling import disc_sets
-
-
-def scene(
-    a_view: View, light: Sunlight, ground: BandReflectance | float, spp: int = 16, **more: object
-) -> RenderInput:
-    """A scene with the reflectance given, or Lambert's of a grey value."""
-    if isinstance(ground, float):
-        ground = Lambert().at(NODES, np.full(len(NODES), ground))
-    return RenderInput(
-        view=a_view,
-        sun=light,
-        wavelength_nm=NODES,
-        reflectance=ground,
-        samples_per_pixel=spp,
-        key=5,
-        **more,  # type: ignore[arg-type]
-    )
-
-
-def ball(radius_m: float = 100.0, subdivisions: int = 7) -> render.TerrainMesh:
-    import trimesh
-
-    mesh = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius_m)
-    return render.TerrainMesh(
-        mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32), np.zeros(len(mesh.faces), bool)
-    )
 
 
 @pytest.mark.parametrize("phase_deg", [0.0, 0.09, 5.0, 30.0, 90.0, 130.0])
@@ -61,7 +34,7 @@ def test_phase_curve_of_a_hapke_sphere(phase_deg: float) -> None:
     # so far that phase angles over the disc differ by 2e-4 rad: the opposition peak is 0.026 wide
     away, half = 5e5, 2.1e-4
     a_view = view(away * UP, -UP, width=256, fov_deg=float(np.degrees(2 * np.arctan(half))))
-    image = render.radiance(ball(), scene(a_view, light, ground)).array[band].astype(float)
+    image = render.radiance(ball(subdivisions=7), scene(a_view, light, ground)).array[band].astype(float)
     disc = image.sum() * (2 * half * away / 256) ** 2 / (np.pi * 100.0**2)
     got = disc * np.pi / light.irradiance_W_m2_nm[band]
 
@@ -87,36 +60,18 @@ def test_every_band_has_its_own_phase_function() -> None:
     light = sun(frames.direction_L(70, 35), 2.0)
     a_view = view(10 * UP, -UP, width=16, fov_deg=1.0)
     got = render.radiance(join(plane()), scene(a_view, light, hapke_at(NODES))).array.mean(axis=(1, 2))
-    rows = np.column_stack([getattr(hapke_at(NODES), name) for name in _columns()])
+    rows = np.column_stack([getattr(hapke_at(NODES), name) for name in COLUMNS])
     i = np.radians(55.0)
     expected = [by_angles(i, 1e-6, 0.0, tuple(row)) for row in rows] * light.irradiance_W_m2_nm
     # half a degree of field and a quarter of disc change cos i by 0.2 % at most, and cancel to first order
     np.testing.assert_allclose(got, expected, rtol=1e-3)
 
 
-def _columns() -> tuple[str, ...]:
-    from vbnfault.reflectance.hapke import COLUMNS
-
-    return COLUMNS
-
-
 @pytest.mark.parametrize("name", ["67P, Hapke 2002", "bright, rough"])
 def test_plugin(name: str) -> None:
     """The Mitsuba plugin: the same values; its samples integrate to the hemispherical albedo."""
-    w, g, b0, hs, bc0, hc, theta, k = SETS[name]
-    plugin = mi.load_dict(
-        {
-            "type": "hapke",
-            "w": w,
-            "g": g,
-            "B0": b0,
-            "h_s": hs,
-            "B_C0": bc0,
-            "h_c": hc,
-            "roughness_deg": theta,
-            "K": k,
-        }
-    )
+    keys = ("w", "g", "B0", "h_s", "B_C0", "h_c", "roughness_deg", "K")
+    plugin = mi.load_dict({"type": "hapke", **dict(zip(keys, SETS[name], strict=True))})
     angles = np.radians([[20, 50, 60], [50, 20, 60], [70, 70, 180], [5, 5, 0.05]])
     light, seen = directions(angles)
     si = dr.zeros(mi.SurfaceInteraction3f, len(angles))
@@ -322,24 +277,6 @@ def test_a_plane_has_the_radiance_of_its_model(name: str, more: dict[str, float]
         np.testing.assert_allclose(got, np.broadcast_to(bare * dusty, got.shape), rtol=5e-3)
 
 
-def test_bits_do_not_depend_on_threads() -> None:
-    surface = join(plane(60.0), *(_stone(k) for k in range(12)))
-    a_view, light = view(np.array([0, 0, -12.0]), -UP, width=64), limb(2.0)
-    light = dataclasses.replace(light, direction_L=frames.direction_L(30, 20))
-    a_scene = scene(a_view, light, hapke_at(NODES), bounces=1)
-    found = []
-    for threads in (2, 1):
-        with render_threads(threads):
-            found.append(render.radiance(surface, a_scene).array)
-    np.testing.assert_array_equal(*found)
-
-
-def _stone(k: int) -> tuple[np.ndarray, np.ndarray]:
-    from test_render import box
-
-    return box(np.array([np.cos(k) * 3, np.sin(2 * k) * 3, -0.3]), 0.4)
-
-
 # --- samples of the disc ----------------------------------------------------------------------------------------
 
 
@@ -367,10 +304,10 @@ def test_limb_darkening_adds_no_noise() -> None:
     a_view = view(10 * UP, -UP, width=32, fov_deg=1.0)
     light = dataclasses.replace(limb(), direction_L=frames.direction_L(20, 60))
     for spp in (4, 16):
-        signal = render.direct(join(plane()), scene(a_view, light, 0.06, spp)).array.sum(axis=0)
+        signal = render.direct(join(plane()), scene(a_view, light, 0.06, spp=spp)).array.sum(axis=0)
         assert signal.std() / signal.mean() < 1e-3
         weights = np.ones(len(NODES))
-        sampled = render.direct_by_sample(join(plane()), scene(a_view, light, 0.06, spp), weights)
+        sampled = render.direct_by_sample(join(plane()), scene(a_view, light, 0.06, spp=spp), weights)
         expected = 0.06 / np.pi * light.irradiance_W_m2_nm.sum() * np.sin(np.radians(60))
         assert sampled.radiance.array.sum(axis=0).mean() == pytest.approx(expected, rel=1e-3)
         # Points of the Sun are drawn by the limb darkening of the signal, so single samples are alike, too. What is

@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 from conftest import small_scene
-from test_light import limb, scene
-from test_render import NODES, UP, box, join, plane, view
+from test_light import limb
+from test_render import NODES, UP, box, join, plane, scene, view
 
 from vbnfault import render
 from vbnfault.camera import Camera

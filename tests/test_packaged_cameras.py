@@ -20,7 +20,7 @@ from vbnfault.detector.mosaic import sample
 from vbnfault.detector.readout import ReadoutNoise, analogue_dn, read_out
 from vbnfault.detector.sensor import load_sensor
 from vbnfault.lens import ThinLens, load_lens
-from vbnfault.reflectance.contract import Diffuse
+from vbnfault.reflectance.contract import SingleTerm
 from vbnfault.scene import config
 from vbnfault.world import assemble, cameras, ephemeris
 
@@ -168,7 +168,7 @@ def test_the_navigation_camera_sees_to_1000_nm() -> None:
     assert spectra.solar_irradiance_W_m2_nm(np.array([1000.0]))[0] == pytest.approx(0.74, rel=0.03)
     sun = spectra.solar_band_irradiance_W_m2_nm(nodes, 1.0)
     ground = assemble.ground_reflectance(scene)
-    assert isinstance(ground, Diffuse)  # whose spectrum is that of the geometric albedo, but for a factor
+    assert isinstance(ground, SingleTerm)  # whose spectrum is that of the geometric albedo, but for a factor
     albedo = np.asarray(ground.reflectance, dtype=np.float64)
     # Fornasier et al. 2015: 11 to 16 % per 100 nm in the visible; 0.0820 at 989 nm, 0.0677 at 649 nm, 5 % each
     near, red = (float(np.interp(nm, nodes, albedo)) for nm in (989.0, 649.0))

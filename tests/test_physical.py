@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from conftest import small_scene
 from scipy.spatial.transform import Rotation
-from test_light import scene
-from test_render import NODES, UP, CountedScene, join, plane, sun, view
+from test_render import NODES, UP, CountedScene, join, plane, scene, sun, view
 
 from vbnfault import render
 from vbnfault.core import frames
@@ -22,7 +21,6 @@ from vbnfault.pipeline.record import to_sample
 from vbnfault.pipeline.rendering import describe, render_view
 from vbnfault.pipeline.resolve import resolve
 from vbnfault.pipeline.spec import Frame
-from vbnfault.render import sampling
 from vbnfault.render.detail import _LEVELS, _SIDE, _UNIT, _pyramid
 from vbnfault.render.runtime import mi
 from vbnfault.render.surface import World
@@ -71,25 +69,6 @@ def test_the_relief_below_the_facets_follows_the_exponent_of_the_patch() -> None
     assert fine[0.4].slope / fine[0.9].slope == pytest.approx(
         (fine[0.4].longest_m / 4 / law.baseline_m) ** -0.5, rel=1e-6
     )
-
-
-def test_surface_points_reproject_onto_their_pixels(samples: tuple[Session, list[Frame]]) -> None:
-    """A surface point, carried through T and the stored pose, lands on its pixel's centre to 0.01 px."""
-    s, all_frames = samples
-    seen = 0
-    for frame in all_frames:
-        sample = to_sample(frame)
-        points = sample.layers["point_T_m"].reshape(-1, 3)
-        body = sample.layers["semantic"].ravel() == BODY
-        seen += body.sum()
-        C_from_T = rotation(sample.scalars["camera_from_T"])
-        in_C = (points[body] - sample.scalars["camera_position_T_m"]) @ C_from_T.T
-        fx, fy, cx, cy = sample.scalars["intrinsics"]
-        xy = np.column_stack([in_C[:, 0] / in_C[:, 2] * fx + cx, in_C[:, 1] / in_C[:, 2] * fy + cy])
-        rows, columns = np.divmod(np.flatnonzero(body), s.scene.camera.width_px)
-        np.testing.assert_allclose(xy, np.column_stack([columns, rows]) + 0.5, atol=0.01)
-        assert np.isnan(points[sample.layers["semantic"].ravel() == SKY]).all()
-    assert seen > 5000
 
 
 def test_truth_angles_are_those_of_the_points(samples: tuple[Session, list[Frame]]) -> None:
@@ -277,23 +256,6 @@ def test_noise_of_sampling_stays_below_the_sensors() -> None:
         if judged == 3:
             break
     assert judged == 3
-
-
-def test_tables_of_an_adaptive_render_are_made_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    made = []
-    make = sampling.disc_sets
-    monkeypatch.setattr(sampling, "disc_sets", lambda *key: made.append(key) or make(*key))
-
-    def one_render() -> None:
-        for samples in (4, 16, 64, 256):
-            strata = sampling.Strata(sampling.Pixels(4), samples, 0)
-            for dimension in range(3):  # the Sun's disc, the aperture, one bounce
-                strata.disc(dimension)
-
-    one_render()
-    made.clear()
-    one_render()
-    assert not made
 
 
 def test_finest_relief_has_its_slopes_and_fades_into_the_pixel() -> None:

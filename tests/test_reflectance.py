@@ -9,16 +9,12 @@ from typing import Any, Literal
 
 import numpy as np
 import pytest
-from conftest import small_scene
 from pydantic import Field
 
-from vbnfault import render
 from vbnfault.core.errors import InputError
 from vbnfault.reflectance import DiscReflectance, radiance_factor, registry
 from vbnfault.reflectance.hapke import COLUMNS, HAPKE_TABLES, Hapke, geometric_albedo, hapke_at
-from vbnfault.render.description import RenderInput, Sunlight, View
 from vbnfault.scene import config
-from vbnfault.world import assemble, ephemeris
 
 # w, g, B0, h_s, B_C0, h_c, roughness (deg), K
 SETS = {
@@ -271,6 +267,8 @@ class Minnaert(DiscReflectance):
 
 
 def test_a_model_defined_here_alone_is_a_key_of_the_scene_file() -> None:
+    """And it is rendered: `test_light.test_a_plane_has_the_radiance_of_its_model` takes every registered one."""
+
     def parsed(**table: Any) -> config.Scene:
         return config.parse_scene({"title": "t", "body": {"photometry": table}}, source="t.toml")
 
@@ -288,34 +286,3 @@ def test_a_model_defined_here_alone_is_a_key_of_the_scene_file() -> None:
     assert "exponent" in json.dumps(config.json_schema({}))
     # every store of an earlier version lists the keys of all models of that time
     assert parsed(model="powered", phase_slope_mag_deg=0.0, parameters="67p_fornasier2015", hapke=None)
-
-
-def test_a_model_defined_here_alone_is_rendered() -> None:
-    """A plane in oblique light, seen from straight above: cos(i)^k of the normal reflectance."""
-    table = {"photometry": {"model": "powered", "exponent": 0.6}}
-    scene = config.parse_scene(small_scene(body=table, render={"bands": 1}), source="t.toml")
-    ground = assemble.ground_reflectance(scene)
-    light = np.array([math.sin(math.radians(60)), 0.0, -0.5])
-    vertices = np.array([[-9, -9, 0], [9, -9, 0], [9, 9, 0], [-9, 9, 0]], dtype=np.float32)
-    plane = render.TerrainMesh(vertices, np.array([[0, 2, 1], [0, 3, 2]], np.int32), np.ones(2, dtype=bool))
-    seen = View(
-        position_L_m=np.array([0.0, 0.0, -9000.0]),
-        L_from_C=np.eye(3),
-        intrinsics=np.array([16000.0, 16000.0, 4.0, 4.0]),
-        width_px=8,
-        height_px=8,
-    )
-    sun = Sunlight(direction_L=light, angular_radius_rad=1e-5, irradiance_W_m2_nm=np.ones(1))
-    got = render.radiance(
-        plane,
-        RenderInput(
-            view=seen,
-            sun=sun,
-            wavelength_nm=ephemeris.wavelengths_nm(scene),
-            reflectance=ground,
-            samples_per_pixel=4,
-            key=0,
-        ),
-    ).array
-    normal = ground.weights[0, 0]
-    np.testing.assert_allclose(got, normal * 0.5**0.6, rtol=1e-4)

@@ -13,7 +13,9 @@ from vbnfault import render
 from vbnfault.core import frames, spectra
 from vbnfault.detector import ThreeColourDetector
 from vbnfault.lens import ThinLens
+from vbnfault.reflectance import BandReflectance
 from vbnfault.reflectance.disc import Lambert
+from vbnfault.reflectance.hapke import hapke_at
 from vbnfault.render.description import RenderInput, Sunlight, View
 from vbnfault.render.runtime import dr, mi, packets
 
@@ -53,6 +55,14 @@ def box(centre: np.ndarray, half_m: float) -> tuple[np.ndarray, np.ndarray]:
     return (mesh.vertices + centre).astype(np.float32), mesh.faces.astype(np.int32)
 
 
+def ball(radius_m: float = 100.0, subdivisions: int = 6, centre: Any = (0, 0, 0)) -> render.TerrainMesh:
+    import trimesh
+
+    mesh = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius_m)
+    vertices = (mesh.vertices + np.array(centre)).astype(np.float32)
+    return render.TerrainMesh(vertices, mesh.faces.astype(np.int32), np.zeros(len(mesh.faces), bool))
+
+
 def join(*parts: tuple[np.ndarray, np.ndarray]) -> render.TerrainMesh:
     offset, vertices, faces = 0, [], []
     for v, f in parts:
@@ -86,15 +96,19 @@ def view(position: np.ndarray, look: np.ndarray, width: int = 64, fov_deg: float
 
 
 def scene(
-    a_view: View, light: Sunlight, spp: int = 16, reflectance: float | str = 0.06, key: int = 5
+    a_view: View,
+    light: Sunlight,
+    ground: BandReflectance | float | str = 0.06,
+    *,
+    spp: int = 16,
+    key: int = 5,
+    **more: Any,
 ) -> RenderInput:
+    """A scene with the reflectance given, or Lambert's of a grey value or a named spectrum."""
+    if isinstance(ground, float | str):
+        ground = Lambert().at(NODES, spectra.reflectance(ground, NODES))
     return RenderInput(
-        view=a_view,
-        sun=light,
-        wavelength_nm=NODES,
-        reflectance=Lambert().at(NODES, spectra.reflectance(reflectance, NODES)),
-        samples_per_pixel=spp,
-        key=key,
+        view=a_view, sun=light, wavelength_nm=NODES, reflectance=ground, samples_per_pixel=spp, key=key, **more
     )
 
 
@@ -112,15 +126,9 @@ def test_lambert_plane_has_the_analytic_radiance(distance_au: float, elevation_d
 
 def test_lambert_sphere_integrates_to_its_geometric_albedo() -> None:
     # A Lambert sphere seen from the Sun: I = ρ E cos i / π, disk mean (2/3) ρ E / π (the geometric albedo 2ρ/3).
-    import trimesh
-
-    ball = trimesh.creation.icosphere(subdivisions=6, radius=100.0)
-    surface = render.TerrainMesh(
-        ball.vertices.astype(np.float32), ball.faces.astype(np.int32), np.zeros(len(ball.faces), bool)
-    )
     # from 1e5 radii away, so that the outline is the great circle to 1e-10
     a_view = view(1e5 * UP, -UP, width=128, fov_deg=np.degrees(2 * np.arctan(1.1e-3)))
-    image = render.radiance(surface, scene(a_view, sun(UP))).array[3]
+    image = render.radiance(ball(), scene(a_view, sun(UP))).array[3]
     pixel_m2 = (2 * 1.1e-3 * 1e5 / 128) ** 2
     got = image.sum() * pixel_m2 / (np.pi * 100.0**2)
     want = 2 / 3 * 0.06 * spectra.solar_band_irradiance_W_m2_nm(NODES, 1.0)[3] / np.pi
@@ -131,7 +139,7 @@ def test_lambert_sphere_integrates_to_its_geometric_albedo() -> None:
 def test_spectral_sampling_adds_no_noise_and_no_bias() -> None:
     """Flat Lambert plane at 16 samples per pixel: spread < 0.3 of the sensor's noise, bias < 0.5 %."""
     light = sun(frames.direction_L(0, 60), 2.0)
-    image = render.radiance(join(plane()), scene(view(10 * UP, -UP), light, reflectance="67p"))
+    image = render.radiance(join(plane()), scene(view(10 * UP, -UP), light, "67p"))
     detector = ThreeColourDetector(width_px=64, height_px=64)
     lens = ThinLens(focal_length_mm=4.4, f_number=4.0)
     one = detector.electrons_expected(lens.image(image), 1.0)
@@ -220,12 +228,8 @@ def test_contact_shadow_of_a_small_stone(away_m: float) -> None:
 
 def test_a_lit_sphere_far_away_has_no_acne() -> None:
     # facets that face the Sun by 3 degrees and more must not shadow themselves, 4 km from the origin
-    import trimesh
-
-    ball = trimesh.creation.icosphere(subdivisions=5, radius=1500.0)
     centre = np.array([4000.0, 1000.0, 500.0])
-    vertices, faces = (ball.vertices + centre).astype(np.float32), ball.faces.astype(np.int32)
-    surface = render.TerrainMesh(vertices, faces, np.ones(len(faces), bool))
+    surface = ball(1500.0, 5, centre)
     light = sun(np.array([-0.3, 1.0, -0.5]))
     a_view = view(np.zeros(3), centre, width=256, fov_deg=50.0)
     image = render.radiance(surface, scene(a_view, light, spp=1)).array[0]
@@ -307,18 +311,25 @@ def test_overhang_does_not_count_as_ground_from_below() -> None:
 
 
 def test_bits_do_not_depend_on_threads_or_history() -> None:
-    surface = join(plane(), box(np.array([2.0, 1.0, -1.0]), 1.0))
-    a = scene(view(10 * UP, -UP), sun(frames.direction_L(0, 30)))
+    """Also of light between surfaces, under a limb-darkened Sun."""
+
+    def surface() -> render.TerrainMesh:
+        stones = (box(np.array([np.cos(k) * 3, np.sin(2 * k) * 3, -0.3]), 0.4) for k in range(12))
+        return join(plane(60.0), *stones)
+
+    light = dataclasses.replace(sun(frames.direction_L(30, 20), 2.0), limb_darkening=spectra.limb_darkening(NODES))
+    a = scene(view(12 * UP, -UP), light, hapke_at(NODES), bounces=1)
     b = scene(view(6 * UP, np.array([0.3, 0.2, 1.0])), sun(frames.direction_L(90, 10)), key=6)
+    one = surface()
     with render_threads(2):
-        first = render.radiance(surface, a).array
-        render.radiance(surface, b)
+        first = render.radiance(one, a).array
+        other = render.radiance(one, b).array
     with render_threads(1):
-        again = render.radiance(surface, a).array
-        fresh = render.radiance(join(plane(), box(np.array([2.0, 1.0, -1.0]), 1.0)), a).array
+        again = render.radiance(one, a).array
+        fresh = render.radiance(surface(), a).array
     assert np.array_equal(first, again)
     assert np.array_equal(first, fresh)
-    assert not np.array_equal(first, render.radiance(surface, b).array)
+    assert not np.array_equal(first, other)
 
 
 def test_a_new_view_compiles_nothing() -> None:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from poses_kit import columns_of, row
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
@@ -20,8 +21,8 @@ from vbnfault.core import meshes, spectra
 from vbnfault.core.errors import InputError
 from vbnfault.pipeline import Session
 from vbnfault.scene.config import parse_scene
-from vbnfault.world import spacecraft
-from vbnfault.world.spacecraft import HingePose, Material, ModelPlacement, Part, Spacecraft, load_spacecraft
+from vbnfault.world import assemble, spacecraft
+from vbnfault.world.spacecraft import HingePose, Material, Part, Spacecraft, load_spacecraft
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
@@ -48,10 +49,6 @@ def write(folder: Path, text: str, name: str = "vehicle.obj") -> Path:
     path = folder / name
     path.write_text(text, encoding="utf-8")
     return path
-
-
-def by_name(vehicle: Spacecraft) -> dict[tuple[str, str], Part]:
-    return {(part.name, part.material.name): part for part in vehicle.parts}
 
 
 def box(material: str, centre: tuple[float, float, float] = (0, 0, 0)) -> trimesh.Trimesh:
@@ -83,18 +80,12 @@ def test_obj_parts_and_materials(obj: Path) -> None:
     vehicle = load_spacecraft(
         obj, materials={"gold foil": "gold_mli", "panel": "solar_cell", "bus": 0.5, "wing/yoke": "aluminium"}
     )
-    parts = by_name(vehicle)
     # a part's own name, or its parent's, goes before its material's
-    assert set(parts) == {
-        ("bus", "grey_0.5"),
-        ("wing/panel", "solar_cell"),
-        ("wing/yoke", "aluminium"),
-    }
-    assert [(part.name, len(part.faces)) for part in vehicle.parts] == [
-        ("bus", 2),
-        ("bus", 1),
-        ("wing/panel", 2),
-        ("wing/yoke", 1),  # of its two faces one has no area
+    assert [(part.name, part.material.name, len(part.faces)) for part in vehicle.parts] == [
+        ("bus", "grey_0.5", 2),
+        ("bus", "grey_0.5", 1),
+        ("wing/panel", "solar_cell", 2),
+        ("wing/yoke", "aluminium", 1),  # of its two faces one has no area
     ]
     np.testing.assert_array_equal(
         vehicle.parts[3].vertices_B_m[vehicle.parts[3].faces[0]], [[1, 1, 1], [1, 0, 1], [0, 0, 1]]
@@ -165,15 +156,12 @@ def test_units(obj: Path, unit: Any, metres: float) -> None:
 
 
 def test_placement(obj: Path) -> None:
-    placed = load_spacecraft(
-        obj, unit="cm", placement=ModelPlacement(roll_deg=90, yaw_deg=90, translation_B_m=(0.0, 0.5, -2.0))
-    )
+    keys = {"model": str(obj), "unit": "cm", "roll_deg": 90.0, "yaw_deg": 90.0, "translation_m": [0.0, 0.5, -2.0]}
+    placed = assemble.spacecraft(parse_scene({"title": "t", "spacecraft": keys}, source="t.toml"))
+    assert placed is not None
     # Rx(90) Rz(90): x -> y -> z, y -> -x, z -> -y
     x, y, z = load_spacecraft(obj).merged().vertices_B_m.T * 0.01
-    expected = np.stack([-y, -z + 0.5, x - 2.0], axis=1)
-    np.testing.assert_allclose(placed.merged().vertices_B_m, expected, atol=1e-6)
-    upright = ModelPlacement(yaw_deg=180).B_from_V  # the convention of GLB: y up, z forward, x left
-    np.testing.assert_allclose(upright, np.diag([-1.0, -1.0, 1.0]), atol=1e-15)
+    np.testing.assert_allclose(placed.vertices_B_m, np.stack([-y, -z + 0.5, x - 2.0], axis=1), atol=1e-6)
 
 
 # ------------------------------------------------------------------------------------ malformed input
@@ -197,6 +185,8 @@ def test_malformed_obj(tmp_path: Path, text: str, says: str) -> None:
         load_spacecraft(path)
     assert str(caught.value).startswith(str(path))
     assert "\n" not in str(caught.value)
+    with pytest.raises(InputError, match=r"unsupported spacecraft type '\.stl'; allowed are \.obj, \.glb, \.gltf"):
+        load_spacecraft(write(tmp_path, "solid", "a.stl"))
 
 
 @pytest.mark.parametrize("content", [b"\0", b"glTF\2\0\0\0" + b"\xff" * 40, b"solid nothing", b"glTF\1\0\0\0"])
@@ -207,11 +197,6 @@ def test_malformed_glb(tmp_path: Path, content: bytes) -> None:
         InputError, match=r"its JSON is unreadable|is cut short: a chunk of \d+ bytes|a GLB of version 2"
     ):
         load_spacecraft(path)
-
-
-def test_wrong_files(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"unsupported spacecraft type '\.stl'; allowed are \.obj, \.glb, \.gltf"):
-        load_spacecraft(write(tmp_path, "solid", "a.stl"))
 
 
 @pytest.mark.parametrize(
@@ -231,9 +216,6 @@ def test_wrong_files(tmp_path: Path) -> None:
 def test_refused_settings(obj: Path, settings: dict[str, Any], says: str) -> None:
     with pytest.raises(InputError, match=says):
         load_spacecraft(obj, **settings)
-
-
-def test_refused_poses() -> None:
     with pytest.raises(InputError, match=r"axis = \[0, 0, 0\]"):
         HingePose(hinge_B_m=(0, 0, 0), axis_B=(0, 0, 0))
 
@@ -244,14 +226,16 @@ def test_refused_poses() -> None:
 def test_a_quarter_turn_about_a_hinge(obj: Path) -> None:
     at_rest = load_spacecraft(obj)
     hinge = HingePose(hinge_B_m=(1.0, 2.0, 0.0), axis_B=(0.0, 0.0, 3.0), angle_deg=90.0)
-    posed = load_spacecraft(obj, poses={"wing": hinge})
-    for before, after in zip(at_rest.parts, posed.parts, strict=True):
+    posed = at_rest.posed({"wing": hinge})  # which leaves the vehicle as it was
+    for before, after in zip(load_spacecraft(obj).parts, posed.parts, strict=True):
         x, y, z = before.vertices_B_m.T
         expected = before.vertices_B_m
         if before.name.startswith("wing/"):  # (x, y) - hinge -> (-dy, dx)
             expected = np.stack([1 - (y - 2), 2 + (x - 1), z], axis=1)
         np.testing.assert_allclose(after.vertices_B_m, expected, atol=1e-12)
         np.testing.assert_array_equal(after.faces, before.faces)
+    for before, kept in zip(load_spacecraft(obj).parts, at_rest.parts, strict=True):
+        np.testing.assert_array_equal(kept.vertices_B_m, before.vertices_B_m)
 
 
 def test_any_turn_follows_rodrigues(obj: Path) -> None:
@@ -273,14 +257,6 @@ def test_nested_poses_turn_the_inner_first(obj: Path) -> None:
     np.testing.assert_allclose(both["wing/panel"].vertices_B_m, np.stack([-(2 - y), x, -z], axis=1), atol=1e-12)
     x, y, z = rest["wing/yoke"].vertices_B_m.T
     np.testing.assert_allclose(both["wing/yoke"].vertices_B_m, np.stack([-y, x, z], axis=1), atol=1e-12)
-
-
-def test_posing_leaves_the_vehicle_as_it_was(obj: Path) -> None:
-    vehicle = load_spacecraft(obj)
-    before = [part.vertices_B_m.copy() for part in vehicle.parts]
-    vehicle.posed({"wing": HingePose(hinge_B_m=(0, 0, 0), axis_B=(1, 0, 0), angle_deg=50)})
-    for part, vertices in zip(vehicle.parts, before, strict=True):
-        np.testing.assert_array_equal(part.vertices_B_m, vertices)
 
 
 # ------------------------------------------------------------------------------------ materials
@@ -353,21 +329,18 @@ def test_the_default_vehicle_is_what_its_maker_makes() -> None:
 
 
 @pytest.mark.parametrize("angles", POSES)
-def test_default_parts_are_closed(angles: dict[str, float]) -> None:
-    for part in posed(**angles).parts:
+def test_default_parts_are_closed_and_clear_of_the_pupil(angles: dict[str, float]) -> None:
+    vehicle = posed(**angles)
+    merged = vehicle.merged()
+    near = np.linalg.norm(merged.vertices_B_m, axis=1) < 0.3
+    assert (merged.vertices_B_m[near, 2] < -0.009).all()  # the barrel alone, behind
+    assert merged.blocked_fraction(65.0, 32) < 0.03
+    for part in vehicle.parts:
         mesh = trimesh.Trimesh(part.vertices_B_m, part.faces, process=False)
         assert mesh.is_watertight, part.name
         assert mesh.is_winding_consistent, part.name
         assert mesh.volume > 0, part.name
         assert mesh.area_faces.min() > 0, part.name
-
-
-@pytest.mark.parametrize("angles", POSES)
-def test_default_keeps_clear_of_the_pupil(angles: dict[str, float]) -> None:
-    mesh = posed(**angles).merged()
-    near = np.linalg.norm(mesh.vertices_B_m, axis=1) < 0.3
-    assert (mesh.vertices_B_m[near, 2] < -0.009).all()  # the barrel alone, behind
-    assert mesh.blocked_fraction(65.0, 32) < 0.03
 
 
 def test_what_the_camera_sees_of_the_default_vehicle() -> None:
@@ -436,17 +409,7 @@ def test_a_model_that_hides_the_whole_frame_is_named(tmp_path: Path, low: Any, h
     """By a build and a description before anything is rendered, and by a sample, with bounds and with poses."""
     table = {"spacecraft": {"model": write_box(tmp_path / "box.obj", low, high)}, "dataset": {"samples": 1}}
     scene = parse_scene({"title": "t", "camera": {"fov_deg": 60.0}, **table}, source="t.toml")
-    row = {"name": "a", "julian_date": 2457000.5, "sun_distance_au": 2.5}
-    row |= {
-        "camera_x_T_m": 9e3,
-        "camera_y_T_m": 0.0,
-        "camera_z_T_m": 0.0,
-        "sun_x_T": 1.0,
-        "sun_y_T": 0,
-        "sun_z_T": 0,
-    }
-    row |= dict(zip((f"camera_from_T_{a}" for a in "wxyz"), (0.5, 0.5, 0.5, 0.5), strict=True))
-    poses = {key: [value] for key, value in row.items()} if flown else None
+    poses = columns_of([row("a", (9e3, 0.0, 0.0), (1.0, 0.0, 0.0))]) if flown else None
     for act in (Session.warn_of_doubts, lambda session: session.simulate(0)):
         with pytest.raises(
             InputError, match=r"spacecraft\.model: box\.obj: hides the whole frame .*'bus'.*translation_m"

@@ -9,9 +9,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+import tomli_w
+from conftest import small_scene
+from test_cli import run
 
+import vbnfault
 from vbnfault.core import frames, spice
 from vbnfault.core.errors import InputError
+from vbnfault.pipeline import Session
 from vbnfault.scene import config
 from vbnfault.world import ephemeris
 
@@ -79,6 +84,9 @@ SCLK_PARTITION_END_999 = ( 4.0E9 )
 SCLK01_COEFFICIENTS_999 = ( 0 0 1 )
 \begintext
 """
+ROTATION = frames.Rotation(
+    pole_ra_deg=69.54, pole_dec_deg=64.11, prime_meridian_deg=114.69, period_h=8640 / 696.543884683
+)
 BUS_FROM_J = frames.rx(0.3) @ frames.rz(-1.1)
 POSITION_T_M = np.array([12_000.0, -34_000.0, 56_000.0])
 
@@ -96,12 +104,9 @@ def write_kernels(folder: Path) -> Path:
 
     epochs = ET_S + np.arange(-40, 41) * 3600.0
     orbit = [orbit_state_J_km(et) for et in epochs]
-    rotation = frames.Rotation(
-        pole_ra_deg=69.54, pole_dec_deg=64.11, prime_meridian_deg=114.69, period_h=8640 / 696.543884683
-    )
     near = ET_S + np.arange(-10, 11) * 60.0
     at_rest = [
-        np.r_[rotation.J_from_T(spice.julian_date_from_et_s(et)) @ POSITION_T_M / 1000, np.zeros(3)] for et in near
+        np.r_[ROTATION.J_from_T(spice.julian_date_from_et_s(et)) @ POSITION_T_M / 1000, np.zeros(3)] for et in near
     ]
     handle = spiceypy.spkopn(str(folder / "a.bsp"), "test", 0)
     # Hermite (13) for the comet, whose states come with velocities; Lagrange (9) for positions alone.
@@ -152,14 +157,9 @@ def all_of(folder: Path) -> list[Path]:
 
 @pytest.mark.parametrize("julian_date", [2451545.0, 2456876.0, 2456974.0, 2457247.5886578634, 2457468.5])
 def test_rotation_is_that_of_a_text_pck(folder: Path, julian_date: float) -> None:
-    rotation = frames.Rotation(
-        pole_ra_deg=69.54, pole_dec_deg=64.11, prime_meridian_deg=114.69, period_h=8640 / 696.543884683
-    )
     with spice.kernels(folder / "a.tpc", folder / "a.tf"):
-        ours, theirs = (
-            rotation.J_from_T(julian_date),
-            spice.J_from_T("COMET_FIXED", spice.et_s_from_julian_date(julian_date)),
-        )
+        ours = ROTATION.J_from_T(julian_date)
+        theirs = spice.J_from_T("COMET_FIXED", spice.et_s_from_julian_date(julian_date))
     # 6000 days of 12 rad hold W to 7e4 rad · 2⁻⁵³ ≈ 1e-11 rad.
     between = frames.quaternion(ours @ theirs.T)
     assert 2 * np.linalg.norm(between[1:]) < 1e-9
@@ -175,14 +175,8 @@ SHAPE_FRAMES = {
     "Eros": (2000433, 11.363, 17.232, 326.08, 1639.38928, 0.0),  # eros_alex.tpc
     "Moon": (301, 269.9949, 66.5392, 38.3213, 13.17635815, -1.4e-12),  # pck00011.tpc, without its periodic terms
     "Ceres": (2000001, 291.42763, 66.76033, 170.309, 952.1532635, 0.0),  # CERES18D, dawn_ceres_v06.tpc
-    "Phobos": (
-        401,
-        317.67071657,
-        52.88627266,
-        35.1877444,
-        1128.84475928,
-        9.536137031212154e-9,
-    ),  # pck00011.tpc, too
+    # pck00011.tpc, too
+    "Phobos": (401, 317.67071657, 52.88627266, 35.1877444, 1128.84475928, 9.536137031212154e-9),
 }
 
 
@@ -271,26 +265,9 @@ def test_kernels_leave_nothing_behind(folder: Path) -> None:
     assert spiceypy.ktotal("ALL") == 0  # the pool of this process is the user's own
 
 
-def test_meta_kernels(folder: Path, tmp_path: Path) -> None:
-    meta = tmp_path / "all.tm"
-    listed = " ".join(f"'$K/{path.name}'" for path in all_of(folder))
-    text = (
-        f"KPL/MK\n\\begindata\nPATH_VALUES = ( '{folder}' )\nPATH_SYMBOLS = ( 'K' )\nKERNELS_TO_LOAD = ( {{}} )\n"
-    )
-    meta.write_text(text.format(listed))
-    with spice.kernels(meta):
-        assert np.linalg.norm(spice.sun_position_J_au(str(COMET), ET_S)) > 1
-    assert loaded() == 0
-    meta.write_text(text.format(listed + " '$K/lost.bsp'"))
-    sentence = (
-        rf"all\.tm: KERNELS_TO_LOAD names '\$K/lost\.bsp', which is missing; looked for {folder}/lost\.bsp\.$"
-    )
-    with pytest.raises(InputError, match=sentence), spice.kernels(meta):
-        pass
-    assert loaded() == 0
-
-
-@pytest.mark.parametrize("kind", ["relative", "working folder", "long", "continued", "crlf", "nested", "defining"])
+@pytest.mark.parametrize(
+    "kind", ["relative", "working folder", "long", "continued", "crlf", "nested", "defining", "lacking"]
+)
 def test_meta_kernels_as_agencies_and_users_write_them(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:
@@ -311,6 +288,8 @@ def test_meta_kernels_as_agencies_and_users_write_them(
     if kind == "defining":
         names.remove("a.tf")
         extra = FK.partition("\\begindata")[2].partition("\\begintext")[0]
+    if kind == "lacking":
+        names.append("lost.bsp")
     listed = ", ".join(f"'$K/{name}'" for name in names)
     text = (
         f"KPL/MK\n\\begindata\nPATH_VALUES = ( {value} )\nPATH_SYMBOLS = ( 'K' )\n{extra}"
@@ -322,6 +301,14 @@ def test_meta_kernels_as_agencies_and_users_write_them(
         (own / "outer.tm").write_text("KPL/MK\n\\begindata\nKERNELS_TO_LOAD = 'all.tm'\n\\begintext\n")
         meta = own / "outer.tm"
     monkeypatch.chdir(place.parent if kind == "working folder" else tmp_path)
+    if kind == "lacking":
+        sentence = (
+            rf"all\.tm: KERNELS_TO_LOAD names '\$K/lost\.bsp', which is missing; looked for {place}/lost\.bsp\.$"
+        )
+        with pytest.raises(InputError, match=sentence), spice.kernels(meta):
+            pass
+        assert loaded() == 0
+        return
     with spice.kernels(meta):
         assert np.linalg.norm(spice.sun_position_J_au(str(COMET), ET_S)) > 1
         assert spice.J_from_T("COMET_FIXED", ET_S).shape == (3, 3)  # the frame kernel too
@@ -402,10 +389,7 @@ def test_what_the_kernels_do_not_hold_is_said_in_a_sentence(folder: Path) -> Non
         return spice.pose_T(spacecraft, str(COMET), "COMET_FIXED", camera_frame, et_s, **more)
 
     cases = [
-        (
-            lambda: spice.sun_position_J_au(str(COMET), far),
-            r"Sun from 1000012 at JD 2456174\.\d+ TDB: .*no position",
-        ),
+        (lambda: spice.sun_position_J_au(str(COMET), far), r"Sun from 1000012 at JD 2456174\.\d+ .*no position"),
         (lambda: spice.sun_position_J_au("NOBODY", ET_S), "Sun from NOBODY at .*no body of that name"),
         (lambda: spice.J_from_T("NOFRAME", ET_S), "frame NOFRAME at .*: the kernels define no such frame"),
         (lambda: spice.J_from_T("IAU_EROS", ET_S), "frame IAU_EROS at "),
@@ -431,8 +415,6 @@ def test_what_the_kernels_do_not_hold_is_said_in_a_sentence(folder: Path) -> Non
 
 def flown_scene(folder: Path) -> dict[str, Any]:
     """A small scene whose camera is on the spacecraft and looks at the body's centre."""
-    from conftest import small_scene
-
     far = np.linalg.norm(POSITION_T_M)
     # the bus holds an attitude of no importance: mount the camera so that it looks at the body's centre
     with spice.kernels(*all_of(folder)):
@@ -460,12 +442,6 @@ def test_a_scene_on_a_spacecrafts_way(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Camera and Sun of every sample are SPICE's at its own date; the picture looks where the camera does."""
-    import tomli_w
-    from test_cli import run
-
-    from vbnfault.pipeline import Session
-    from vbnfault.scene import config
-
     table = flown_scene(folder)
     far, z = np.linalg.norm(POSITION_T_M), -frames.unit(POSITION_T_M)
     session = Session(config.parse_scene(table, source="test"))
@@ -508,20 +484,12 @@ def test_a_scene_on_a_spacecrafts_way(
     ],
 )
 def test_a_way_needs_all_its_keys(table: dict[str, Any], words: str) -> None:
-    from conftest import small_scene
-
-    from vbnfault.scene import config
-
     with pytest.raises(InputError, match=words):
         config.parse_scene(small_scene(spice=table), source="test")
 
 
 def test_a_coma_follows_the_date_of_each_sample(folder: Path, tmp_path: Path) -> None:
     """Its light in the store is that of the Afρ at the Sun's distance in SPICE at the sample's own date."""
-    import vbnfault
-    from vbnfault.pipeline import Session
-    from vbnfault.scene import config
-
     # so steep a power that some minutes change the light by 1e-4, a thousand times the rounding of float32
     keys = {"afrho_cm": 500.0, "reference_au": 1.88, "distance_exponent": 20.0, "affects_ground": False}
     table = flown_scene(folder)

@@ -11,8 +11,7 @@ import zarr
 from conftest import small_scene
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from test_light import ball
-from test_render import UP, sun, view
+from test_render import UP, ball, sun, view
 
 from vbnfault import dataset, render, store
 from vbnfault.camera import Camera

@@ -37,7 +37,8 @@ if TYPE_CHECKING:
     from .store import open_dataset
     from .study.run import study
 
-# public name → the module that defines it, see `load_name`; it is loaded when the name is first used
+# public name → the module that defines it, and the name there if it is another; without one: the module itself. It
+# is loaded when the name is first used. `tests/test_api.py` compares this table with the imports above.
 _HOMES = {
     "BuildOptions": "dataset",
     "DiscReflectance": "reflectance",
@@ -85,10 +86,17 @@ __all__ = sorted([*_HOMES, "__version__"])
 if not TYPE_CHECKING:  # a type checker that saw the function would accept every misspelled name
 
     def __getattr__(name: str) -> Any:
-        """Return a public name from the module that defines it."""
-        from .core.lazy_names import load_name  # not above: the import of the package loads no other module
+        """Return a public name from the module that defines it, and keep it (PEP 562)."""
+        from importlib import import_module  # not above: the import of the package loads no other module
 
-        return load_name(__name__, name, _HOMES)
+        if name not in _HOMES:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        module, renamed, defined = _HOMES[name].partition(":")
+        value: Any = import_module(f".{module}", __name__)
+        if defined or not renamed:
+            value = getattr(value, defined or name)
+        globals()[name] = value
+        return value
 
 
 def __dir__() -> list[str]:

@@ -10,10 +10,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,25 +37,10 @@ _GLUED = re.compile(rb"(?<=[0-9.])-")
 _ICQ_GAP_FRACTION = 1e-3
 
 
-@dataclass(frozen=True, eq=False)
-class RawShape:
-    """Hold a mesh as its file stores it.
+def read_shape(path: Path, data: bytes) -> tuple[Float64, Int64, bool]:
+    """Return vertices and faces in a file, and whether its format defines that they are in km.
 
-    Attributes
-    ----------
-    vertices, faces
-        float64[n, 3] in the file's unit, int64[m, 3] from 0.
-    unit
-        "km" if the format defines it, else None.
-    """
-
-    vertices: Float64
-    faces: Int64
-    unit: Literal["km"] | None = None
-
-
-def read_shape(path: Path, data: bytes) -> RawShape:
-    """Return the mesh in a file; the content `data` and the suffix (one of `SUFFIXES`) select the reader.
+    The content `data` and the suffix (one of `SUFFIXES`) select the reader.
 
     Raises
     ------
@@ -67,13 +50,13 @@ def read_shape(path: Path, data: bytes) -> RawShape:
     source = str(path)
     head = data[:65536]
     if head.startswith((b"DAS/DSK", b"NAIF/DAS")):
-        return RawShape(*spice.read_dsk(path), unit="km")
+        return *spice.read_dsk(path), True
     if path.suffix.lower() == ".bds":
         raise InputError(f"{source}: line 1: expected the mark 'DAS/DSK' of a NAIF DSK, found {_shown(head)}.")
     if b"\0" in data:
         raise InputError(f"{source}: line {_line(data, data.index(0))}: expected text, found binary data.")
     if re.match(rb"\s*#VRML", data) or path.suffix.lower() == ".wrl":
-        return RawShape(*read_vrml(data, source))
+        return *read_vrml(data, source), False
     data = _without_comments(data)
     if not data.translate(_FORTRAN).strip():
         raise InputError(f"{source}: line 1: expected vertices and facets, found nothing.")
@@ -81,10 +64,10 @@ def read_shape(path: Path, data: bytes) -> RawShape:
         if lost := re.search(rb"(?m)^[ \t]*[VF\d.+-].*$", data):
             line, given = _line(data, lost.start()), _shown(lost[0])
             raise InputError(f"{source}: line {line}: expected `v x y z` or `f a b c`, found {given}.")
-        return RawShape(*joined(read_obj(_clean(data), source, may_count_from_0=True)))
+        return *joined(read_obj(_clean(data), source, may_count_from_0=True)), False
     if path.suffix.lower() == ".icq" or _is_icq(data):
-        return RawShape(*read_icq(data, source))
-    return RawShape(*read_plate_table(data, source))
+        return *read_icq(data, source), False
+    return *read_plate_table(data, source), False
 
 
 def read_plate_table(data: bytes, source: str) -> Mesh:

@@ -69,10 +69,9 @@ def load_shape(path: str | Path, unit: Unit = "auto") -> tuple[Float64, Int32]:
         raise InputError(f"{path}: unit must be one of auto, m, km; got {unit!r}.")
     data = user_files.read_input(path, "shape", types=FILE_TYPES)
     suffix = path.suffix.lower()
-    native: Unit | None = None
+    is_km = False
     if suffix in formats.SUFFIXES:
-        raw = formats.read_shape(path, data)
-        vertices, faces, native = raw.vertices, raw.faces, raw.unit
+        vertices, faces, is_km = formats.read_shape(path, data)
     elif suffix == ".obj":
         vertices, faces = meshes.joined(meshes.read_obj(data, str(path)))
     elif suffix in (".glb", ".gltf"):
@@ -81,8 +80,7 @@ def load_shape(path: str | Path, unit: Unit = "auto") -> tuple[Float64, Int32]:
         vertices, faces = _read_with_trimesh(path, data)
     _check_arrays(vertices, faces, str(path))
     if unit == "auto":
-        extent = float(np.ptp(vertices, axis=0).max())
-        unit = native or ("km" if extent < AUTO_KM_BELOW_EXTENT else "m")
+        unit = "km" if is_km or np.ptp(vertices, axis=0).max() < AUTO_KM_BELOW_EXTENT else "m"
     if unit == "km":
         vertices = vertices * METRES_PER_KM
     if suffix in _SPLIT_VERTEX_TYPES:
@@ -286,19 +284,21 @@ def _directed_edges(faces: NDArray) -> NDArray[np.int64]:
     return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
 
 
+def _edge_keys(faces: NDArray) -> NDArray[np.int64]:
+    """Return a number for each of `_directed_edges`, int64[3 m]: the same for both directions of an edge."""
+    edges = np.sort(_directed_edges(faces), axis=1)
+    return np.asarray(edges[:, 0] * (int(faces.max()) + 1) + edges[:, 1])
+
+
 def _loose_faces(faces: NDArray) -> NDArray[np.bool_]:
     """Return which faces share no edge with another face; filling their outline would only double them."""
-    edges = np.sort(_directed_edges(faces), axis=1)
-    _, inverse, counts = np.unique(
-        edges[:, 0] * (int(faces.max()) + 1) + edges[:, 1], return_inverse=True, return_counts=True
-    )
+    _, inverse, counts = np.unique(_edge_keys(faces), return_inverse=True, return_counts=True)
     return np.asarray((counts[inverse.ravel()].reshape(3, -1) == 1).all(axis=0))
 
 
 def _undirected_counts(faces: NDArray) -> NDArray[np.int64]:
     """Return the number of faces at each edge."""
-    edges = np.sort(_directed_edges(faces), axis=1)
-    return np.unique(edges[:, 0] * (int(faces.max()) + 1) + edges[:, 1], return_counts=True)[1]
+    return np.unique(_edge_keys(faces), return_counts=True)[1]
 
 
 def _consistent(faces: NDArray) -> bool:
@@ -312,26 +312,19 @@ def _consistent(faces: NDArray) -> bool:
 
 def _fill_holes(vertices: Float64, faces: NDArray) -> NDArray:
     """Close simple boundary loops with a fan: those of up to eight edges, and those without area."""
-    edges = _directed_edges(faces)
-    count = int(faces.max()) + 1
-    key = edges.min(axis=1) * count + edges.max(axis=1)
-    _, inverse, counts = np.unique(key, return_inverse=True, return_counts=True)
+    _, inverse, counts = np.unique(_edge_keys(faces), return_inverse=True, return_counts=True)
     follow: dict[int, list[int]] = {}
-    for a, b in edges[counts[inverse.ravel()] == 1]:
+    for a, b in _directed_edges(faces)[counts[inverse.ravel()] == 1]:
         follow.setdefault(int(b), []).append(int(a))  # reversed, as a filling face needs
     fans = [np.empty((0, 3), dtype=faces.dtype)]
     while follow:
         path = [next(iter(follow))]
         while follow.get(path[-1]):
             step = follow[path[-1]].pop()
-            if (
-                step in path
-            ):  # a loop; the path goes on from where the loop began, since loops may touch in a vertex
+            if step in path:  # a loop; the path goes on from where it began, since loops may touch in a vertex
                 loop = path[path.index(step) :]
                 del path[path.index(step) + 1 :]
-                fan = np.array(
-                    [(loop[0], loop[k], loop[k + 1]) for k in range(1, len(loop) - 1)], dtype=faces.dtype
-                )
+                fan = np.array([(loop[0], *side) for side in pairwise(loop[1:])], dtype=faces.dtype)
                 if len(fan) and (len(loop) <= _LARGEST_HOLE_EDGES or not _sound_faces(vertices, fan).any()):
                     fans.append(fan)
             else:
@@ -390,8 +383,7 @@ def _united(vertices: Float64, faces: NDArray, source: str) -> tuple[Float64, ND
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    edges = np.sort(_directed_edges(faces), axis=1)
-    order = np.argsort(edges[:, 0] * (int(faces.max()) + 1) + edges[:, 1], kind="stable") % len(faces)
+    order = np.argsort(_edge_keys(faces), kind="stable") % len(faces)
     one, other = order.reshape(-1, 2).T  # the two faces of each edge
     graph = coo_array((np.ones(len(one), dtype=bool), (one, other)), shape=(len(faces), len(faces)))
     shells_n, label = connected_components(graph, directed=False)

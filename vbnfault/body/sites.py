@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -59,15 +58,7 @@ class Sites(Sequence[Site]):
     def __len__(self) -> int:
         return self._count
 
-    @overload
-    def __getitem__(self, index: int) -> Site: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> tuple[Site, ...]: ...
-
-    def __getitem__(self, index: int | slice) -> Site | tuple[Site, ...]:
-        if isinstance(index, slice):
-            return tuple(self[k] for k in range(self._count)[index])
+    def __getitem__(self, index: int) -> Site:  # type: ignore[override]  # no slices
         number = range(self._count)[index]
         if number not in self._made:
             self._made[number] = self._make(number)

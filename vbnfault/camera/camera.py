@@ -21,7 +21,7 @@ from ..lens.adapt import Change
 class Camera:
     """Hold a camera in the state in which it takes one image.
 
-    `architecture` and `readout_direction` (`core.architecture` names their values) are drawn once per
+    `architecture` and `readout_direction` (`core.quantities` names their values) are drawn once per
     sample, and broken pixels and broken lines share them. `exposure_s` is above 0. `gain`, at least 1, is the
     factor on the detector's own gain in DN/e, which the detector holds already.
 

@@ -7,12 +7,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, Literal, NamedTuple, Self, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 CHANNELS = ("R", "G", "B", "I")
+
+# How a sensor moves and reads its charge. Every sample of a dataset has one of these.
+Architecture = Literal["full_frame_ccd", "frame_transfer_ccd", "interline_ccd", "cmos"]
+ARCHITECTURES: tuple[Architecture, ...] = get_args(Architecture)
+# The side of the image towards which the rows, or columns, are read.
+ReadoutDirection = Literal["up", "down", "left", "right"]
+READOUT_DIRECTIONS: tuple[ReadoutDirection, ...] = get_args(ReadoutDirection)
 
 # Rec. 709 luminance of linear RGB: the intensity channel of a camera without W pixels.
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)

@@ -310,11 +310,6 @@ def response(name: str, wavelength_nm: F64, quantum_efficiency_peak: float) -> F
     )
 
 
-def band_weights(name: str, quantum_efficiency_peak: float, nodes_nm: F64) -> F64:
-    """Return `electron_weights` of R, G, B for a named response, float64[3, band]."""
-    return electron_weights(lambda nm: response(name, nm, quantum_efficiency_peak), nodes_nm)
-
-
 def electron_weights(efficiency: Callable[[F64], F64], nodes_nm: F64, transmittance: F64 | None = None) -> F64:
     """Return weights float64[channel, band] in electrons nm / J: electrons = weights · energy per band in J / nm.
 

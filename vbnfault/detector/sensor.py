@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import AfterValidator, Field
 
 from ..core import resources, spectra, tables, toml_files
-from ..core.architecture import Architecture
 from ..core.errors import InputError, shown
+from ..core.quantities import Architecture
 from ..core.tables import Fraction, table_class
 from .charge import ChargeCloud, TrapSpecies
 from .dark import CCD_GROWTH

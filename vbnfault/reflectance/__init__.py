@@ -1,25 +1,8 @@
-"""Define how the ground reflects: one class a model, which registers itself (`contract`)."""
+"""Define how the ground reflects: one class a model, which registers itself (`contract`).
 
-from .contract import (
-    NUMPY,
-    REFERENCE_NM,
-    AnyReflectance,
-    BandReflectance,
-    DiscReflectance,
-    Reflectance,
-    is_packaged,
-    radiance_factor,
-    registry,
-)
+Each public name, listed in `__init__.pyi`, loads its module when it is first used.
+"""
 
-__all__ = [
-    "NUMPY",
-    "REFERENCE_NM",
-    "AnyReflectance",
-    "BandReflectance",
-    "DiscReflectance",
-    "Reflectance",
-    "is_packaged",
-    "radiance_factor",
-    "registry",
-]
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

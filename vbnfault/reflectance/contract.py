@@ -65,8 +65,8 @@ REFERENCE_NM = 649.0
 
 _REGISTRY: Registry[type[Reflectance]] = Registry("ground reflectance", __package__ or "")
 
-_DECAY_PER_MAG = float(0.4 * np.log(10))
-_DEG_PER_HALF = float(np.degrees(2.0))  # degrees of an angle per radian of its half
+DECAY_PER_MAG = float(0.4 * np.log(10))
+DEG_PER_HALF = float(np.degrees(2.0))  # degrees of an angle per radian of its half
 
 
 class BandReflectance(Protocol):
@@ -155,7 +155,38 @@ def is_packaged(cls: type[Reflectance]) -> bool:
     return _REGISTRY.is_packaged(cls)
 
 
-class DiscReflectance(Reflectance, ABC):
+class ScaledReflectance(Reflectance, ABC):
+    """Model a reflectance of one shape at all wavelengths: r = (A/π) `term`, where A is `body.reflectance`."""
+
+    @abstractmethod
+    def term(self, m: Any, light: Triple, view: Triple) -> Any:
+        """Return π r / A; it is 0 where the light comes from below the surface."""
+
+    def at(self, wavelength_nm: F64, reflectance: F64) -> BandReflectance:
+        """Return the model at the wavelengths of the bands."""
+        return SingleTerm(model=self, reflectance=reflectance)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SingleTerm:
+    """Evaluate a `ScaledReflectance` in the bands of a scene; `reflectance` float64[band] in [0, 1] is A."""
+
+    model: ScaledReflectance
+    reflectance: F64
+
+    terms: ClassVar[int] = 1
+
+    @property
+    def weights(self) -> F64:
+        """Return the reflectance r of each band per unit of the term, float64[1, band]."""
+        return self.reflectance[None, :] / np.pi
+
+    def evaluate(self, m: Any, light: Triple, view: Triple) -> list[Any]:
+        """Return the single term."""
+        return [self.model.term(m, light, view)]
+
+
+class DiscReflectance(ScaledReflectance, ABC):
     """Model reflectance, disc function and phase function as a product: r = (A/π) D(i, e, α) 10^(-0.4 β α).
 
     A is the normal reflectance of `body.reflectance`. A subclass gives the disc function D by the hook `disc`.
@@ -180,41 +211,13 @@ class DiscReflectance(Reflectance, ABC):
             Phase angle α in degrees.
         """
 
-    def at(self, wavelength_nm: F64, reflectance: F64) -> BandReflectance:
-        """Return the model at the wavelengths of the bands."""
-        return Diffuse(model=self, reflectance=reflectance)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class SingleTerm:
-    """Hold what the reflectances of a single term share: the weight of the term in each band of a scene.
-
-    `reflectance` float64[band] in [0, 1] is A, the reflectance that the model scales.
-    """
-
-    reflectance: F64
-
-    terms: ClassVar[int] = 1
-
-    @property
-    def weights(self) -> F64:
-        """Return the reflectance r of each band per unit of the term, float64[1, band]."""
-        return self.reflectance[None, :] / np.pi
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Diffuse(SingleTerm):
-    """Evaluate a `DiscReflectance` in the bands of a scene; A is the normal reflectance at zero phase."""
-
-    model: DiscReflectance
-
-    def evaluate(self, m: Any, light: Triple, view: Triple) -> list[Any]:
-        """Return the single term π r / A; it is 0 where the light comes from below the surface."""
-        phase_deg = _DEG_PER_HALF * m.atan(tan_half_phase(m, light, view))
-        value = self.model.disc(m, m.maximum(light[2], 0), m.maximum(view[2], LEAST_COSINE), phase_deg)
-        if self.model.phase_slope_mag_deg:
-            value = value * m.exp(-_DECAY_PER_MAG * self.model.phase_slope_mag_deg * phase_deg)
-        return [value]
+    def term(self, m: Any, light: Triple, view: Triple) -> Any:
+        """Return D 10^(-0.4 β α)."""
+        phase_deg = DEG_PER_HALF * m.atan(tan_half_phase(m, light, view))
+        value = self.disc(m, m.maximum(light[2], 0), m.maximum(view[2], LEAST_COSINE), phase_deg)
+        if self.phase_slope_mag_deg:
+            value = value * m.exp(-DECAY_PER_MAG * self.phase_slope_mag_deg * phase_deg)
+        return value
 
 
 def tan_half_phase(m: Any, light: Triple, view: Triple) -> Any:

@@ -12,14 +12,20 @@ from __future__ import annotations
 import itertools
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from .contract import LEAST_COSINE, DiscReflectance, Reflectance, SingleTerm, Triple, tan_half_phase
+from .contract import (
+    DECAY_PER_MAG,
+    DEG_PER_HALF,
+    LEAST_COSINE,
+    DiscReflectance,
+    ScaledReflectance,
+    Triple,
+    tan_half_phase,
+)
 
 _PI = math.pi
 _RAD_PER_DEG = _PI / 180
@@ -95,10 +101,6 @@ def _seeliger(m: Any, cos_i: Any, cos_e: Any) -> Any:
 
 # --- phase curves of spheres ------------------------------------------------------------------------------------
 
-F64 = NDArray[np.float64]
-
-_DEG_PER_HALF = float(np.degrees(2.0))  # degrees of an angle per radian of its half
-_DECAY_PER_MAG = float(0.4 * np.log(10))
 # f keeps its value at 150° beyond that phase angle. There Φ_LS falls towards 0 at 180° and Φ is hardly measured.
 _LAST_DEG = 150.0
 _LAST_TANGENT = float(np.tan(np.radians(_LAST_DEG / 2)))
@@ -107,30 +109,19 @@ _MOST_ROWS = 1000
 _LEAST_MAGNITUDE = -1.0
 
 
-class SphereCurve(Reflectance, ABC):
+class SphereCurve(ScaledReflectance, ABC):
     """Reflect as Lommel-Seeliger with the phase function that gives a sphere the curve `curve`."""
 
     @abstractmethod
     def curve(self, m: Any, tan_half: Any) -> Any:
         """Return the flux Φ of a sphere relative to that at zero phase, from tan(α/2), up to 150° of phase."""
 
-    def at(self, wavelength_nm: F64, reflectance: F64) -> SphereDiffuse:
-        """Return the model at the wavelengths of the bands."""
-        return SphereDiffuse(model=self, reflectance=reflectance)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class SphereDiffuse(SingleTerm):
-    """Evaluate a `SphereCurve` in the bands of a scene; A is the geometric albedo of a sphere."""
-
-    model: SphereCurve
-
-    def evaluate(self, m: Any, light: Triple, view: Triple) -> list[Any]:
-        """Return the single term π r / A; it is 0 where the light comes from below the surface."""
+    def term(self, m: Any, light: Triple, view: Triple) -> Any:
+        """Return the Lommel-Seeliger term times Φ / Φ_LS; A is the geometric albedo of a sphere."""
         tan_half = m.minimum(m.maximum(tan_half_phase(m, light, view), _LEAST_TANGENT), _LAST_TANGENT)
         cos_i, cos_e = m.maximum(light[2], 0), m.maximum(view[2], LEAST_COSINE)
-        phase = self.model.curve(m, tan_half) / lommel_seeliger_curve(m, tan_half)
-        return [2 * cos_i / (cos_i + cos_e) * phase]
+        phase = self.curve(m, tan_half) / lommel_seeliger_curve(m, tan_half)
+        return 2 * cos_i / (cos_i + cos_e) * phase
 
 
 def lommel_seeliger_curve(m: Any, tan_half: Any) -> Any:
@@ -208,11 +199,11 @@ class PhaseCurve(SphereCurve):
 
     def curve(self, m: Any, tan_half: Any) -> Any:
         """Return 10^(-0.4 magnitude), with magnitudes interpolated linearly in the phase angle."""
-        phase_deg = _DEG_PER_HALF * m.atan(tan_half)
+        phase_deg = DEG_PER_HALF * m.atan(tan_half)
         magnitude, last = 0.0 * phase_deg, len(self.phase_deg) - 2
         for k in range(last + 1):
             low, high = self.phase_deg[k : k + 2]
             slope = (self.magnitude[k + 1] - self.magnitude[k]) / (high - low)
             within = m.maximum(phase_deg - low, 0)
             magnitude = magnitude + slope * (within if k == last else m.minimum(within, high - low))
-        return m.exp(-_DECAY_PER_MAG * magnitude)
+        return m.exp(-DECAY_PER_MAG * magnitude)

@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 
 from ..core.quantities import BODY, SKY, SPACECRAFT, SUN, SunInView, Truth
 from ..core.sundisc import Pinhole, Projection, bounds_px, pixel_sums
-from .albedo import AlbedoMap, GroundPoints
+from .albedo import GroundPoints
 from .description import Sunlight, View
-from .earth import EarthAlbedo
 from .light import sun_in_view
 from .runtime import dr, mi
 from .sampling import Optics, SunDisc
@@ -55,36 +54,32 @@ def truth(
     semantic = dr.select(hit.valid, mi.UInt32(BODY), mi.UInt32(SKY))
     if hit.material is not None:
         semantic = dr.select(hit.on_vehicle, mi.UInt32(SPACECRAFT), semantic)
-    layers = {"semantic": semantic, "depth": depth}
+    layers = {"depth_m": depth}
     if angles:
-        pairs = {"incidence": (normal, centre), "emission": (normal, -rays.d), "phase": (centre, -rays.d)}
+        pairs = {
+            "incidence_deg": (normal, centre),
+            "emission_deg": (normal, -rays.d),
+            "phase_deg": (centre, -rays.d),
+        }
         layers |= {name: dr.select(hit.valid, _angle_deg(*pair), dr.nan) for name, pair in pairs.items()}
         layers["dust"] = dr.select(hit.valid, hit.dust, dr.nan)
         if surface.albedo is not None:
-            factor = _albedo_factor(surface.albedo, view, hit, rays, centre)
-            layers["albedo_factor"] = dr.select(hit.valid, factor, dr.nan)
+            spacing_m = hit.range_m / float(view.intrinsics[0])
+            ground = GroundPoints(
+                point_L_m=hit.point, footprint_m=spacing_m, valid=hit.valid, view_L=-rays.d, sun_L=centre
+            )
+            layers["albedo_factor"] = dr.select(hit.valid, surface.albedo.at_reference(ground), dr.nan)
         if hit.material is not None:
             layers["material"] = dr.select(hit.on_vehicle, mi.Int32(hit.material), mi.Int32(-1))
-    dr.eval(*in_camera, *layers.values())
-    more = {"incidence": "incidence_deg", "emission": "emission_deg", "phase": "phase_deg"}
-    more |= {name: name for name in ("dust", "material", "albedo_factor")}
+    dr.eval(*in_camera, semantic, *layers.values())
     classes = semantic.numpy().astype(np.uint8).reshape(shape)
     disc = sun_in_view(surface, view, sun) if slopes is None or projection is not None else None
     if disc is not None:
         _mark_sun(classes, disc, Pinhole(view.intrinsics) if projection is None else projection)
     return Truth(
-        depth_m=depth.numpy().reshape(shape),
         normal=np.stack([c.numpy() for c in in_camera], axis=-1).astype(np.float16).reshape(*shape, 3),
         semantic=classes,
-        **{to: layers[name].numpy().reshape(shape) for name, to in more.items() if name in layers},
-    )
-
-
-def _albedo_factor(albedo: AlbedoMap | EarthAlbedo, view: View, hit: Any, rays: Any, sun_L: Any) -> Any:
-    """Return the factor of a map of the albedo, in the reference band, where the rays of pixels hit."""
-    spacing_m = hit.range_m / float(view.intrinsics[0])
-    return albedo.at_reference(
-        GroundPoints(point_L_m=hit.point, footprint_m=spacing_m, valid=hit.valid, view_L=-rays.d, sun_L=sun_L)
+        **{name: layer.numpy().reshape(shape) for name, layer in layers.items()},
     )
 
 

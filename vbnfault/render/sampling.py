@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.sundisc import axes
 from .description import Sunlight, View
 from .runtime import dr, mi, packets
 
@@ -255,12 +256,7 @@ class SunDisc:
     """
 
     def __init__(self, sun: Sunlight) -> None:
-        z = sun.direction_L / np.linalg.norm(sun.direction_L)
-        x = np.cross(z, np.eye(3)[np.argmin(np.abs(z))])
-        x /= np.linalg.norm(x)
-        self.direction = opaque_vector(mi.Vector3f, z)
-        self._x = opaque_vector(mi.Vector3f, x)
-        self._y = opaque_vector(mi.Vector3f, np.cross(z, x))
+        self._x, self._y, self.direction = (opaque_vector(mi.Vector3f, axis) for axis in axes(sun.direction_L))
         self._tangent = dr.opaque(mi.Float, np.tan(sun.angular_radius_rad))
 
     def towards(self, p: Any) -> Any:

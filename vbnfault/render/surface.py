@@ -284,11 +284,11 @@ class World:
         return v.x * x + v.y * y + v.z * z
 
 
-class VehicleHit:
+class VehicleHit(Hit):
     """Hold hits of which some are on the vehicle and the others on the ground."""
 
     def __init__(self, ground: Hit, nearer: Any, on_vehicle: Any, normal: Any, material: Any, rays: Any) -> None:
-        self._ground, self._rays, self.start_m = ground, rays, 0.0
+        self._ground, self._rays = ground, rays
         self.on_vehicle, self.material, self.facet = nearer, material, on_vehicle.prim_index
         self.valid = ground.valid | nearer
         self.distance_m = dr.select(nearer, on_vehicle.t, ground.distance_m)
@@ -298,16 +298,6 @@ class VehicleHit:
     def dust(self) -> Any:
         """Return the dust cover of the ground; 0 on the vehicle."""
         return dr.select(self.on_vehicle, 0, self._ground.dust)
-
-    @property
-    def point(self) -> Any:
-        """Return the positions of the hits in L."""
-        return self._rays(self.distance_m)
-
-    @property
-    def range_m(self) -> Any:
-        """Return the distance from the camera, whose rays start at its pupil."""
-        return self.distance_m
 
     def shading_normal(self, detail: Detail | None, dither: Any) -> Any:
         """Return the ground's shading normal; the vehicle has no finer relief."""

@@ -193,7 +193,7 @@ def thin_parts(surface: TerrainMesh, scene: RenderInput) -> FineLight | None:
     if vehicle is None or not len(facets):
         return None
     fx, fy = view.intrinsics[:2]
-    corners = vehicle.corners_of(facets)
+    corners = vehicle.corners_m[facets]
     first, second = (corners[:, k] - corners[:, 0] for k in (1, 2))
     normal = np.cross(first, second) / 2
     middle = corners.mean(axis=1)

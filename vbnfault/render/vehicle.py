@@ -29,6 +29,8 @@ class Vehicle:
         int32[m].
     reflectance
         float64[material, band].
+
+    `corners_m` float64[m, corner, 3] are the corners of the facets.
     """
 
     def __init__(
@@ -39,11 +41,11 @@ class Vehicle:
         reflectance: NDArray[np.float64],
     ) -> None:
         self.scene = mesh_scene("vehicle", vertices_m, faces)
-        self._corners_m = vertices_m[faces].astype(np.float64)
-        used = self._corners_m.reshape(-1, 3)
+        self.corners_m = vertices_m[faces].astype(np.float64)
+        used = self.corners_m.reshape(-1, 3)
         self.centre_m = (used.min(axis=0) + used.max(axis=0)) / 2
         self.radius_m = 1.001 * float(np.linalg.norm(used - self.centre_m, axis=1).max()) + 1e-3
-        a, b, c = (vertices_m[faces[:, k]].astype(np.float64) for k in range(3))
+        a, b, c = (self.corners_m[:, k] for k in range(3))
         normal = np.cross(b - a, c - a)
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
         # four floats per facet, fetched in one packet: its normal and its material
@@ -58,7 +60,7 @@ class Vehicle:
 
     def thin_in(self, view: View) -> NDArray[np.bool_]:
         """Return which facets before the camera are narrower than a pixel in a view, bool[m]."""
-        corners = self._corners_m
+        corners = self.corners_m
         z = np.maximum(corners[..., 2], _NEAREST_M)
         x, y = (corners[..., k] / z * view.intrinsics[k] for k in (0, 1))
         sides = [(np.roll(x, -1, axis=1) - x), (np.roll(y, -1, axis=1) - y)]
@@ -69,10 +71,6 @@ class Vehicle:
         before = (corners[..., 2] > _NEAREST_M).all(axis=1)
         return np.asarray((twice_area < _THIN_PX * longest) & before & inside)
 
-    def corners_of(self, facets: NDArray[np.intp]) -> NDArray[np.float64]:
-        """Return the corners of facets in B, float64[n, corner, 3]."""
-        return self._corners_m[facets]
-
     def slopes_in(self, view: View) -> NDArray[np.float64]:
         """Return bounds of x/z and y/z in B beyond which no ray of a camera meets a part, float64[2, axis].
 
@@ -81,7 +79,7 @@ class Vehicle:
         fx, fy, cx, cy = view.intrinsics
         low = np.array([-cx / fx, -cy / fy])
         high = np.array([(view.width_px - cx) / fx, (view.height_px - cy) / fy])
-        aperture, corners = view.aperture_radius_m, self._corners_m
+        aperture, corners = view.aperture_radius_m, self.corners_m
         z = corners[..., 2]
         # a facet is out of sight if all its corners lie behind the camera or beyond the same side of the field
         hidden = (z <= 0).all(axis=1)

@@ -8,8 +8,8 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from ..core import spectra
-from ..core.architecture import ARCHITECTURES, READOUT_DIRECTIONS, Architecture, ReadoutDirection
 from ..core.errors import InputError
+from ..core.quantities import ARCHITECTURES, READOUT_DIRECTIONS, Architecture, ReadoutDirection
 from ..core.tables import Table, pair_within
 
 # Values of a camera without a prescription, where the scene gives none.

@@ -10,8 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..camera import Camera, focal_length_mm
-from ..core.architecture import ARCHITECTURES, READOUT_DIRECTIONS
-from ..core.quantities import RGBI, Charge, Electrons, Offset, Quantity, RawMosaic
+from ..core.quantities import (
+    ARCHITECTURES,
+    READOUT_DIRECTIONS,
+    RGBI,
+    Charge,
+    Electrons,
+    Offset,
+    Quantity,
+    RawMosaic,
+)
 from ..detector import MosaicDetector as _Mosaic
 from ..detector import ThreeColourDetector, load_sensor
 from ..faults import FaultContext

@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from ..core.architecture import ARCHITECTURES
 from ..core.errors import InputError
-from ..core.quantities import Electrons
+from ..core.quantities import ARCHITECTURES, Electrons
 from ..faults import (
     MOSAIC_STEPS,
     STEPS,

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..body import Body, Site, ellipsoid, load_body
 from ..camera import Camera
-from ..core import spectra
+from ..core import frames, spectra
 from ..core.errors import InputError, under_key
 from ..core.quantities import Radiance, Truth
 from ..reflectance import REFERENCE_NM, BandReflectance, radiance_factor
@@ -22,7 +22,7 @@ from ..scene.target import EARTH, BodyTable
 from . import sky
 from .coma import check_coma
 from .ephemeris import sun_distance_au, wavelengths_nm
-from .spacecraft import HingePose, ModelPlacement, Spacecraft, SpacecraftMesh, default_spacecraft, load_spacecraft
+from .spacecraft import HingePose, Spacecraft, SpacecraftMesh, default_spacecraft, load_spacecraft
 from .surface_map import load_albedo_map
 
 if TYPE_CHECKING:
@@ -224,16 +224,13 @@ def spacecraft(scene: Scene) -> SpacecraftMesh | None:
             known = ", ".join(vehicle.hinges)
             raise InputError(f"spacecraft.pose.{unknown[0]}: the default vehicle has no such joint; it has {known}")
         return vehicle.posed({name: _pose(name, t, vehicle) for name, t in table.pose.items()}).merged()
+    roll, pitch, yaw = np.radians([table.roll_deg, table.pitch_deg, table.yaw_deg])
     with under_key("spacecraft.model"):
         vehicle = load_spacecraft(
             Path(table.model),
             unit=table.unit,
-            placement=ModelPlacement(
-                roll_deg=table.roll_deg,
-                pitch_deg=table.pitch_deg,
-                yaw_deg=table.yaw_deg,
-                translation_B_m=table.translation_m,
-            ),
+            B_from_V=frames.rx(roll) @ frames.ry(pitch) @ frames.rz(yaw),
+            translation_B_m=table.translation_m,
             materials={name: _plain(value) for name, value in table.materials.items()},
             poses={name: _pose(name, t, None) for name, t in table.pose.items()},
             default_material=_plain(table.default_material),

@@ -19,7 +19,6 @@ from scipy.spatial.transform import Rotation
 
 from ..core import meshes, resources, user_files
 from ..core.errors import InputError
-from ..core.frames import rx, ry, rz
 from ..core.meshes import MeshPart
 
 F64 = NDArray[np.float64]
@@ -141,26 +140,6 @@ class HingePose:
         hinge, axis = np.array(self.hinge_B_m, dtype=float), np.array(self.axis_B, dtype=float)
         turn = Rotation.from_rotvec(np.radians(self.angle_deg) * axis / np.linalg.norm(axis))
         return np.asarray(turn.apply(points_B_m - hinge) + hinge)
-
-
-@dataclass(frozen=True, kw_only=True)
-class ModelPlacement:
-    """Describe the position of a file's axes V in B: p_B = Rx(roll) · Ry(pitch) · Rz(yaw) · p_V + translation.
-
-    The order of the angles is that of `frames.L_from_C`. By convention GLB files have y up, z forward and x left;
-    yaw_deg = 180 turns these axes into those of B.
-    """
-
-    roll_deg: float = 0.0
-    pitch_deg: float = 0.0
-    yaw_deg: float = 0.0
-    translation_B_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-
-    @property
-    def B_from_V(self) -> F64:
-        """Return the rotation matrix, float64[3, 3]."""
-        roll, pitch, yaw = np.radians([self.roll_deg, self.pitch_deg, self.yaw_deg])
-        return np.asarray(rx(roll) @ ry(pitch) @ rz(yaw))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -285,7 +264,8 @@ def load_spacecraft(
     path: str | Path,
     *,
     unit: Unit = "m",
-    placement: ModelPlacement | None = None,
+    B_from_V: F64 | None = None,
+    translation_B_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
     materials: Mapping[str, str | float | Mapping[str, Any]] | None = None,
     poses: Mapping[str, HingePose] | None = None,
     default_material: str | float | Mapping[str, Any] = 0.3,
@@ -300,8 +280,9 @@ def load_spacecraft(
         (`usemtl`). Polygons are triangulated. Textures, colours and .mtl files are not read.
     unit
         Unit of the file: "m", "cm" or "mm". The GLB standard uses metres.
-    placement
-        Axes and origin of the file in B; by default they are those of B.
+    B_from_V, translation_B_m
+        Rotation float64[3, 3] from the file's axes V, and position of its origin, in B; default: those of B. By
+        convention GLB files have y up, z forward and x left; half a turn about z makes these the axes of B.
     materials
         Settings for `make_material` by part or by the file's material. The first match applies: the part's path,
         its name, its parents' names from the nearest on, the file's material. Next follows a material of the file
@@ -318,7 +299,6 @@ def load_spacecraft(
         no part of it. Faces without area are dropped without a message.
     """
     path = Path(path)
-    placement = placement or ModelPlacement()
     pieces = _read(path)
     extent_m = METRES_PER[unit] * float(np.ptp(np.concatenate([p.vertices for p in pieces]), axis=0).max())
     if extent_m > LARGEST_EXTENT_M:
@@ -326,11 +306,11 @@ def load_spacecraft(
             f"{path}: the vehicle measures {extent_m:g} m in the unit {unit!r}; it must be at most"
             f" {LARGEST_EXTENT_M:g} m, so give the file's own unit: {', '.join(METRES_PER)}"
         )
-    B_from_V, translation = placement.B_from_V, np.array(placement.translation_B_m, dtype=np.float64)
+    rotation, translation = np.eye(3) if B_from_V is None else B_from_V, np.array(translation_B_m, dtype=np.float64)
     parts = tuple(
         Part(
             name=piece.name,
-            vertices_B_m=METRES_PER[unit] * piece.vertices @ B_from_V.T + translation,
+            vertices_B_m=METRES_PER[unit] * piece.vertices @ rotation.T + translation,
             faces=piece.faces,
             material=material,
         )
