@@ -11,16 +11,18 @@ import pytest
 from scipy import stats
 
 from vbnfault.core.errors import InputError
-from vbnfault.detector.converter import convert, transitions_dn
-from vbnfault.detector.nodes import node_of, transmission_order
 from vbnfault.detector.readout import (
     ReadoutIndividual,
     ReadoutNoise,
     ReadoutSpec,
     analogue_dn,
     banding_e,
+    convert,
+    node_of,
     read_out,
     readout_time_s,
+    transitions_dn,
+    transmission_order,
 )
 
 IDEAL = ReadoutSpec(read_noise_e_rms=0)

@@ -10,7 +10,7 @@ import pytest
 from test_faults_kit import flat_electrons, make, make_context, rng, with_mosaic
 
 from vbnfault.detector import load_sensor
-from vbnfault.detector.converter import convert
+from vbnfault.detector.readout import convert
 from vbnfault.faults import FaultContext
 
 SIZE = 64

@@ -17,7 +17,7 @@ from test_faults_kit import make, make_context, noisy, noisy_electrons, with_mos
 from vbnfault.core.errors import InputError
 from vbnfault.core.quantities import LUMINANCE, RGBI
 from vbnfault.core.registry import undoing_registrations
-from vbnfault.detector.compiled import with_luminance
+from vbnfault.detector.interface import with_luminance
 from vbnfault.detector.mosaic import pattern
 from vbnfault.faults import (
     MOSAIC_STEPS,

@@ -127,6 +127,19 @@ def flat(array: NDArray[T]) -> NDArray[T]:
     return out
 
 
+def on_device(array: NDArray[Any]) -> Any:
+    """Return real numbers of any shape as a device array, Float, in their order."""
+    return backend().Float(flat(np.asarray(array, dtype=np.float32)))
+
+
+def evaluated(array: Any) -> NDArray[Any]:
+    """Return the values of a device array, once its kernel has run, in the memory of the device array."""
+    dr = backend().dr
+    dr.eval(array)
+    dr.sync_thread()
+    return np.array(array, copy=False)
+
+
 def _paths() -> Iterator[tuple[str, Path]]:
     """Yield the origin and the path of every library file to inspect, in the order of preference."""
     if os.environ.get(VARIABLE):

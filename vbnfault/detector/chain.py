@@ -23,13 +23,13 @@ from numpy.typing import NDArray
 from ..core.errors import VbnfaultError
 from ..core.quantities import DEAD, HOT, RGBI, RTS, RTS_HIGH, STUCK, TRAP
 from .charge import transfer_dark_e
-from .compiled import luminance
 from .demosaic import bounded_at_edges, correct_defects, demosaic, interpolate
 from .effects import Acts, Effect, Exposure, chain_of, is_packaged
 from .effects.electrons import upper_fraction
 from .effects.output import full_well_to_codes
 from .efficiency import white_balance
 from .individual import Individual, IndividualSpec, dark_rate_e_s, make_individual, offset_e, response
+from .interface import luminance
 from .mosaic import channel_of
 from .noise import NormalField, draw_normals
 from .readout import ReadoutIndividual, ReadoutNoise, read_out

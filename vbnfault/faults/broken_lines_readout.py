@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..detector.nodes import last_before, node_of, readout_steps
+from ..detector.readout import last_before, node_of, readout_steps
 from .context import FaultContext, Params
 from .contract import Fault
 from .fields import Interval, Severity, bounds, number

@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..converter import convert
 from ..individual import StuckPixels
-from ..readout import ReadoutIndividual, analogue_dn, clip_full_well, read_out
+from ..readout import ReadoutIndividual, analogue_dn, clip_full_well, convert, read_out
 from .contract import F32, Effect, Exposure, FaultStep
 
 Raw = NDArray[np.uint16]
