@@ -380,20 +380,6 @@ def test_offsets_with_heavy_tails_follow_students_t() -> None:
         IndividualSpec(dsnu_freedom=2.0)
 
 
-def test_same_seed_same_device_other_seed_another() -> None:
-    a, b, c = sensor(BUSY, 3), sensor(BUSY, 3), sensor(BUSY, 4)
-    for name in ("gain", "dsnu_e", "dark_e_s", "damage_e_s"):
-        np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
-        assert (getattr(a, name) != getattr(c, name)).mean() > 0.1  # undamaged pixels stay at 0
-    for kind in KINDS:
-        one, same, other = (arrays(getattr(made, kind)) for made in (a, b, c))
-        for name, values in one.items():
-            assert len(values) > 5
-            np.testing.assert_array_equal(values, same[name])
-            n = min(len(values), len(other[name]))
-            assert (values[:n] != other[name][:n]).any()
-
-
 def test_one_property_leaves_the_others_alone() -> None:
     made = sensor(BUSY)
     changes: dict[str, set[str]] = {
