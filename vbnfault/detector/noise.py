@@ -176,7 +176,7 @@ def _horner(s: Any, terms: tuple[float, ...]) -> Any:
 def poisson_quantile(mean: F32, normal: F32) -> F32:
     """Return the Poisson count at the quantile Φ(normal), float32: one variate per value for any mean.
 
-    The result is exact where the mean is below `EXACT_POISSON_BELOW_E`; elsewhere the expansion named there is used.
+    The result is exact where the mean is below `EXACT_POISSON_BELOW_E`; elsewhere it is the expansion named there.
     """
     z = normal
     out = z * z * np.float32(1 / 6) + np.float32(1 / 3) + np.sqrt(mean) * z + mean

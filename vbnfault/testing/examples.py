@@ -1,8 +1,10 @@
-"""Make cameras, contexts and random quantities on which a fault can be tried."""
+"""Make cameras, contexts and random quantities on which a fault can be tried; name the example that breaks it."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+import pickle
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -117,3 +119,21 @@ def _random_bytes(rng: np.random.Generator, shape: tuple[int, int]) -> NDArray[n
     array[::7, ::5] = 0
     array[::5, ::7] = 255
     return array
+
+
+@contextlib.contextmanager
+def naming(title: str, example: str) -> Iterator[None]:
+    """Turn every error of a block into an AssertionError that names the class and the example that breaks it."""
+    try:
+        yield
+    except Exception as error:
+        text = str(error) if isinstance(error, AssertionError) else f"raised {type(error).__name__}: {error}"
+        raise AssertionError(f"{title}: {text} ({example})") from error
+
+
+def pickled(value: Any) -> Any:
+    """Return a value as another process gets it. Raises AssertionError if it cannot be pickled."""
+    try:
+        return pickle.loads(pickle.dumps(value))
+    except (pickle.PicklingError, AttributeError) as error:
+        raise AssertionError(f"cannot be pickled: {error}; define its class at the top of a module") from None
