@@ -284,15 +284,13 @@ def read_out(
     noise: ReadoutNoise | None = None,
     individual: ReadoutIndividual | None = None,
 ) -> Raw:
-    """Return raw DN, uint16[y, x], of collected electrons float32[y, x], in one compiled kernel.
+    """Return raw DN, uint16[y, x], of collected electrons float32[y, x].
 
     Without `noise` the result is noise-free. Without `individual` it has no fixed pattern and no differential
     non-linearity.
     """
-    left = backend().dr.minimum(on_device(electrons), _opaque(spec.full_well_e))
-    level = _amplified(left, electrons.shape, spec, noise, individual or ReadoutIndividual())
-    codes = _codes(level, spec, None if individual is None else individual.transitions_dn)
-    return evaluated(codes).reshape(electrons.shape).astype(np.uint16)
+    level = analogue_dn(clip_full_well(electrons, spec.full_well_e), spec, noise, individual)
+    return convert(level, spec, None if individual is None else individual.transitions_dn)
 
 
 def analogue_dn(
@@ -305,8 +303,31 @@ def analogue_dn(
 
     `electrons` are those that the full well has left (`clip_full_well`); other arguments are as in `read_out`.
     """
-    level = _amplified(on_device(electrons), electrons.shape, spec, noise, individual or ReadoutIndividual())
-    return evaluated(level).reshape(electrons.shape)
+    height, width = electrons.shape
+    if individual is None:
+        individual = ReadoutIndividual()
+    rows = np.zeros(height, dtype=np.float32) if individual.row_e is None else individual.row_e
+    if noise is not None:
+        rows = rows + noise.row * np.float32(spec.row_noise_e_rms)
+    out = on_device(electrons)
+    if individual.pixel_e is not None:
+        out = out + on_device(individual.pixel_e)
+    # values of a line are copied to all its pixels: a kernel that gathers them takes longer
+    for line in (individual.column_e, rows[:, None]):
+        if line is not None and line.any():
+            out = out + on_device(np.broadcast_to(line, electrons.shape))
+    if spec.banding_seen_e:
+        out = out + on_device(banding_e((height, width), spec))
+    if noise is not None:
+        out = out + on_device(noise.read) * _opaque(spec.noise_e_rms)
+    gains = np.array(spec.node_gains or (1.0,) * spec.nodes) * spec.system_gain_dn_per_e
+    offsets = np.array(spec.node_offsets_dn or (0.0,) * spec.nodes) + spec.bias_dn
+    if spec.nodes == 1:
+        out = out * _opaque(gains[0]) + _opaque(offsets[0])
+    else:
+        node = node_of((height, width), spec.nodes)
+        out = out * on_device(gains[node]) + on_device(offsets[node])
+    return evaluated(_bent(out, spec)).reshape(electrons.shape)
 
 
 def convert(analogue: F32, spec: ReadoutSpec, transitions_dn: F32 | None = None) -> Raw:
@@ -314,8 +335,22 @@ def convert(analogue: F32, spec: ReadoutSpec, transitions_dn: F32 | None = None)
 
     With `transitions_dn` (see `ReadoutIndividual`) a code begins at its transition.
     """
-    codes = _codes(on_device(analogue), spec, transitions_dn)
-    return evaluated(codes).reshape(analogue.shape).astype(np.uint16)
+    be = backend()
+    dr, UInt32 = be.dr, be.UInt32
+    level = dr.clip(on_device(analogue), 0, _opaque(spec.top_dn))
+    if transitions_dn is None:
+        code = UInt32(be.Int32(dr.round(level)))
+    else:
+        # levels with integer part k have at least low[k] transitions at or below them, and at most the greatest
+        # difference of `low` further ones
+        low = np.searchsorted(transitions_dn, np.arange(spec.top_dn + 2), side="right")
+        code = dr.gather(UInt32, UInt32(low.astype(np.uint32)), UInt32(be.Int32(level)))
+        above = on_device(np.append(transitions_dn, np.float32(np.inf)))
+        for _ in range(int(np.diff(low).max(initial=0))):
+            code = code + dr.select(dr.gather(be.Float, above, code) <= level, UInt32(1), UInt32(0))
+    if spec.missing_codes or spec.stuck_bits:
+        code = dr.gather(UInt32, UInt32(spec.codes.astype(np.uint32)), code)
+    return evaluated(code).reshape(analogue.shape).astype(np.uint16)
 
 
 def clip_full_well(electrons: F32, full_well_e: float) -> F32:
@@ -337,40 +372,6 @@ def banding_e(shape: tuple[int, int], spec: ReadoutSpec) -> F32:
     return out
 
 
-def _amplified(
-    electrons: Any,
-    shape: tuple[int, ...],
-    spec: ReadoutSpec,
-    noise: ReadoutNoise | None,
-    individual: ReadoutIndividual,
-) -> Any:
-    """Return the level at the converter in DN, Float, of electrons, Float, in the order of the pixels.
-
-    Values of a row or column are copied to all its pixels. A kernel that gathers them takes longer: the gather
-    instruction of processors may be slow.
-    """
-    height, width = shape
-    rows = np.zeros(height, dtype=np.float32) if individual.row_e is None else individual.row_e
-    if noise is not None:
-        rows = rows + noise.row * np.float32(spec.row_noise_e_rms)
-    out = electrons
-    if individual.pixel_e is not None:
-        out = out + on_device(individual.pixel_e)
-    for line in (individual.column_e, rows[:, None]):
-        if line is not None and line.any():
-            out = out + on_device(np.broadcast_to(line, shape))
-    if spec.banding_seen_e:
-        out = out + on_device(banding_e((height, width), spec))
-    if noise is not None:
-        out = out + on_device(noise.read) * _opaque(spec.noise_e_rms)
-    gains = np.array(spec.node_gains or (1.0,) * spec.nodes) * spec.system_gain_dn_per_e
-    offsets = np.array(spec.node_offsets_dn or (0.0,) * spec.nodes) + spec.bias_dn
-    if spec.nodes == 1:
-        return _bent(out * _opaque(gains[0]) + _opaque(offsets[0]), spec)
-    node = node_of((height, width), spec.nodes)
-    return _bent(out * on_device(gains[node]) + on_device(offsets[node]), spec)
-
-
 def _bent(dn: Any, spec: ReadoutSpec) -> Any:
     """Apply the integral non-linearity, which has no deviation at the bias and at the top code."""
     if not (spec.inl_quadratic_dn or spec.inl_cubic_dn):
@@ -381,26 +382,6 @@ def _bent(dn: Any, spec: ReadoutSpec) -> Any:
     arc = u * (1 - u)
     s = 4 * spec.inl_quadratic_dn + _CUBIC_SCALE * spec.inl_cubic_dn
     return dn + arc * (_opaque(s) - _opaque(2 * _CUBIC_SCALE * spec.inl_cubic_dn) * u)
-
-
-def _codes(level: Any, spec: ReadoutSpec, transitions: F32 | None) -> Any:
-    """Return the codes, UInt32, of levels in DN, Float."""
-    be = backend()
-    dr, UInt32 = be.dr, be.UInt32
-    level = dr.clip(level, 0, _opaque(spec.top_dn))
-    if transitions is None:
-        code = UInt32(be.Int32(dr.round(level)))
-    else:
-        # levels with integer part k have at least low[k] transitions at or below them, and at most the greatest
-        # difference of `low` further ones
-        low = np.searchsorted(transitions, np.arange(spec.top_dn + 2), side="right")
-        code = dr.gather(UInt32, UInt32(low.astype(np.uint32)), UInt32(be.Int32(level)))
-        above = on_device(np.append(transitions, np.float32(np.inf)))
-        for _ in range(int(np.diff(low).max(initial=0))):
-            code = code + dr.select(dr.gather(be.Float, above, code) <= level, UInt32(1), UInt32(0))
-    if spec.missing_codes or spec.stuck_bits:
-        code = dr.gather(UInt32, UInt32(spec.codes.astype(np.uint32)), code)
-    return code
 
 
 def transitions_dn(dnl_lsb: NDArray[np.floating]) -> F32:
