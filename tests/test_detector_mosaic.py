@@ -69,7 +69,7 @@ def test_near_infrared_replaces_the_second_green() -> None:
     assert nir.channels == ("R", "G", "B", "NIR")
 
 
-# tiles of a user: their heights divide no power of two, or are larger than the blocks that are copied at a time
+# tiles of a user, also a high one
 SIX = Pattern(name="six", channels=("R", "W"), tile=((0, 1, 1, 1, 1, 1), *(((1,) * 6,) * 5)))
 TALL = Pattern(name="tall", channels=("R", "W"), tile=((0,),) * 3 + ((1,),) * 67)
 

@@ -42,9 +42,6 @@ _MANY_STEPS_E = 30.0
 # A sum of a distribution that no longer changes in float64.
 SUM_COMPLETE = 1 - 1e-15
 
-# Numbers that are looked up together: numpy makes indices of 8 bytes of them, which stay in the cache.
-_CODES_AT_ONCE = 1 << 17
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class NormalField:
@@ -78,13 +75,9 @@ class NormalField:
 
     def values(self) -> F32:
         """Return the variates, float32[y, x, ...]."""
-        codes, table = self.codes.reshape(-1), variates_by_code()
-        out = np.empty(codes.shape, np.float32)
-        for start in range(0, codes.size, _CODES_AT_ONCE):
-            part = slice(start, start + _CODES_AT_ONCE)
-            np.take(table, codes[part], mode="clip", out=out[part])
-        out[self.tail] = self.tail_values
-        return out.reshape(self.codes.shape)
+        out = np.take(variates_by_code(), self.codes)
+        out.reshape(-1)[self.tail] = self.tail_values
+        return out
 
     @cached_property
     def looked_up(self) -> F32:
