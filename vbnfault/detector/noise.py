@@ -172,10 +172,10 @@ def poisson_quantile(mean: F32, normal: F32) -> F32:
     The result is exact where the mean is below `EXACT_POISSON_BELOW_E`; elsewhere it is the expansion named there.
     """
     z = normal
-    out = z * z * np.float32(1 / 6) + np.float32(1 / 3) + np.sqrt(mean) * z + mean
+    out: Any = z * z * np.float32(1 / 6) + np.float32(1 / 3) + np.sqrt(mean) * z + mean
     # the later terms move a count by less than 0.01 where the mean is above this
     out += np.where(mean < ALL_TERMS_BELOW_E, _later_terms(np, mean, z), np.float32(0))
-    out = np.asarray(np.maximum(np.floor(out), 0), dtype=np.float32)
+    out = np.maximum(np.floor(out), 0)
     few = mean < EXACT_POISSON_BELOW_E
     u = np.minimum(ndtr(z[few].astype(np.float64)), SUM_COMPLETE)
     out[few] = np.where(mean[few] > 0, poisson_least_count(u, mean[few].astype(np.float64)), 0)
