@@ -141,19 +141,16 @@ def replace(table: dict[str, Any], values: Mapping[str, Any], *, source: str) ->
             raise InputError(
                 f"{source}: {shown(key)} = {shown(value)}: the key must be a text, such as 'dataset.seed'"
             )
-        *parents, leaf = dotted(key).split(".")
+        parts, what = dotted(key).split("."), f"{source}: {key} = {shown(value)}"
         node: Any = table
-        for i, parent in enumerate(parents):
-            if isinstance(node, list):
-                node = node[_entry(node, parent, ".".join(parents[:i]), f"{source}: {key} = {shown(value)}")]
-            else:
-                node = node.setdefault(parent, {})
+        for i, part in enumerate(parts):
+            place = _entry(node, part, ".".join(parts[:i]), what) if isinstance(node, list) else part
+            if i == len(parts) - 1:
+                node[place] = value
+                break
+            node = node[place] if isinstance(node, list) else node.setdefault(place, {})
             if not isinstance(node, dict | list):
-                raise InputError(f"{source}: {key} = {shown(value)}: {parent} is a value, not a table")
-        if isinstance(node, list):
-            node[_entry(node, leaf, ".".join(parents), f"{source}: {key} = {shown(value)}")] = value
-        else:
-            node[leaf] = value
+                raise InputError(f"{what}: {part} is a value, not a table")
 
 
 def _as_plain(value: Any) -> Any:
