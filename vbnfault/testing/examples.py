@@ -9,7 +9,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..camera import Camera, focal_length_mm
 from ..core.architecture import ARCHITECTURES, READOUT_DIRECTIONS
@@ -104,21 +103,16 @@ def random_quantity(step: str, context: FaultContext, seed: int = 0) -> Quantity
         relative = rng.uniform(0, 2, (*context.shape, len(white_e))).astype(np.float32)
         return Electrons(array=relative * white_e, white_e=white_e)
     if step == "rgbi":
-        return RGBI(array=_random_bytes(rng, context.shape))
+        image = rng.integers(0, 256, (*context.shape, 4), dtype=np.uint8)
+        image[::7, ::5] = 0
+        image[::5, ::7] = 255
+        return RGBI(array=image)
     readout = context.camera.mosaic.sensor.readout
     if step == "raw":
         return RawMosaic(array=rng.integers(0, readout.top_dn + 1, context.shape, dtype=np.uint16))
     if step == "offsets":
         return Offset(array=rng.normal(0, 100, context.shape).astype(np.float32))
     return Charge(array=rng.uniform(0, 2 * readout.full_well_e, context.shape).astype(np.float32))
-
-
-def _random_bytes(rng: np.random.Generator, shape: tuple[int, int]) -> NDArray[np.uint8]:
-    """Return random R, G, B and I, uint8[y, x, 4], with zeros and full pixels among them."""
-    array = rng.integers(0, 256, (*shape, 4), dtype=np.uint8)
-    array[::7, ::5] = 0
-    array[::5, ::7] = 255
-    return array
 
 
 @contextlib.contextmanager
