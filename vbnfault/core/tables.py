@@ -384,20 +384,16 @@ def _interval(schema: Mapping[str, Any]) -> str:
     """Return the limits of a number in words; empty where it has none."""
     lo, hi = schema.get("minimum"), schema.get("maximum")
     above, below = schema.get("exclusiveMinimum"), schema.get("exclusiveMaximum")
-    parts = [f"from {_plain(lo)}"] if lo is not None else [f"above {_plain(above)}"] if above is not None else []
+    start = f"from {_plain(lo)}" if lo is not None else f"above {_plain(above)}" if above is not None else ""
     if hi is not None:
-        parts.append(
-            f"to {_plain(hi)}"
-            if lo is not None
-            else f"and at most {_plain(hi)}"
-            if parts
-            else f"up to {_plain(hi)}"
-        )
+        end = f"{'to' if lo is not None else 'and at most' if start else 'up to'} {_plain(hi)}"
     elif below is not None:
-        parts.append(f"and below {_plain(below)}" if parts else f"below {_plain(below)}")
+        end = f"{'and below' if start else 'below'} {_plain(below)}"
     elif lo is not None:
         return f"of at least {_plain(lo)}"
-    return " ".join(parts)
+    else:
+        end = ""
+    return f"{start} {end}".strip()
 
 
 def _plain(bound: float) -> str:
