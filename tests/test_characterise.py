@@ -207,16 +207,6 @@ def test_four_nodes_read_each_half_to_its_own_side() -> None:
     assert charge[19, 20] == charge[44, 43] == charge[20, 19] == charge[43, 44] == 0
 
 
-def test_a_shutter_that_lets_light_through_smears() -> None:
-    light = np.zeros((64, 64), np.float32)
-    light[20, 30] = 5000.0
-    device = Device(ccd("full_frame_ccd", shutter_transmission=0.02), 1, shape=(64, 64))
-    dark = device.expected_e(0 * light, 0.01)
-    got = device.expected_e(light, 0.01) - dark
-    np.testing.assert_allclose(got[21:, 30], 5000 / 0.01 * 1e-3 * 0.02, rtol=1e-3)
-    np.testing.assert_allclose(got[:20, 30], 0, atol=1e-3)
-
-
 def test_a_global_shutter_lets_light_onto_charge_that_waits() -> None:
     """leak × rate × i row times, from the first row read on; none of it with a rolling shutter."""
     light = np.full((64, 64), 5000.0, np.float32)
@@ -268,16 +258,6 @@ def test_telegraph_signals_of_a_device_are_in_its_charge() -> None:
     signals = device.individual.rts.at(293.0)
     dark = device.collected_e(np.zeros((64, 64), np.float32), 10.0)
     assert dark.sum() == pytest.approx(10 * (signals.amplitude_e_s * signals.duty).sum(), rel=1e-4)
-
-
-def test_smear_follows_the_direction_of_readout() -> None:
-    light = np.zeros((64, 64), np.float32)
-    light[20, 30] = 5000.0
-    made = sensor(architecture="frame_transfer_ccd", transfer=Transfer(row_transfer_s=1e-5))
-    for direction, behind in (("up", slice(21, None)), ("down", slice(0, 20))):
-        got = Device(made, 1, shape=(64, 64), direction=direction).expected_e(light, 0.01)[:, 30] - 0.4
-        assert got[behind].min() > 4
-        assert np.delete(got, np.r_[np.arange(64)[behind], 20]).max() < 0.1
 
 
 def test_intensity_is_what_pixels_without_a_filter_see() -> None:
