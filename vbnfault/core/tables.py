@@ -144,7 +144,7 @@ def replace(table: dict[str, Any], values: Mapping[str, Any], *, source: str) ->
         parts, what = dotted(key).split("."), f"{source}: {key} = {shown(value)}"
         node: Any = table
         for i, part in enumerate(parts):
-            place = _entry(node, part, ".".join(parts[:i]), what) if isinstance(node, list) else part
+            place: Any = _entry(node, part, ".".join(parts[:i]), what) if isinstance(node, list) else part
             if i == len(parts) - 1:
                 node[place] = value
                 break
