@@ -7,7 +7,9 @@ import contextlib
 import errno
 import gc
 import io
+import logging
 import os
+import re
 import shutil
 import signal
 import sys
@@ -118,6 +120,21 @@ def one_render_thread() -> None:
     """The processes of xdist share the cores: each renders with one thread, where a test asks for no more."""
     if "PYTEST_XDIST_WORKER" in os.environ and "drjit" in sys.modules:
         sys.modules["drjit"].set_thread_count(1)
+
+
+@pytest.fixture(autouse=True)
+def no_unexpected_warning(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Fail a test during which the library logs a warning, but for `caplog` and the mark `expects_warnings`."""
+    heard: list[str] = []
+    handler = logging.Handler(logging.WARNING)
+    handler.emit = lambda record: heard.append(record.getMessage())  # type: ignore[method-assign]
+    logger = logging.getLogger("vbnfault")
+    logger.addHandler(handler)
+    yield
+    logger.removeHandler(handler)
+    if "caplog" not in request.fixturenames and not request.node.get_closest_marker("expects_warnings"):
+        # a dataset of few samples lacks a class or a split
+        assert not [text for text in heard if not re.match(r"split \w+ has no sample", text)]
 
 
 @contextlib.contextmanager

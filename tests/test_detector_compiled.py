@@ -34,8 +34,9 @@ def with_outermost(noise: Noise) -> Noise:
 
 def stepwise(detector: ThreeColourDetector, expected: Electrons, noise: Noise | None) -> np.ndarray:
     """Return the image uint8[y, x, 4] by the methods of the single steps, which leave out nothing."""
-    raw = detector.raw_dn(detector.electrons(expected, EXPOSURE_S, noise), noise)
-    return detector.rgbi(raw, EXPOSURE_S).array
+    shot, read = (None, None) if noise is None else (noise.shot.values(), noise.read.values())
+    electrons = detector.collected_e(expected.array, EXPOSURE_S, shot)
+    return detector.shown(detector.converted_dn(electrons, read), EXPOSURE_S)
 
 
 def sky(shape: tuple[int, int], lit: float, level_e: float = 900.0) -> np.ndarray:

@@ -46,7 +46,7 @@ class Persistence(Effect):
 
 
 class Nothing(Effect):
-    """Change nothing between the analogue chain and the converter, which else run in one pass."""
+    """Change nothing between the analogue chain and the converter."""
 
     name = "nothing"
     after = "analogue"

@@ -245,20 +245,6 @@ def test_the_reference_has_every_key_of_a_scene() -> None:
         assert f"| `{key}` |" in section or own_table, f"{name}.{key}"
 
 
-@pytest.mark.parametrize(("page", "folder"), [("lens", "lenses"), ("sensor", "detectors")])
-def test_the_reference_has_every_key_of_packaged_files(page: str, folder: str) -> None:
-    text = generated(page)
-    keys = {
-        match[1]
-        for file in (ROOT / "scenes" / folder).glob("*.toml")
-        for match in re.finditer(
-            r"^(\w+) = ", file.read_text(encoding="utf-8").partition("[sources]")[0], re.MULTILINE
-        )
-    }
-    assert len(keys) >= 12
-    assert not [key for key in sorted(keys) if f"| `{key}` |" not in text]
-
-
 def test_the_notebook_holds_the_outputs_of_one_run_in_order() -> None:
     text = NOTEBOOK.read_text(encoding="utf-8")
     cells = [cell for cell in json.loads(text)["cells"] if cell["cell_type"] == "code"]

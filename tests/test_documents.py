@@ -7,7 +7,6 @@ from datetime import date
 from pathlib import Path
 
 import pytest
-from test_architecture import MAY_IMPORT
 
 import vbnfault
 
@@ -61,32 +60,6 @@ def test_every_name_beside_a_file_is_in_that_file() -> None:
         if not re.search(rf"\b{name}\b", (ROOT / path).read_text(encoding="utf-8"))
     ]
     assert not missing
-
-
-def documented_imports() -> dict[str, set[str]]:
-    """Return the packages that each row of the table lets its package import, `core` included."""
-    table = CONTRIBUTING.partition("| package |")[2].partition("\n\n")[0]
-    rows = [line.strip("|").split("|") for line in table.splitlines() if line.startswith("| `")]
-    assert all(len(cells) == 4 for cells in rows)
-    meaning = CONTRIBUTING.partition("Words in capitals stand for several packages: ")[2].partition("\n\n")[0]
-    groups: dict[str, set[str]] = {}
-
-    def packages(text: str) -> set[str]:
-        return set(re.findall(r"`(\w+)`", text)).union(*(groups[word] for word in re.findall("[A-Z]{2,}", text)))
-
-    for words, members in re.findall(r"([A-Z]+) for ([^;]+)", meaning):
-        groups[words] = packages(members)
-    names = [re.findall(r"\w+", cells[0])[0] for cells in rows]
-    assert len(set(names)) == len(names)
-    return {name: packages(cells[3]) | {"core"} for name, cells in zip(names, rows, strict=True)}
-
-
-def test_the_table_of_packages_is_that_of_the_architecture() -> None:
-    # a package may import itself, which the page does not say
-    assert {unit: allowed - {unit} for unit, allowed in documented_imports().items()} == {
-        unit: (allowed | {"core"}) - {unit} for unit, allowed in MAY_IMPORT.items()
-    }
-    assert all("core" in allowed for unit, allowed in MAY_IMPORT.items() if unit != "core")
 
 
 def test_the_changelog_begins_with_this_version() -> None:

@@ -91,16 +91,3 @@ def test_row_noise_adds_in_quadrature() -> None:
     added = stripes(where, params, noise)
     # of the same variates, 50 e for 30 e: 20 e a row, to the rounding of two codes
     np.testing.assert_allclose(added, np.broadcast_to(20 * noise.readout.row[:, None], added.shape), atol=3.5)
-
-
-def test_it_shows_in_the_picture_and_optics_stay() -> None:
-    where = context()
-    fault = make("banding")
-    params = fault.draw(where, rng(2))
-    camera = fault.alter(where.camera, params)
-    assert camera == fault.alter(where.camera, params)
-    assert camera.optics == where.camera.optics
-    signal = flat_electrons(where, 0.4)
-    before, after = (c.detector.develop(signal, 0.01, None).array.astype(int) for c in (where.camera, camera))
-    assert (before != after).mean() > 0.5
-    assert 2 <= np.abs(after - before).max() <= 60

@@ -11,7 +11,7 @@ from test_faults_kit import flat_electrons, make, make_context, noisy, rng, with
 
 from vbnfault.core.quantities import ARCHITECTURES, RawMosaic
 from vbnfault.detector import load_sensor
-from vbnfault.detector.nodes import node_of
+from vbnfault.detector.readout import node_of
 from vbnfault.faults import FaultContext
 from vbnfault.faults.broken_lines_readout import ONE_WAY, POSSIBLE
 

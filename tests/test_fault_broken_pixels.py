@@ -62,15 +62,6 @@ def test_one_defect_and_its_neighbours() -> None:
     assert FAULT.footprint(params, context).sum() == 5
 
 
-def test_neighbour_looks_at_its_far_side() -> None:
-    context = make_context(9)
-    array = np.full((9, 9, 4), 40, np.uint8)
-    array[4, 6] = 240  # far side of (4, 5)
-    out = FAULT.apply(flat_rgbi(context, 0).with_array(array), cmos(x=[4], y=[4], brightness_dn=[100]), context)
-    assert out.array[4, 5, 3] == (100 + 240) / 2
-    assert out.array[4, 3, 3] == (100 + 40) / 2
-
-
 def test_colour_keeps_its_ratio_and_black_becomes_grey() -> None:
     context = make_context(9)
     array = np.zeros((9, 9, 4), np.uint8)
@@ -95,12 +86,6 @@ def test_subtended_line_runs_to_the_frames_edge(direction: str) -> None:
     assert (out == 90).sum() == len(line)
     length = {"up": 8, "down": 12, "left": 12, "right": 18}[direction]
     assert FAULT.footprint(params, context).sum() == 4 + length
-
-
-def test_zero_offset_is_no_line() -> None:
-    context = make_context(16)
-    params = ccd("right", x=[4], y=[4], brightness_dn=[200], line_offset_dn=[0])
-    assert FAULT.footprint(params, context).sum() == 5
 
 
 @settings(max_examples=60)

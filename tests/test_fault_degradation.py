@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import pytest
 from test_faults_kit import flat_electrons, make, make_context, noisy_electrons, rng
 
 from vbnfault.core.errors import InputError
-from vbnfault.faults import degradation
 from vbnfault.faults.degradation import sigma_px
 
 
@@ -49,15 +47,6 @@ def test_the_sun_is_clipped_to_white_first() -> None:
     assert np.count_nonzero(blurred[..., 0]) == 17**2
 
 
-def test_flat_stays_flat() -> None:
-    context = make_context(256)
-    fault = make("optics_degradation")
-    params = fault.draw(context, rng())
-    flat = flat_electrons(context, 0.5)
-    assert np.allclose(fault.apply(flat, params, context).array, flat.array, rtol=1e-6, atol=0)
-    assert fault.footprint(params, context).all()  # type: ignore[union-attr]
-
-
 def test_sizes_are_odd_and_fill_the_table() -> None:
     context = make_context(1024, 8)
     sizes = {make("optics_degradation").draw(context, rng(s))["filter_size_px"] for s in range(200)}
@@ -87,14 +76,3 @@ def test_a_small_image_is_still_blurred() -> None:
     blurred = fault.apply(edge, params, context).array
     # e^(-1/(2·0.16)) / (1 + 2 e^(-1/(2·0.16))) of the lit side arrives behind the edge: 4 %, 5 DN at half white
     assert blurred[20, 32] == pytest.approx(0.0404 * edge.array[20, 31], rel=0.01)
-
-
-@pytest.mark.parametrize("height", [5, 100, 129, 257, 321, 400])
-@pytest.mark.parametrize("size", [3, 17, 81])
-def test_strips_of_rows_do_not_show(height: int, size: int) -> None:
-    """The image is filtered strip by strip: the last may have one row, and a wide kernel makes them higher."""
-    array = np.random.default_rng(height + size).random((height, 40, 3), dtype=np.float32) * 2000
-    white = np.array([900, 1000, 1100], dtype=np.float32)
-    taps = cv2.getGaussianKernel(size, 0.15 * size, cv2.CV_32F)
-    whole = cv2.sepFilter2D(np.minimum(array, white), -1, taps, taps, borderType=cv2.BORDER_REFLECT_101)
-    np.testing.assert_array_equal(degradation._blur(array, white, taps), whole)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from test_faults_kit import make, make_context, rng, with_mosaic
 
-from vbnfault.core.quantities import Electrons
 from vbnfault.faults import FaultContext
 
 EXPOSURE_S = 0.01
@@ -101,17 +100,3 @@ def test_a_better_sensor_does_not_mend() -> None:
         if params["cause"] == "clock":
             assert params["row_transfer_s"] == 1e-6
     assert causes == {"clock", "clear"}
-
-
-def test_it_shows_in_a_picture() -> None:
-    c = context("frame_transfer_ccd")
-    fault = make("smear", cause="clock", row_transfer_s=1e-5)
-    camera = fault.alter(c.camera, fault.draw(c, rng()))
-    light = camera.detector.white_e * np.zeros((*c.shape, 3), np.float32)
-    light[:32] = 0.8 * camera.detector.white_e
-    expected = Electrons(array=light, white_e=camera.detector.white_e)
-    before, after = (
-        k.detector.develop(expected, EXPOSURE_S, None).array[..., 3].astype(int) for k in (c.camera, camera)
-    )
-    # the dark half has passed 32 rows: 0.8 · 255 · 32 · (10 − 1) µs / 10 ms = 5.9 DN
-    assert np.median((after - before)[36:]) == pytest.approx(5.9, abs=1.1)

@@ -11,7 +11,7 @@ from test_faults_kit import flat_electrons, make, make_context, noisy, rng, with
 
 from vbnfault.core.quantities import RawMosaic
 from vbnfault.detector import load_sensor
-from vbnfault.detector.nodes import transmission_order
+from vbnfault.detector.readout import transmission_order
 from vbnfault.faults import FaultContext
 
 SIZE = 64

@@ -10,20 +10,7 @@ from vbnfault import testing
 from vbnfault.core.quantities import RGBI, Electrons
 from vbnfault.faults import Fault, FaultContext, from_dict
 from vbnfault.testing import random_quantity as noisy
-from vbnfault.testing import with_mosaic
-
-__all__ = [
-    "flat_electrons",
-    "flat_rgbi",
-    "inside",
-    "make",
-    "make_context",
-    "noisy",
-    "noisy_electrons",
-    "noisy_rgbi",
-    "rng",
-    "with_mosaic",
-]
+from vbnfault.testing import with_mosaic as with_mosaic
 
 FOV_DEG = 40.0
 

@@ -24,6 +24,8 @@ from vbnfault.core.errors import InputError, VbnfaultError
 from vbnfault.store import disk
 from vbnfault.store.metadata import metadata_problems
 
+pytestmark = pytest.mark.expects_warnings  # of what is damaged
+
 
 @pytest.fixture(scope="module")
 def template(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:

@@ -127,6 +127,19 @@ def flat(array: NDArray[T]) -> NDArray[T]:
     return out
 
 
+def on_device(array: NDArray[Any]) -> Any:
+    """Return real numbers of any shape as a device array, Float, in their order."""
+    return backend().Float(flat(np.asarray(array, dtype=np.float32)))
+
+
+def evaluated(array: Any) -> NDArray[Any]:
+    """Return the values of a device array, once its kernel has run, in the memory of the device array."""
+    dr = backend().dr
+    dr.eval(array)
+    dr.sync_thread()
+    return np.array(array, copy=False)
+
+
 def _paths() -> Iterator[tuple[str, Path]]:
     """Yield the origin and the path of every library file to inspect, in the order of preference."""
     if os.environ.get(VARIABLE):
@@ -155,30 +168,27 @@ def _name_version(path: Path) -> tuple[int, ...]:
 
 
 def _inspect(path: Path, origin: str) -> Candidate:
-    """Return a library with its version and, where it is unusable, its problem."""
-    if not path.is_file():
-        return Candidate(path=path, origin=origin, version=None, problem="no such file")
+    """Return a candidate; libraries whose name gives an old version are not loaded."""
+    version, problem = _version(path, origin) if path.is_file() else (None, "no such file")
+    if version is not None and version[0] < OLDEST_USABLE:
+        problem = f"version {version[0]} aborts the first render"
+    return Candidate(path=path, origin=origin, version=version, problem=problem)
+
+
+def _version(path: Path, origin: str) -> tuple[tuple[int, int, int] | None, str]:
+    """Return the version that a library's name or the library itself states, or None and what is wrong with it."""
     by_name = re.search(r"libLLVM[.-](?:so\.)?(\d+)", path.resolve().name)
-    if by_name and int(by_name[1]) < OLDEST_USABLE:  # the name gives the version: do not load the library
-        return _candidate(path, origin, (int(by_name[1]), 0, 0))
+    if by_name and int(by_name[1]) < OLDEST_USABLE:
+        return (int(by_name[1]), 0, 0), ""
     try:
-        library = _load(path, origin)
+        get_version = _load(path, origin).LLVMGetVersion
     except OSError as error:
-        return Candidate(path=path, origin=origin, version=None, problem=f"does not load: {error}")
-    try:
-        get_version = library.LLVMGetVersion
+        return None, f"does not load: {error}"
     except AttributeError:
-        problem = f"older than {OLDEST_USABLE}, or no LLVM: it exports no LLVMGetVersion"
-        return Candidate(path=path, origin=origin, version=None, problem=problem)
+        return None, f"older than {OLDEST_USABLE}, or no LLVM: it exports no LLVMGetVersion"
     parts = [ctypes.c_uint() for _ in range(3)]
     get_version(*map(ctypes.byref, parts))
-    return _candidate(path, origin, (parts[0].value, parts[1].value, parts[2].value))
-
-
-def _candidate(path: Path, origin: str, version: tuple[int, int, int]) -> Candidate:
-    """Return the candidate for a library whose version is known, with the reason if it cannot be used."""
-    problem = f"version {version[0]} aborts the first render" if version[0] < OLDEST_USABLE else ""
-    return Candidate(path=path, origin=origin, version=version, problem=problem)
+    return (parts[0].value, parts[1].value, parts[2].value), ""
 
 
 def _load(path: Path, origin: str) -> ctypes.CDLL:

@@ -1,6 +1,6 @@
 """Define the quantities that flow through the pipeline; each is a frozen array with its unit and its axes.
 
-Radiance ─ lens ─▶ Irradiance ─ detector ─▶ Electrons ─▶ RawDN ─▶ RGBI ─▶ Sample
+Radiance ─ lens ─▶ Irradiance ─ detector ─▶ Electrons ─▶ RGBI ─▶ Sample
 """
 
 from __future__ import annotations
@@ -267,15 +267,6 @@ class Electrons(Quantity):
         return replace(
             self, array=self.array * times, past_rims=past * times if past is not None and past.any() else None
         )
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class RawDN(Quantity):
-    """Hold the digital numbers of the analogue-to-digital converter, bias included, per colour R, G, B."""
-
-    unit = "DN"
-    axes = ("y", "x", "channel")
-    dtype = np.uint16
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -141,19 +141,16 @@ def replace(table: dict[str, Any], values: Mapping[str, Any], *, source: str) ->
             raise InputError(
                 f"{source}: {shown(key)} = {shown(value)}: the key must be a text, such as 'dataset.seed'"
             )
-        *parents, leaf = dotted(key).split(".")
+        parts, what = dotted(key).split("."), f"{source}: {key} = {shown(value)}"
         node: Any = table
-        for i, parent in enumerate(parents):
-            if isinstance(node, list):
-                node = node[_entry(node, parent, ".".join(parents[:i]), f"{source}: {key} = {shown(value)}")]
-            else:
-                node = node.setdefault(parent, {})
+        for i, part in enumerate(parts):
+            place: Any = _entry(node, part, ".".join(parts[:i]), what) if isinstance(node, list) else part
+            if i == len(parts) - 1:
+                node[place] = value
+                break
+            node = node[place] if isinstance(node, list) else node.setdefault(place, {})
             if not isinstance(node, dict | list):
-                raise InputError(f"{source}: {key} = {shown(value)}: {parent} is a value, not a table")
-        if isinstance(node, list):
-            node[_entry(node, leaf, ".".join(parents), f"{source}: {key} = {shown(value)}")] = value
-        else:
-            node[leaf] = value
+                raise InputError(f"{what}: {part} is a value, not a table")
 
 
 def _as_plain(value: Any) -> Any:
@@ -387,20 +384,16 @@ def _interval(schema: Mapping[str, Any]) -> str:
     """Return the limits of a number in words; empty where it has none."""
     lo, hi = schema.get("minimum"), schema.get("maximum")
     above, below = schema.get("exclusiveMinimum"), schema.get("exclusiveMaximum")
-    parts = [f"from {_plain(lo)}"] if lo is not None else [f"above {_plain(above)}"] if above is not None else []
+    start = f"from {_plain(lo)}" if lo is not None else f"above {_plain(above)}" if above is not None else ""
     if hi is not None:
-        parts.append(
-            f"to {_plain(hi)}"
-            if lo is not None
-            else f"and at most {_plain(hi)}"
-            if parts
-            else f"up to {_plain(hi)}"
-        )
+        end = f"{'to' if lo is not None else 'and at most' if start else 'up to'} {_plain(hi)}"
     elif below is not None:
-        parts.append(f"and below {_plain(below)}" if parts else f"below {_plain(below)}")
+        end = f"{'and below' if start else 'below'} {_plain(below)}"
     elif lo is not None:
         return f"of at least {_plain(lo)}"
-    return " ".join(parts)
+    else:
+        end = ""
+    return f"{start} {end}".strip()
 
 
 def _plain(bound: float) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,8 @@ from .path_checks import shown_path
 from .user_files import read_input
 
 _DEEPEST_TABLE = 24
+# Half of a pair of UTF-16, which has no encoding in UTF-8.
+_NO_UNICODE = re.compile("[\ud800-\udfff]")
 # Kinds of files that users have in place of a TOML file, by how they start and by suffix.
 _STARTS = {
     r"(!.*\n\s*)*(RDM|LEN)\b(?! NEW \")": "a CODE V sequence file",
@@ -91,7 +93,7 @@ def toml_text(table: Mapping[str, Any]) -> str:
     return tomli_w.dumps(table).encode("utf-8", "replace").decode()
 
 
-def check_plain(table: Mapping[str, Any], source: str) -> None:
+def check_plain(table: Mapping[str, Any] | Sequence[Any], source: str, where: str = "", depth: int = 0) -> None:
     """Check that plain data can be written as TOML.
 
     It must be nested at most 24 deep, its whole numbers must fit 64 bits, and its texts must be Unicode. A text of
@@ -99,36 +101,18 @@ def check_plain(table: Mapping[str, Any], source: str) -> None:
 
     Raises InputError; the message begins with `source`.
     """
-    level: list[tuple[str, Any]] = [("", table)]
-    for _ in range(_DEEPEST_TABLE):
-        below: list[tuple[str, Any]] = []
-        for where, node in level:
-            items = node.items() if isinstance(node, Mapping) else enumerate(node)
-            for key, value in items:
-                if isinstance(value, Mapping | list | tuple):
-                    below.append((f"{where}{_shown_key(key)}.", value))
-                elif isinstance(value, int) and not -(2**63) <= value < 2**64:
-                    path = f"{where}{_shown_key(key)}"
-                    raise InputError(
-                        f"{source}: {path} = {shown(value)}: must be a whole number of at most 64 bits"
-                    )
-                elif isinstance(value, str) and not _is_unicode(value):
-                    path = f"{where}{_shown_key(key)}"
-                    raise InputError(f"{source}: {path} = {shown(value)}: must be text in UTF-8")
-        level = below
-        if not level:
-            return
-    where = level[0][0].rstrip(".")
-    raise InputError(f"{source}: {where}: nested deeper than {_DEEPEST_TABLE} tables or lists")
-
-
-def _is_unicode(text: str) -> bool:
-    """Return whether a text can be written as UTF-8."""
-    try:
-        text.encode()
-    except UnicodeEncodeError:
-        return False
-    return True
+    if depth == _DEEPEST_TABLE:
+        raise InputError(f"{source}: {where.rstrip('.')}: nested deeper than {_DEEPEST_TABLE} tables or lists")
+    wanted = ""
+    for key, value in table.items() if isinstance(table, Mapping) else enumerate(table):
+        if isinstance(value, Mapping | list | tuple):
+            check_plain(value, source, f"{where}{_shown_key(key)}.", depth + 1)
+        elif isinstance(value, int) and not -(2**63) <= value < 2**64:
+            wanted = "a whole number of at most 64 bits"
+        elif isinstance(value, str) and _NO_UNICODE.search(value):
+            wanted = "text in UTF-8"
+        if wanted:
+            raise InputError(f"{source}: {where}{_shown_key(key)} = {shown(value)}: must be {wanted}")
 
 
 def _shown_key(key: object) -> str:

@@ -6,16 +6,3 @@ from .noise import EXACT_POISSON_BELOW_E, poisson_quantile
 from .operation import amplified, binned
 from .sensor import Sensor, load_sensor
 from .three_colour import Noise, ThreeColourDetector
-
-__all__ = [
-    "EXACT_POISSON_BELOW_E",
-    "Detector",
-    "MosaicDetector",
-    "Noise",
-    "Sensor",
-    "ThreeColourDetector",
-    "amplified",
-    "binned",
-    "load_sensor",
-    "poisson_quantile",
-]

@@ -23,13 +23,12 @@ from numpy.typing import NDArray
 from ..core.errors import VbnfaultError
 from ..core.quantities import DEAD, HOT, RGBI, RTS, RTS_HIGH, STUCK, TRAP
 from .charge import transfer_dark_e
-from .compiled import luminance
 from .demosaic import bounded_at_edges, correct_defects, demosaic, interpolate
 from .effects import Acts, Effect, Exposure, chain_of, is_packaged
 from .effects.electrons import upper_fraction
-from .effects.output import full_well_to_codes
 from .efficiency import white_balance
 from .individual import Individual, IndividualSpec, dark_rate_e_s, make_individual, offset_e, response
+from .interface import luminance
 from .mosaic import channel_of
 from .noise import NormalField, draw_normals
 from .readout import ReadoutIndividual, ReadoutNoise, read_out
@@ -109,9 +108,6 @@ class Device:
         self.transfer_dark_e = transfer_dark_e(sensor, self.dark_rate_e_s, direction)
         self.telegraph = self.individual.rts.at(self.temperature_K)
         self.chain = chain_of(sensor.effects)
-        names = [effect.name for effect in self.chain]
-        # with no effect between them, the three run in one kernel, which is quicker
-        self._reads_out_at_once = names.index("converter") == names.index("full_well") + 2
 
     # --- light to raw DN ------------------------------------------------------------------------------------------
 
@@ -144,15 +140,10 @@ class Device:
     ) -> Any:
         """Return the signal after the effects of the chain, up to but without the one named `before`."""
         exposure = Exposure(device=self, exposure_s=exposure_s, noise=noise, acts=acts)
-        effects = iter(self.chain)
-        for effect in effects:
+        for effect in self.chain:
             if effect.name == before:
                 break
-            if effect.name == "full_well" and self._reads_out_at_once:
-                next(effects), next(effects)  # analogue and converter
-                signal = full_well_to_codes(signal, exposure)
-            else:
-                signal = _checked(effect, signal, effect.apply(signal, exposure))
+            signal = _checked(effect, signal, effect.apply(signal, exposure))
         return signal
 
     # --- raw DN to image ------------------------------------------------------------------------------------------

@@ -25,9 +25,8 @@ F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
 # Omnidirectional proton flux per cm² of a sphere's cross-section: CREME96 at the Sun-Earth point L2, without
-# shielding and behind 11 mm of aluminium.
+# shielding; behind 11 mm of aluminium it is 4.32.
 FLUX_UNSHIELDED_CM2_S = 4.67
-FLUX_BEHIND_11_MM_AL_CM2_S = 4.32
 
 PAIR_ENERGY_EV = 3.65  # mean energy per electron-hole pair in silicon at 300 K
 

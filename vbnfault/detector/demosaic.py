@@ -8,7 +8,6 @@ Normalised convolution needs no mirror: it uses only the pixels inside the mosai
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Literal
 
@@ -34,8 +33,8 @@ _HALO_PX = {"bilinear": 2, "malvar": 2, "menon": 8}
 HARD_NOISE, HARD_RATIO = 16.0, 8.0
 
 # Bilinear: weights with which a pixel contributes to the neighbours in its own plane (Losson, Macaire & Yang 2010,
-# Advances in Imaging and Electron Physics 162, doi 10.1016/S1076-5670(10)62005-8). The first is [½ 1 ½]ᵀ [½ 1 ½].
-BILINEAR_RED_BLUE = np.array([[1, 2, 1], [2, 4, 2], [1, 2, 1]], dtype=np.float32) / 4
+# Advances in Imaging and Electron Physics 162, doi 10.1016/S1076-5670(10)62005-8).
+# Those of red and blue are [½ 1 ½]ᵀ [½ 1 ½].
 BILINEAR_GREEN = np.array([[0, 1, 0], [1, 4, 1], [0, 1, 0]], dtype=np.float32) / 4
 _TENT = np.array([0.5, 1, 0.5], dtype=np.float32)
 
@@ -111,7 +110,7 @@ def bounded_at_edges(
     measured values within one pixel: never below the least, and on the dark side of the edge never above the
     greatest.
 
-    `_Edges` says where an edge is hard. Elsewhere values stay as published: a bound there would change the noise.
+    `_bound` says where an edge is hard. Elsewhere values stay as published: a bound there would change the noise.
 
     Parameters
     ----------
@@ -137,7 +136,6 @@ def bounded_at_edges(
     bright = signal
     if clipped is not None and clipped.any():
         bright = np.where(clipped, np.float32(np.inf), signal)
-    edges = _Edges(pattern, method, black, noise)
     halo = _HALO_PX[method]
     measured = cv2.copyMakeBorder(signal, halo, halo, halo, halo, _MIRROR)
     brightest = measured if bright is signal else cv2.copyMakeBorder(bright, halo, halo, halo, halo, _MIRROR)
@@ -145,47 +143,38 @@ def bounded_at_edges(
     for start in range(0, len(signal), _ROWS_PER_BLOCK):
         block = rgb[start : start + _ROWS_PER_BLOCK]
         rows = slice(start, start + len(block) + 2 * halo)
-        edges.bound(block, measured[rows], brightest[rows])
+        _bound(block, measured[rows], brightest[rows], pattern, method, black=black, noise=noise)
     return rgb
 
 
-@dataclass(frozen=True)
-class _Edges:
-    """Find hard edges and correct the values beside them for `bounded_at_edges`.
+def _bound(
+    block: F32, measured: F32, brightest: F32, pattern: Pattern, method: Method, *, black: float, noise: float
+) -> None:
+    """Keep the values of a block of rows, float32[y, x, 3], within their bounds beside hard edges, in place.
 
-    An edge is hard where the pixels of the method's `footprint` span more than noise can (16 standard deviations)
-    and more than 8:1 above black, or 2:1 where the value is below black. A clipped pixel may have any brightness,
-    so an edge beside it is always hard.
+    `measured` and `brightest` are the mosaic with a halo around the block; in `brightest`, clipped pixels are
+    infinite. An edge is hard where the pixels of the method's `footprint` span more than noise can (16 standard
+    deviations) and more than 8:1 above black, or 2:1 where the value is below black. A clipped pixel may have any
+    brightness, so an edge beside it is always hard.
     """
-
-    pattern: Pattern
-    method: Method
-    black: float
-    noise: float
-
-    def bound(self, block: F32, measured: F32, brightest: F32) -> None:
-        """Keep the values of a block of rows, float32[y, x, 3], within their bounds, in place.
-
-        `measured` and `brightest` are the mosaic with a halo around the block; in `brightest`, clipped pixels are
-        infinite.
-        """
-        halo = _HALO_PX[self.method]
-        inner = np.s_[halo:-halo, halo:-halo]
-        top = cv2.dilate(brightest, _support(self.method))[inner]
-        lowest = cv2.erode(measured, np.ones((3, 3), np.uint8))[inner]
-        # the few pixels where an edge may be hard for one of the colours
-        y, x = np.nonzero((top - lowest > HARD_NOISE * self.noise) & (top - lowest > lowest - self.black))
-        least = _malvar(measured, self.pattern, filtered=_least_beside)
-        greatest = _malvar(measured, self.pattern, filtered=_greatest_beside)
-        top, own = top[y, x], brightest[inner][y, x] - self.black
-        for k in range(3):
-            value, low, high = block[y, x, k], least[k][inner][y, x], greatest[k][inner][y, x]
-            span, dark = top - low, low - self.black
-            ratio = (span > (HARD_RATIO - 1) * dark) | ((value < self.black) & (span > dark))
-            hard = (span > HARD_NOISE * self.noise) & ratio
-            dark_side = hard & (HARD_RATIO * own < top - self.black)
-            value = np.where(hard & (value < low), low, value)
-            block[y, x, k] = np.where(dark_side & (value > high), high, value)
+    halo = _HALO_PX[method]
+    inner = np.s_[halo:-halo, halo:-halo]
+    top = cv2.dilate(brightest, _support(method))[inner]
+    lowest = cv2.erode(measured, np.ones((3, 3), np.uint8))[inner]
+    # the few pixels where an edge may be hard for one of the colours
+    y, x = np.nonzero((top - lowest > HARD_NOISE * noise) & (top - lowest > lowest - black))
+    least, greatest = (
+        _malvar(measured, pattern, filtered=extreme) for extreme in (_least_beside, _greatest_beside)
+    )
+    top, own = top[y, x], brightest[inner][y, x] - black
+    for k in range(3):
+        value, low, high = block[y, x, k], least[k][inner][y, x], greatest[k][inner][y, x]
+        span, dark = top - low, low - black
+        ratio = (span > (HARD_RATIO - 1) * dark) | ((value < black) & (span > dark))
+        hard = (span > HARD_NOISE * noise) & ratio
+        dark_side = hard & (HARD_RATIO * own < top - black)
+        value = np.where(hard & (value < low), low, value)
+        block[y, x, k] = np.where(dark_side & (value > high), high, value)
 
 
 def interpolate(raw: NDArray[Any], pattern: Pattern, channel: str) -> F32:

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.quantities import RGBI, Electrons, Irradiance
+from ..core.quantities import LUMINANCE, RGBI, Electrons, Irradiance
 from ..core.spectra import per_joule
 from .effects import Acts
 from .efficiency import QuantumEfficiency, white_balance
@@ -22,6 +22,11 @@ if TYPE_CHECKING:
     from .mosaic_detector import MosaicDetector
 
 F32 = NDArray[np.float32]
+U8 = NDArray[np.uint8]
+
+# The weights of R, G and B are rounded to whole 65536ths, and their sum is 1. Their products with levels, and the
+# sums of these, are exact in single precision, so every order of the sum, fused or not, gives the same bits.
+LUMINANCE_WEIGHTS = np.rint(LUMINANCE.astype(np.float64) * 65536) / 65536
 
 _ROWS_PER_BLOCK = 64  # measured as the fastest; two threads would wait for the interpreter's lock
 
@@ -133,36 +138,25 @@ class Detector(Protocol):
 
 def electrons_of(irradiance: Irradiance, weights: F32) -> F32:
     """Return the electrons per pixel and channel, float32[y, x, channel], with weights float32[channel, band]."""
-
-    # a matrix product over the bands that stays in the cache: BLAS is slow for 3 × 8
-    def step(energy: F32) -> F32:
-        height, _, width = energy.shape
-        colours = np.zeros((len(weights), height, width), dtype=np.float32)
-        if not colours[0].size:  # of a frame without ground; OpenCV refuses empty arrays
-            return np.moveaxis(colours, 0, -1)
+    _, height, width = irradiance.array.shape
+    out = np.empty((height, width, len(weights)), dtype=np.float32)
+    # a matrix product over the bands, in blocks of rows that stay in the cache: BLAS is slow for 3 × 8
+    for start in range(0, height if width else 0, _ROWS_PER_BLOCK):  # OpenCV refuses empty arrays
+        block = out[start : start + _ROWS_PER_BLOCK]
+        energy = np.moveaxis(irradiance.array[:, start : start + len(block)], 0, 1)
+        colours = np.zeros((len(weights), *block.shape[:2]), dtype=np.float32)
         for colour, row in zip(colours, weights.tolist(), strict=True):
             for band, weight in enumerate(row):
                 cv2.scaleAdd(energy[:, band], weight, colour, dst=colour)
-        return cv2.merge(list(colours)).reshape(height, width, len(weights))
-
-    return np.asarray(blockwise(step, np.moveaxis(irradiance.array, 0, 1)))
-
-
-def blockwise(step: Callable[..., NDArray[Any]], array: NDArray[Any], *more: NDArray[Any] | None) -> NDArray[Any]:
-    """Return `step(block, *blocks of more)` of all blocks of rows, joined.
-
-    `more` are arrays; None stays None.
-    """
-
-    def of_block(start: int) -> NDArray[Any]:
-        rows = slice(start, start + _ROWS_PER_BLOCK)
-        return step(array[rows], *(None if extra is None else extra[rows] for extra in more))
-
-    first = of_block(0)
-    if len(array) <= _ROWS_PER_BLOCK:
-        return first
-    out = np.empty((len(array), *first.shape[1:]), first.dtype)
-    out[:_ROWS_PER_BLOCK] = first
-    for start in range(_ROWS_PER_BLOCK, len(array), _ROWS_PER_BLOCK):
-        out[start : start + _ROWS_PER_BLOCK] = of_block(start)
+        block[...] = cv2.merge(list(colours)).reshape(block.shape)
     return out
+
+
+def luminance(rgb: U8) -> U8:
+    """Return the luminance, uint8[y, x], of R, G and B, uint8[y, x, 3]; halves become the even level."""
+    return np.asarray(cv2.transform(rgb, LUMINANCE_WEIGHTS.reshape(1, 3))).reshape(rgb.shape[:2])
+
+
+def with_luminance(rgb: U8) -> U8:
+    """Return R, G, B and the luminance as I, uint8[y, x, 4], of R, G and B, uint8[y, x, 3]."""
+    return np.asarray(cv2.insertChannel(luminance(rgb), cv2.cvtColor(rgb, cv2.COLOR_RGB2RGBA), 3))

@@ -18,8 +18,6 @@ from ..core.tables import table_class
 F32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-_BLOCK_ROWS = 64  # rows that one thread copies at a time, about
-
 
 @table_class()
 class Pattern:
@@ -102,12 +100,9 @@ def sample(planes: F32, pattern: Pattern) -> F32:
     """
     out = np.empty(planes.shape[:2], np.float32)
     rows, columns = pattern.shape
-    height = rows * max(1, _BLOCK_ROWS // rows)  # whole tiles, so that each block begins with the tile's first row
-    for start in range(0, len(out), height):
-        block = slice(start, start + height)
-        for y in range(rows):
-            for x in range(columns):
-                out[block][y::rows, x::columns] = planes[block][y::rows, x::columns, pattern.tile[y][x]]
+    for y in range(rows):
+        for x in range(columns):
+            out[y::rows, x::columns] = planes[y::rows, x::columns, pattern.tile[y][x]]
     return out
 
 

@@ -6,6 +6,7 @@ Two exposures of twins therefore differ only where their signals differ.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any
@@ -14,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtr, ndtri, pdtr, pdtrik
 
-from ..core.llvm import backend
+from ..core.llvm import backend, evaluated, flat
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -40,12 +41,6 @@ _MANY_STEPS_E = 30.0
 
 # A sum of a distribution that no longer changes in float64.
 SUM_COMPLETE = 1 - 1e-15
-
-# Numbers that are looked up together: numpy makes indices of 8 bytes of them, which stay in the cache.
-_CODES_AT_ONCE = 1 << 17
-
-# Means whose distributions are summed together, so that their five arrays of 8 bytes stay in the cache.
-_SUMMED_AT_ONCE = 1 << 15
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -80,13 +75,9 @@ class NormalField:
 
     def values(self) -> F32:
         """Return the variates, float32[y, x, ...]."""
-        codes, table = self.codes.reshape(-1), variates_by_code()
-        out = np.empty(codes.shape, np.float32)
-        for start in range(0, codes.size, _CODES_AT_ONCE):
-            part = slice(start, start + _CODES_AT_ONCE)
-            np.take(table, codes[part], mode="clip", out=out[part])
-        out[self.tail] = self.tail_values
-        return out.reshape(self.codes.shape)
+        out = np.take(variates_by_code(), self.codes)
+        out.reshape(-1)[self.tail] = self.tail_values
+        return out
 
     @cached_property
     def looked_up(self) -> F32:
@@ -153,7 +144,7 @@ def variates_by_code() -> F32:
     return ndtri((np.arange(65536) + 0.5) / 65536).astype(np.float32)
 
 
-def later_poisson_terms(xp: Any, mean: Any, z: Any) -> Any:
+def _later_terms(xp: Any, mean: Any, z: Any) -> Any:
     """Return the terms of the Poisson quantile's expansion that matter for small means, float32.
 
     They have the form of Giles' expansion (2016, Q_N2) in s = z / √mean, but its series does not converge in the
@@ -178,33 +169,16 @@ def _horner(s: Any, terms: tuple[float, ...]) -> Any:
 def poisson_quantile(mean: F32, normal: F32) -> F32:
     """Return the Poisson count at the quantile Φ(normal), float32: one variate per value for any mean.
 
-    The result is exact (the distribution is summed) where the mean is below `EXACT_POISSON_BELOW_E`. Elsewhere it
-    uses the expansion named there.
+    The result is exact where the mean is below `EXACT_POISSON_BELOW_E`; elsewhere it is the expansion named there.
     """
-    normal = z = np.ascontiguousarray(normal)  # out takes its layout: ravel must be a view
-    root = np.sqrt(mean)
-    out = z * z
-    out *= np.float32(1 / 6)
-    out += np.float32(1 / 3)
-    root *= z
-    out += root
-    out += mean
+    z = normal
+    out: Any = z * z * np.float32(1 / 6) + np.float32(1 / 3) + np.sqrt(mean) * z + mean
     # the later terms move a count by less than 0.01 where the mean is above this
-    few = np.flatnonzero(mean < ALL_TERMS_BELOW_E)
-    if len(few):
-        m, z = mean.ravel(), normal.ravel()
-        if len(few) < m.size:
-            m, z = m[few], z[few]
-        terms = later_poisson_terms(np, m, z)
-        if len(few) < out.size:
-            out.ravel()[few] += terms
-        else:
-            out.ravel()[:] += terms
-    np.floor(out, out=out)
-    np.clip(out, 0, np.inf, out=out)  # half the time of `maximum`
-    if len(few):
-        low = np.flatnonzero(m < EXACT_POISSON_BELOW_E)
-        out.ravel()[few[low]] = _poisson_exact(m[low], z[low])
+    out += np.where(mean < ALL_TERMS_BELOW_E, _later_terms(np, mean, z), np.float32(0))
+    out = np.maximum(np.floor(out), 0)
+    few = mean < EXACT_POISSON_BELOW_E
+    u = np.minimum(ndtr(z[few].astype(np.float64)), SUM_COMPLETE)
+    out[few] = np.where(mean[few] > 0, poisson_least_count(u, mean[few].astype(np.float64)), 0)
     return out
 
 
@@ -213,28 +187,6 @@ def poisson_on_dark(signal: F32, dark: np.float32, normal: F32) -> F32:
     lit = signal > 0
     out = counts_of_one_mean(float(dark), normal)
     out[lit] = poisson_quantile(signal[lit] + dark, normal[lit])
-    return out
-
-
-def _poisson_exact(mean: F32, normal: F32) -> F32:
-    """Return the Poisson count, float32[n], at the quantile Φ(normal) by summing the distribution."""
-    out = np.zeros(len(mean), dtype=np.float32)
-    for start in range(0, len(mean), _SUMMED_AT_ONCE):
-        part = slice(start, start + _SUMMED_AT_ONCE)
-        counts, m, u = out[part], mean[part].astype(np.float64), ndtr(normal[part].astype(np.float64))
-        term = np.exp(-m)
-        total = term.copy()
-        left = np.flatnonzero(u > total)
-        u, m, term, total = u[left], m[left], term[left], total[left]
-        count = 0
-        while len(left):
-            count += 1
-            term *= m
-            term /= count
-            total += term
-            counts[left] = count  # those that go on are written again
-            more = np.flatnonzero((u > total) & (total < SUM_COMPLETE))
-            left, m, u, term, total = left[more], m[more], u[more], term[more], total[more]
     return out
 
 
@@ -264,7 +216,7 @@ def poisson_cumulative(count: ArrayLike, mean: float) -> F64:
     return np.asarray(pdtr(np.floor(np.asarray(count, dtype=np.float64)), mean))
 
 
-def poisson_least_count(probability: ArrayLike, mean: float) -> NDArray[np.int64]:
+def poisson_least_count(probability: ArrayLike, mean: ArrayLike) -> NDArray[np.int64]:
     """Return the least counts whose cumulative probabilities reach `probability`, in (0, 1); `mean` > 0."""
     count = np.ceil(pdtrik(probability, mean))
     fewer = np.maximum(count - 1, 0)
@@ -280,3 +232,90 @@ def poisson_above_0(mean: float, uniform: ArrayLike) -> NDArray[np.int64]:
     if mean < 1e-12:
         return np.ones(chance.shape, dtype=np.int64)
     return np.maximum(poisson_least_count(1 - chance, mean), 1)
+
+
+# --- compiled: the bits of `poisson_quantile`, with intermediate results in registers -----------------------------
+
+
+def poisson(mean: F32, normal: NormalField) -> F32:
+    """Return `poisson_quantile` of means and normal variates, float32[y, x].
+
+    The variates are looked up by numpy, once for all exposures with this noise: on some processors, to fetch them
+    in the kernel takes longer than all of its arithmetic.
+    """
+    be = backend()
+    dr = be.dr
+    codes = flat(normal.codes)
+    if codes.size % 2:  # two codes share a word
+        codes = flat(np.append(codes, np.uint16(0)))
+    words = be.UInt32(codes.view(np.uint32))
+
+    def code_at(place: Any, lanes: Any) -> Any:
+        return dr.gather(be.UInt32, words, place >> 1, lanes) >> 16 * (place & 1) & 0xFFFF
+
+    z = be.Float(flat(normal.looked_up))
+    out: F32 = evaluated(_quantile(be.Float(flat(mean)), z, dr.arange(be.UInt32, mean.size), code_at))
+    out[normal.tail] = poisson_quantile(mean.reshape(-1)[normal.tail], normal.tail_values)
+    return out.reshape(mean.shape)
+
+
+def poisson_of_codes(mean: Any, code: Any, active: Any = True) -> Any:
+    """Return `poisson_quantile` of means and of the normal variates with these codes, as Float.
+
+    Lanes that are not active have any value.
+    """
+    be = backend()
+    return _quantile(
+        mean, be.dr.gather(be.Float, device_tables()[0], code, active), code, lambda code, _: code, active
+    )
+
+
+def _quantile(mean: Any, z: Any, place: Any, code_at: Callable[[Any, Any], Any], active: Any = True) -> Any:
+    """Return `poisson_quantile` of means and of normal variates `z`, as Float.
+
+    Lanes that are not active have any value. Where the mean is small, the distribution is summed up to the code of
+    the variate, which `code_at(place, lanes)` returns for these lanes.
+    """
+    be = backend()
+    dr = be.dr
+    count = (z * z * be.Float(1 / 6) + be.Float(1 / 3) + dr.sqrt(mean) * z) + mean
+    count = dr.if_stmt(
+        (count, mean, z),
+        mean < ALL_TERMS_BELOW_E,
+        lambda count, mean, z: count + _later_terms(dr, mean, z),
+        lambda count, mean, z: count,
+    )
+    few = active & (mean < EXACT_POISSON_BELOW_E)
+    count = dr.maximum(dr.floor(count), 0)
+    return dr.if_stmt(
+        (count, mean, place, few),
+        few,
+        lambda _, mean, place, few: _summed(mean, code_at(place, few), few),
+        lambda count, *_: count,
+    )
+
+
+def _summed(mean: Any, code: Any, few: Any) -> Any:
+    """Return the Poisson counts of means of few electrons, as Float, by summing the distribution in float64."""
+    be = backend()
+    dr = be.dr
+    u, m = dr.gather(be.Float64, device_tables()[1], code, few), be.Float64(mean)
+
+    def goes_on(term: Any, total: Any, count: Any) -> Any:
+        return (u > total) & (total < SUM_COMPLETE)
+
+    def add(term: Any, total: Any, count: Any) -> Any:
+        count = count + 1
+        term = term * m / count
+        return term, total + term, count
+
+    term = dr.exp(-m)
+    _, _, count = dr.while_loop((term, be.Float64(term), be.Float64(0)), goes_on, add, mode="symbolic")
+    return be.Float(count)
+
+
+@lru_cache(maxsize=1)
+def device_tables() -> tuple[Any, Any]:
+    """Return the normal variates by code, and the values of their distribution function, on the device."""
+    be, normal = backend(), variates_by_code()
+    return be.Float(flat(normal)), be.Float64(flat(ndtr(normal.astype(np.float64))))

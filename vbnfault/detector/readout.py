@@ -17,10 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from ..core.llvm import backend
+from ..core.errors import InputError
+from ..core.llvm import backend, evaluated, on_device
 from ..core.tables import table_class
-from .converter import Converter, on_device, raw_of, transitions_dn, with_stuck_bits
-from .nodes import node_of, readout_steps
 from .noise import normal_field
 
 F32 = NDArray[np.float32]
@@ -169,9 +168,60 @@ class ReadoutSpec:
         if self.missing_codes:
             there = np.setdiff1d(codes, self.missing_codes)
             codes = there[np.maximum(np.searchsorted(there, codes, side="right") - 1, 0)]
-        out = with_stuck_bits(codes.astype(np.uint16), self.stuck_bits)
+        bits = dict(self.stuck_bits)
+        high, low = (sum(1 << bit for bit, value in bits.items() if value == state) for state in (1, 0))
+        out = (codes.astype(np.uint16) | np.uint16(high)) & np.uint16(0xFFFF ^ low)
         out.flags.writeable = False
         return out
+
+
+# ------------------------------------------------------------------------------------------ output nodes
+# One of 1, 2 or 4 output nodes reads each pixel once. Nodes sit in the sensor's corners, the first at the top left
+# (assumed), and are read at the same time.
+
+
+def node_of(shape: tuple[int, int], nodes: int) -> NDArray[np.uint8]:
+    """Return the output node that reads each pixel, uint8[y, x].
+
+    A single node has the number 0. Of two nodes, 0 reads the left half and 1 the right half. Of four nodes, 0 and
+    1 read the upper quadrants and 2 and 3 the lower ones, from left to right. A middle row belongs to the upper
+    half, a middle column to the left half.
+    """
+    down, right = halves(shape, nodes)
+    return (2 * down[:, None] + right).astype(np.uint8)
+
+
+def halves(shape: tuple[int, int], nodes: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the half, 0 or 1, in which each row and each column lies; 0 where the sensor is not halved."""
+    if nodes not in (1, 2, 4):
+        raise InputError(f"nodes is {nodes}, but must be 1, 2 or 4")
+    down, right = ((np.arange(n) >= (n + 1) // 2).astype(np.intp) for n in shape)
+    return down * (nodes == 4), right * (nodes > 1)
+
+
+def readout_steps(shape: tuple[int, int], nodes: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return how many rows a node reads before each row, int[y], and pixels before each column, int[x]."""
+    down, right = halves(shape, nodes)
+    y, x = (np.arange(n) for n in shape)
+    return np.where(down, shape[0] - 1 - y, y), np.where(right, shape[1] - 1 - x, x)
+
+
+def last_before(lost: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Return, for each of the increasing indices `lost`, the nearest lower index that is not lost, or -1."""
+    run_begins = np.append(True, np.diff(lost) > 1)
+    return (lost[run_begins] - 1)[np.cumsum(run_begins) - 1] if len(lost) else lost
+
+
+def transmission_order(shape: tuple[int, int], nodes: int) -> NDArray[np.intp]:
+    """Return the flat indices of the pixels, int[y·x], in the order in which they leave the sensor.
+
+    Each step sends one pixel of every node, in the order of the nodes. With one node this is row by row.
+    """
+    if nodes == 1:
+        return np.arange(shape[0] * shape[1])
+    lines, pixels = readout_steps(shape, nodes)
+    step = lines[:, None] * shape[1] + pixels
+    return np.argsort((step * nodes + node_of(shape, nodes)).ravel(), kind="stable")
 
 
 # ------------------------------------------------------------------------------- noise and fixed pattern
@@ -234,15 +284,13 @@ def read_out(
     noise: ReadoutNoise | None = None,
     individual: ReadoutIndividual | None = None,
 ) -> Raw:
-    """Return raw DN, uint16[y, x], of collected electrons float32[y, x], in one compiled kernel.
+    """Return raw DN, uint16[y, x], of collected electrons float32[y, x].
 
     Without `noise` the result is noise-free. Without `individual` it has no fixed pattern and no differential
     non-linearity.
     """
-    transitions = None if individual is None else individual.transitions_dn
-    chain = _Chain(electrons.shape, spec, noise, individual)
-    left = backend().dr.minimum(on_device(electrons), _opaque(spec.full_well_e))
-    return raw_of(Converter(spec, transitions).codes(chain.amplified(left)), electrons.shape)
+    level = analogue_dn(clip_full_well(electrons, spec.full_well_e), spec, noise, individual)
+    return convert(level, spec, None if individual is None else individual.transitions_dn)
 
 
 def analogue_dn(
@@ -255,11 +303,54 @@ def analogue_dn(
 
     `electrons` are those that the full well has left (`clip_full_well`); other arguments are as in `read_out`.
     """
-    chain = _Chain(electrons.shape, spec, noise, individual)
-    dr, level = backend().dr, chain.amplified(on_device(electrons))
-    dr.eval(level)
-    dr.sync_thread()
-    return np.array(level, copy=False).reshape(electrons.shape)
+    height, width = electrons.shape
+    if individual is None:
+        individual = ReadoutIndividual()
+    rows = np.zeros(height, dtype=np.float32) if individual.row_e is None else individual.row_e
+    if noise is not None:
+        rows = rows + noise.row * np.float32(spec.row_noise_e_rms)
+    out = on_device(electrons)
+    if individual.pixel_e is not None:
+        out = out + on_device(individual.pixel_e)
+    # values of a line are copied to all its pixels: a kernel that gathers them takes longer
+    for line in (individual.column_e, rows[:, None]):
+        if line is not None and line.any():
+            out = out + on_device(np.broadcast_to(line, electrons.shape))
+    if spec.banding_seen_e:
+        out = out + on_device(banding_e((height, width), spec))
+    if noise is not None:
+        out = out + on_device(noise.read) * _opaque(spec.noise_e_rms)
+    gains = np.array(spec.node_gains or (1.0,) * spec.nodes) * spec.system_gain_dn_per_e
+    offsets = np.array(spec.node_offsets_dn or (0.0,) * spec.nodes) + spec.bias_dn
+    if spec.nodes == 1:
+        out = out * _opaque(gains[0]) + _opaque(offsets[0])
+    else:
+        node = node_of((height, width), spec.nodes)
+        out = out * on_device(gains[node]) + on_device(offsets[node])
+    return evaluated(_bent(out, spec)).reshape(electrons.shape)
+
+
+def convert(analogue: F32, spec: ReadoutSpec, transitions_dn: F32 | None = None) -> Raw:
+    """Return the code, uint16[y, x], of a level float32[y, x] in DN; half codes round to even.
+
+    With `transitions_dn` (see `ReadoutIndividual`) a code begins at its transition.
+    """
+    be = backend()
+    dr, UInt32 = be.dr, be.UInt32
+    level = dr.clip(on_device(analogue), 0, _opaque(spec.top_dn))
+    if transitions_dn is None:
+        code = UInt32(be.Int32(dr.round(level)))
+    else:
+        # levels with integer part k have at least low[k] transitions at or below them, and at most the greatest
+        # difference of `low` further ones
+        low = np.searchsorted(transitions_dn, np.arange(spec.top_dn + 2), side="right")
+        code = dr.gather(UInt32, UInt32(low.astype(np.uint32)), UInt32(be.Int32(level)))
+        above = on_device(np.append(transitions_dn, np.float32(np.inf)))
+        for _ in range(int(np.diff(low).max(initial=0))):
+            code = code + dr.select(dr.gather(be.Float, above, code) <= level, UInt32(1), UInt32(0))
+    if spec.missing_codes or spec.stuck_bits:
+        code = dr.gather(UInt32, UInt32(spec.codes.astype(np.uint32)), code)
+    return evaluated(code).reshape(analogue.shape).astype(np.uint16)
 
 
 def clip_full_well(electrons: F32, full_well_e: float) -> F32:
@@ -281,70 +372,29 @@ def banding_e(shape: tuple[int, int], spec: ReadoutSpec) -> F32:
     return out
 
 
-class _Chain:
-    """Follow the pixels of one exposure through the analogue chain, in a kernel that drjit compiles."""
+def _bent(dn: Any, spec: ReadoutSpec) -> Any:
+    """Apply the integral non-linearity, which has no deviation at the bias and at the top code."""
+    if not (spec.inl_quadratic_dn or spec.inl_cubic_dn):
+        return dn
+    u = (dn - _opaque(spec.bias_dn)) * _opaque(1 / (spec.top_dn - spec.bias_dn))
+    # outside the range the polynomials diverge, so the curve continues as a straight line
+    u = backend().dr.clip(u, 0, 1)
+    arc = u * (1 - u)
+    s = 4 * spec.inl_quadratic_dn + _CUBIC_SCALE * spec.inl_cubic_dn
+    return dn + arc * (_opaque(s) - _opaque(2 * _CUBIC_SCALE * spec.inl_cubic_dn) * u)
 
-    def __init__(
-        self,
-        shape: tuple[int, ...],
-        spec: ReadoutSpec,
-        noise: ReadoutNoise | None,
-        individual: ReadoutIndividual | None,
-    ) -> None:
-        height, width = shape
-        self._shape, self._spec = (height, width), spec
-        rows, columns = (np.zeros(n, dtype=np.float32) for n in shape)
-        self._pixel_e: F32 | None = None
-        if individual is not None:
-            if individual.row_e is not None:
-                rows = rows + individual.row_e
-            if individual.column_e is not None:
-                columns = individual.column_e
-            self._pixel_e = individual.pixel_e
-        if noise is not None:
-            rows = rows + noise.row * np.float32(spec.row_noise_e_rms)
-        self._row_e, self._column_e = (line if line.any() else None for line in (rows, columns))
-        self._read = None if noise is None else noise.read
 
-    def amplified(self, electrons: Any) -> Any:
-        """Return the level at the converter in DN, Float, of electrons, Float, in the order of the pixels."""
-        spec = self._spec
-        out = electrons
-        if self._pixel_e is not None:
-            out = out + on_device(self._pixel_e)
-        if self._column_e is not None:
-            out = out + self._everywhere(self._column_e)
-        if self._row_e is not None:
-            out = out + self._everywhere(self._row_e[:, None])
-        if spec.banding_seen_e:
-            out = out + on_device(banding_e(self._shape, spec))
-        if self._read is not None:
-            out = out + on_device(self._read) * _opaque(spec.noise_e_rms)
-        gains = np.array(spec.node_gains or (1.0,) * spec.nodes) * spec.system_gain_dn_per_e
-        offsets = np.array(spec.node_offsets_dn or (0.0,) * spec.nodes) + spec.bias_dn
-        if spec.nodes == 1:
-            return self._bent(out * _opaque(gains[0]) + _opaque(offsets[0]))
-        node = node_of(self._shape, spec.nodes)
-        return self._bent(out * on_device(gains[node]) + on_device(offsets[node]))
+def transitions_dn(dnl_lsb: NDArray[np.floating]) -> F32:
+    """Return the transition levels, float32[2^bits - 1], of a converter whose codes are 1 + dnl_lsb[2^bits] wide.
 
-    def _everywhere(self, values: F32) -> Any:
-        """Return values by row or by column as a device array in the order of the pixels.
-
-        A kernel that gathers them takes longer than the copy: the gather instruction of processors may be slow.
-        """
-        return on_device(np.broadcast_to(values, self._shape))
-
-    def _bent(self, dn: Any) -> Any:
-        """Apply the integral non-linearity, which has no deviation at the bias and at the top code."""
-        spec = self._spec
-        if not (spec.inl_quadratic_dn or spec.inl_cubic_dn):
-            return dn
-        u = (dn - _opaque(spec.bias_dn)) * _opaque(1 / (spec.top_dn - spec.bias_dn))
-        # outside the range the polynomials diverge, so the curve continues as a straight line
-        u = backend().dr.clip(u, 0, 1)
-        arc = u * (1 - u)
-        s = 4 * spec.inl_quadratic_dn + _CUBIC_SCALE * spec.inl_cubic_dn
-        return dn + arc * (_opaque(s) - _opaque(2 * _CUBIC_SCALE * spec.inl_cubic_dn) * u)
+    A width below 0 counts as 0: that code is missing. The widths are scaled, as in an end-point fit, so that the
+    first transition stays at half a code and the last at half a code below the top. The outermost codes have one
+    transition only, so their widths do not matter.
+    """
+    widths = np.maximum(1.0 + np.asarray(dnl_lsb, dtype=np.float64)[1:-1], 0.0)
+    if widths.size and widths.sum() > 0:
+        widths *= widths.size / widths.sum()
+    return np.concatenate([[0.5], 0.5 + np.cumsum(widths)]).astype(np.float32)
 
 
 def _opaque(value: float) -> Any:

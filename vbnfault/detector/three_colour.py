@@ -19,12 +19,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import InputError
-from ..core.quantities import RGBI, Electrons, RawDN
-from . import compiled
-from .compiled import with_luminance
+from ..core.llvm import backend, evaluated, flat
+from ..core.quantities import RGBI, Electrons
 from .efficiency import QuantumEfficiency
-from .interface import Detector, blockwise
-from .noise import NormalField, counts_of_one_mean, draw_normals, poisson_on_dark, variates_by_code
+from .interface import LUMINANCE_WEIGHTS, U8, Detector, with_luminance
+from .noise import (
+    NormalField,
+    counts_of_one_mean,
+    device_tables,
+    draw_normals,
+    poisson_of_codes,
+    poisson_on_dark,
+    variates_by_code,
+)
 
 F32 = NDArray[np.float32]
 
@@ -118,21 +125,6 @@ class ThreeColourDetector(Detector):
         """Return the signal of R, G, B in electrons that the 8 bit image shows as 255, float32[3]."""
         return np.asarray(self.full_well_e / self.gain / self.white_balance, dtype=np.float32)
 
-    def electrons(self, expected: Electrons, exposure_s: float, noise: Noise | None) -> Electrons:
-        """Return the collected electrons: add dark current, draw shot noise, clip at the full well."""
-        shot = None if noise is None else noise.shot.values()
-        return expected.with_array(blockwise(self._collector(exposure_s), expected.array, shot))
-
-    def raw_dn(self, electrons: Electrons, noise: Noise | None) -> RawDN:
-        """Return digital numbers: apply the gain, add read noise and bias, round, clip to the converter's range."""
-        read = None if noise is None else noise.read.values()
-        return RawDN(array=blockwise(self._convert, electrons.array, read).astype(np.uint16))
-
-    def rgbi(self, raw: RawDN, exposure_s: float) -> RGBI:
-        """Return 8 bit R, G, B, I: subtract bias and mean dark signal, balance white, add the luminance as I."""
-        show = self._shower(exposure_s)
-        return RGBI(array=blockwise(lambda dn: show(dn.astype(np.float32)), raw.array))
-
     @property
     def optics_key(self) -> Any:
         """Return a key of everything on which the expected electrons depend."""
@@ -177,50 +169,37 @@ class ThreeColourDetector(Detector):
                 raise ValueError(
                     f"{name} has the shape {other.shape}, and the signal {shape}: they must be the same"
                 )
-        codes = None if noise is None else noise.codes
-        known = None if base is None else (base[0].array, base[1].array)
-        image = compiled.image(curve_of(self, float(exposure_s)), expected.array, codes, known)
+        image = _curve(self, float(exposure_s)).image(
+            expected.array, noise and noise.codes, base and (base[0].array, base[1].array)
+        )
         if noise is not None and len(noise.outermost_pixels):
             beyond = noise.outermost_pixels[None]
-            light = expected.array.reshape(-1, 3)[beyond]
-            electrons = self._collector(exposure_s)(light, noise.shot.of_pixels(beyond).values())
-            dn = self._convert(electrons, noise.read.of_pixels(beyond).values())
-            image.reshape(-1, 4)[beyond] = self._shower(exposure_s)(dn)
+            shot, read = (field.of_pixels(beyond).values() for field in (noise.shot, noise.read))
+            electrons = self.collected_e(expected.array.reshape(-1, 3)[beyond], exposure_s, shot)
+            image.reshape(-1, 4)[beyond] = self.shown(self.converted_dn(electrons, read), exposure_s)
         return RGBI(array=image)
 
-    def _collector(self, exposure_s: float) -> Callable[[F32, F32 | None], F32]:
-        """Return the function that computes the collected electrons of a block."""
+    def collected_e(self, signal: F32, exposure_s: float, shot: F32 | None) -> F32:
+        """Return the collected electrons: add dark current, draw shot noise, clip at the full well."""
         dark = np.float32(self.dark_current_e_s * exposure_s)
-        full_well = np.float32(self.full_well_e)
+        mean = signal + dark if shot is None else poisson_on_dark(signal, dark, shot)
+        return np.clip(mean, 0, np.float32(self.full_well_e))
 
-        def collect(signal: F32, shot: F32 | None) -> F32:
-            mean = signal + dark if shot is None else poisson_on_dark(signal, dark, shot)
-            return np.clip(mean, 0, full_well, out=mean)  # half the time of `minimum`
-
-        return collect
-
-    def _convert(self, electrons: F32, read: F32 | None) -> F32:
-        """Return the digital numbers of electrons, as float32."""
+    def converted_dn(self, electrons: F32, read: F32 | None) -> F32:
+        """Return codes, as float32: apply the gain, add read noise and bias, round, clip to the range."""
         gain = np.float32(self.gain_dn_per_e)
         dn = electrons * gain
         if read is not None:
             dn += read * (np.float32(self.read_noise_e_rms) * gain)
-        dn += np.float32(self.bias_dn)
-        np.rint(dn, out=dn)
-        return np.clip(dn, 0, self.adc_max_dn, out=dn)
+        return np.clip(np.rint(dn + np.float32(self.bias_dn)), 0, self.adc_max_dn)
 
-    def _shower(self, exposure_s: float) -> Callable[[F32], NDArray[np.uint8]]:
-        """Return the function that computes the 8 bit image of a block."""
-        black, scale = self._black_and_scale(exposure_s)
+    def shown(self, dn: F32, exposure_s: float) -> U8:
+        """Return 8 bit R, G, B, I: subtract bias and mean dark signal, balance white, add the luminance as I."""
+        black, scale = self.black_and_scale(exposure_s)
+        # OpenCV multiplies with 64 bits, rounds to even and saturates at 0 and 255 as it converts
+        return with_luminance(np.asarray(cv2.multiply(dn - black, (*scale.tolist(), 0.0), dtype=cv2.CV_8U)))
 
-        def show(dn: F32) -> NDArray[np.uint8]:
-            # OpenCV multiplies with 64 bits, rounds to even and saturates at 0 and 255 as it converts
-            rgb = cv2.multiply(dn - black, (*scale.tolist(), 0.0), dtype=cv2.CV_8U)
-            return with_luminance(np.asarray(rgb))
-
-        return show
-
-    def _black_and_scale(self, exposure_s: float) -> tuple[np.float32, F32]:
+    def black_and_scale(self, exposure_s: float) -> tuple[np.float32, F32]:
         """Return the code that is shown as 0, and the levels per code of R, G and B, float32[3]."""
         # white is the range above the black level, so a saturated pixel stays white after a long exposure. Where
         # the dark signal alone saturates the pixels, 1 % of the range is left
@@ -229,20 +208,116 @@ class ThreeColourDetector(Detector):
         return black, (255.0 / (self.adc_max_dn - float(black)) * self.white_balance).astype(np.float32)
 
 
-@lru_cache(maxsize=8)
-def curve_of(detector: ThreeColourDetector, exposure_s: float) -> compiled.Curve:
-    """Return the numbers and tables with which a detector develops all images of an exposure."""
-    gain = np.float32(detector.gain_dn_per_e)
-    dark = np.float32(detector.dark_current_e_s * exposure_s)
-    black, scale = detector._black_and_scale(exposure_s)
-    return compiled.Curve(
-        dark_e=dark,
-        full_well_e=np.float32(detector.full_well_e),
-        gain_dn_per_e=gain,
-        read_noise_dn=np.float32(detector.read_noise_e_rms) * gain,
-        bias_dn=np.float32(detector.bias_dn),
-        adc_max_dn=np.float32(detector.adc_max_dn),
-        black_dn=black,
-        scale=scale,
-        dark_counts_e=counts_of_one_mean(float(dark), variates_by_code()),
-    )
+# --- compiled ---------------------------------------------------------------------------------------------------
+
+
+class _Curve:
+    """Turn the signals of one exposure into 8 bit levels, with intermediate results in registers.
+
+    Every value takes the steps of `ThreeColourDetector` in the same order and precision, so that it has the bits
+    that these steps give one after the other (tests/test_detector_compiled.py). Only the exponential function of
+    the Poisson sums may differ in its last bit. A count would differ for it only where a sum lies within 1e-16 of
+    one of the 65,536 quantiles of the variates.
+
+    All numbers of the sensor are device arrays: as literals they would give each exposure a kernel of its own.
+    """
+
+    def __init__(self, detector: ThreeColourDetector, exposure_s: float) -> None:
+        be = backend()
+        dark, gain = np.float32(detector.dark_current_e_s * exposure_s), np.float32(detector.gain_dn_per_e)
+        black, scale = detector.black_and_scale(exposure_s)
+        read_noise_dn = np.float32(detector.read_noise_e_rms) * gain
+        limits = np.float32(detector.full_well_e), np.float32(detector.adc_max_dn)
+        self._dark, self._gain, self._read_noise, self._bias, self._black, self._full_well, self._top = (
+            be.dr.opaque(be.Float, float(v))
+            for v in (dark, gain, read_noise_dn, np.float32(detector.bias_dn), black, *limits)
+        )
+        self._scale = [be.dr.opaque(be.Float64, float(value)) for value in scale]
+        # electrons of an unlit value by the code of its shot noise
+        self._dark_counts = be.Float(flat(counts_of_one_mean(float(dark), variates_by_code())))
+
+    def image(self, signal: F32, codes: NDArray[np.uint16] | None, base: tuple[F32, U8] | None) -> U8:
+        """Return the 8 bit levels of R, G and B, and the luminance as I, uint8[y, x, 4].
+
+        Parameters
+        ----------
+        signal
+            Expected photo-electrons, float32[y, x, 3], of at least one pixel.
+        codes
+            Codes of the variates of shot noise and of read noise, uint16[y, x, 3, 2]; None for no noise. The two
+            outermost codes stand for variates that no table holds; here they are the medians of their bins.
+        base
+            Another signal, float32[y, x, 3], and its image with the same variates, uint8[y, x, 4]. Where a value of
+            the signal is the same, its level is taken from this image.
+        """
+        be = backend()
+        dr, level = be.dr, self._noise_free_level if codes is None else self._level
+        words = be.UInt32(0) if codes is None else be.UInt32(flat(codes).view(np.uint32))
+        given = be.Float(flat(signal)), dr.arange(be.UInt32, signal.size), words
+        if base is None:
+            found = level(*given)
+        else:
+            of_base = be.UInt32(flat(base[1]).view(np.uint32))
+
+            def known(_: Any, place: Any, __: Any) -> Any:
+                pixel = place // 3
+                return dr.gather(be.UInt32, of_base, pixel) >> 8 * (place - 3 * pixel) & 0xFF
+
+            found = dr.if_stmt(given, given[0] != be.Float(flat(base[0])), level, known)
+        return _with_luminance(evaluated(be.UInt8(found))).reshape(*signal.shape[:2], 4)
+
+    def _noise_free_level(self, signal: Any, place: Any, codes: Any) -> Any:
+        return self._shown(self._charge_dn(signal + self._dark), place)
+
+    def _level(self, signal: Any, place: Any, codes: Any) -> Any:
+        """Return the 8 bit levels of signals; the low half of a word of codes is that of the shot noise."""
+        be = backend()
+        dr, lit = be.dr, signal > 0
+        electrons = dr.if_stmt(
+            (signal + self._dark, codes & 0xFFFF, lit),
+            lit,
+            poisson_of_codes,
+            lambda mean, shot, lit: dr.gather(be.Float, self._dark_counts, shot, ~lit),
+        )
+        read = dr.gather(be.Float, device_tables()[0], codes >> 16) * self._read_noise
+        return self._shown(self._charge_dn(electrons) + read, place)
+
+    def _charge_dn(self, electrons: Any) -> Any:
+        return backend().dr.clip(electrons, 0, self._full_well) * self._gain
+
+    def _shown(self, dn: Any, place: Any) -> Any:
+        be = backend()
+        dr = be.dr
+        dn = dr.clip(dr.round(dn + self._bias), 0, self._top)
+        colour = place % 3
+        scale = dr.select(colour == 0, self._scale[0], dr.select(colour == 1, self._scale[1], self._scale[2]))
+        return be.UInt32(be.Int32(dr.clip(dr.round(be.Float64(dn - self._black) * scale), 0, 255)))
+
+
+_curve = lru_cache(maxsize=8)(_Curve)
+
+
+def _with_luminance(rgb: U8) -> U8:
+    """Return `with_luminance` of R, G and B in a row, uint8[3 * pixel], as uint8[4 * pixel]."""
+    pixels = len(rgb) // 3
+    if pixels % 4:
+        return with_luminance(rgb.reshape(1, pixels, 3)).reshape(-1)
+    be = backend()
+    dr = be.dr
+    group = dr.arange(be.UInt32, pixels // 4)
+    words = be.UInt32(rgb.view(np.uint32))
+    a, b, c = (dr.gather(be.UInt32, words, 3 * group + k) for k in range(3))  # three words hold four pixels
+    four = a & 0xFFFFFF, a >> 24 | (b & 0xFFFF) << 8, b >> 16 | (c & 0xFF) << 16, c >> 8
+    out = dr.empty(be.UInt32, pixels)
+    dr.scatter(out, be.Array4u(*(pixel | _luminance_of(pixel) << 24 for pixel in four)), group)
+    array: U8 = evaluated(out).view(np.uint8)
+    return array
+
+
+def _luminance_of(pixel: Any) -> Any:
+    """Return the luminance, as UInt32, of pixels that hold R, G and B in the three lowest bytes of a word."""
+    be = backend()
+    light = be.Float(0.0)
+    for k, weight in enumerate(LUMINANCE_WEIGHTS):
+        light = be.dr.fma(be.Float(be.Int32(pixel >> (8 * k) & 0xFF)), float(weight), light)
+    return be.UInt32(be.Int32(be.dr.round(light)))

@@ -18,7 +18,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..camera import Camera
-from ..detector.readout import ReadoutSpec
 from .context import FaultContext, Params
 from .contract import Fault, with_sensor
 from .fields import Interval, Severity, bounds
@@ -65,8 +64,7 @@ class ConverterFault(Fault):
         `missing_from` and `missing_count` are in codes, `inl_quadratic_dn` and `inl_cubic_dn` in DN of the
         converter.
         """
-        detector = context.camera.mosaic
-        readout: ReadoutSpec = detector.sensor.readout
+        readout = context.camera.mosaic.sensor.readout
         # a converter with few bits lacks the less significant ones of the range
         low, high = (min(int(p), readout.bits - 1) for p in self.stuck_place)
         bits = rng.permutation(np.arange(low, high + 1))[: self.stuck_count.integer(rng)]
@@ -92,8 +90,7 @@ class ConverterFault(Fault):
 
     def alter(self, camera: Camera, params: Params) -> Camera:
         """Return the camera with this converter."""
-        detector = camera.mosaic
-        readout: ReadoutSpec = detector.sensor.readout
+        readout = camera.mosaic.sensor.readout
         first = params["missing_from"]
         missing = range(first, first + params["missing_count"])
         stuck = dict(readout.stuck_bits) | dict(params["stuck_bits"])

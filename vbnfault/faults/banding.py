@@ -18,7 +18,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..camera import Camera
-from ..detector.readout import ReadoutSpec
 from .context import FaultContext, Params
 from .contract import Fault, with_sensor
 from .fields import Interval, Severity, bounds, flag, number
@@ -73,8 +72,8 @@ class InterferenceBanding(Fault):
 
         The amplitude is the one left in the image, after double sampling.
         """
-        detector = context.camera.mosaic
-        sensor, readout = detector.sensor, detector.sensor.readout
+        sensor = context.camera.mosaic.sensor
+        readout = sensor.readout
         dn_e = readout.white_e / 255
         amplitude_e = self.amplitude_dn.uniform(rng) * dn_e
         low, high = math.log(self.frequency_hz.lo), math.log(self.frequency_hz.hi)
@@ -95,8 +94,7 @@ class InterferenceBanding(Fault):
 
     def alter(self, camera: Camera, params: Params) -> Camera:
         """Return the camera whose readout has this interference and row noise."""
-        detector = camera.mosaic
-        readout: ReadoutSpec = detector.sensor.readout
+        readout = camera.mosaic.sensor.readout
         passed = replace(readout, banding_amplitude_e=1.0, banding_frequency_hz=params["frequency_hz"])
         return with_sensor(
             camera,

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..detector.nodes import last_before, node_of, readout_steps
+from ..detector.readout import last_before, node_of, readout_steps
 from .context import FaultContext, Params
 from .contract import Fault
 from .fields import Interval, Severity, bounds, number
@@ -90,8 +90,8 @@ class ReadoutBrokenLines(Fault):
         - `register`: node and first lost pixel, or None.
         - `node`: index of the lost node, or -1.
         """
-        detector = context.camera.mosaic
-        sensor, nodes = detector.sensor, detector.sensor.readout.nodes
+        sensor = context.camera.mosaic.sensor
+        nodes = sensor.readout.nodes
         ccd = sensor.architecture != "cmos"
         count, group = self.count.integer(rng), self.group.integer(rng)
         is_row = rng.random(count) < self.row_share
@@ -137,9 +137,9 @@ class ReadoutBrokenLines(Fault):
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
         """Return the raw digital numbers with the broken lines, register and node."""
-        detector = context.camera.mosaic
-        readout = detector.sensor.readout
-        lost_dn = readout.bias_dn if detector.sensor.architecture != "cmos" else 0
+        sensor = context.camera.mosaic.sensor
+        readout = sensor.readout
+        lost_dn = readout.bias_dn if sensor.architecture != "cmos" else 0
         out = quantity.array.copy()
         for kind in KINDS:
             for axis in ("row", "column"):
@@ -157,14 +157,12 @@ class ReadoutBrokenLines(Fault):
     def footprint(self, params: Params, context: FaultContext) -> Mask:
         """Return the pixels of the image that the failures can change, bool[y, x]."""
         detector = context.camera.mosaic
-        sensor = detector.sensor
         region = _reached(params["lines"], context)
         if params["register"]:
             region |= _behind(params["register"], context)
         if params["node"] >= 0:
-            region |= node_of(context.shape, sensor.readout.nodes) == params["node"]
-        reached: Mask = detector.footprint(region)
-        return reached
+            region |= node_of(context.shape, detector.sensor.readout.nodes) == params["node"]
+        return detector.footprint(region)
 
 
 def _fail(
@@ -215,7 +213,6 @@ def _reached(lines: list[dict[str, Any]], context: FaultContext) -> Mask:
 
 def _behind(register: dict[str, int], context: FaultContext) -> Mask:
     """Return the mosaic's pixels that are read through the blocked pixel of the register, bool[y, x]."""
-    detector = context.camera.mosaic
-    nodes = detector.sensor.readout.nodes
+    nodes = context.camera.mosaic.sensor.readout.nodes
     pixels = readout_steps(context.shape, nodes)[1]
     return (node_of(context.shape, nodes) == register["node"]) & (pixels >= register["begin"])

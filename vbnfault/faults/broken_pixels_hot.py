@@ -31,7 +31,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.quantities import DEAD, HOT, RTS, RTS_HIGH, STUCK
-from ..detector.chain import Device
 from ..detector.charge import passing_dark_e
 from ..detector.effects.electrons import upper_fraction
 from ..detector.effects.output import show_stuck
@@ -132,17 +131,14 @@ class HotPixels(Fault):
         if step == "offsets":
             return quantity.with_array(quantity.array + damage.offset_e)
         if step == "raw":
-            detector = context.camera.mosaic
             raw = quantity.array.copy()
-            show_stuck(raw, damage.stuck, detector.sensor.readout.top_dn)
+            show_stuck(raw, damage.stuck, context.camera.mosaic.sensor.readout.top_dn)
             return quantity.with_array(raw)
         return self.apply(quantity, params, context)
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
         """Return the pixels of the image that a defect can change, bool[y, x]."""
-        detector = context.camera.mosaic
-        reached: NDArray[np.bool_] = detector.footprint(_damage_once(params, context).changed)
-        return reached
+        return context.camera.mosaic.footprint(_damage_once(params, context).changed)
 
     def defects(self, params: Params, context: FaultContext) -> NDArray[np.uint8]:
         """Return the kinds of the mosaic's defects that show, uint8[y, x]: bits of `quantities.DEFECTS`."""
@@ -216,7 +212,7 @@ def _damage_once(params: Params, context: FaultContext) -> _Damage:
 def _damage(params: Params, context: FaultContext) -> _Damage:
     """Return the damage that the older device has and the device of today lacks."""
     detector = context.camera.mosaic
-    device: Device = detector.device
+    device = detector.device
     own = device.individual
     old = _older(own, _ageing(own.spec, params))
     exposure_s = context.camera.exposure_s

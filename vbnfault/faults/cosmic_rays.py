@@ -99,8 +99,7 @@ class Tracks(Fault):
 
         Each track has the keys of `CosmicRays.params` and its energy in MeV.
         """
-        detector = context.camera.mosaic
-        sensor = detector.sensor
+        sensor = context.camera.mosaic.sensor
         wait_s = max(sensor.transfer.row_readout_s * context.shape[0], _LEAST_READOUT_S)
         depth_um = sensor.individual.depletion_depth_um or _ASSUMED_DEPTH_UM
         params: Params = {
@@ -125,9 +124,7 @@ class Tracks(Fault):
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
         """Return the pixels of the image that the tracks' charge can change by demosaicing, bool[y, x]."""
-        detector = context.camera.mosaic
-        reached: NDArray[np.bool_] = detector.footprint(context.once(_charge, params) > 0)
-        return reached
+        return context.camera.mosaic.footprint(context.once(_charge, params) > 0)
 
 
 def _model(params: Params, context: FaultContext) -> CosmicRayModel:
@@ -173,6 +170,5 @@ def _charge(params: Params, context: FaultContext) -> F32:
         some = CosmicRays.from_params(tracks[start : start + _TRACKS_AT_ONCE])
         index, electrons = model.deposit(some, context.shape)
         out[index] += electrons
-    detector = context.camera.mosaic
-    out[out < detector.step_e * params["least_dn"]] = 0
+    out[out < context.camera.mosaic.step_e * params["least_dn"]] = 0
     return out.reshape(context.shape)

@@ -52,15 +52,15 @@ class RadiationTraps(Fault):
 
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
         """Return the species of `parallel` and `serial` traps, with density_per_px and release_time_s of each."""
-        detector = context.camera.mosaic
-        move = detector.sensor.transfer
+        sensor = context.camera.mosaic.sensor
+        move = sensor.transfer
         params: Params = {}
         for name, density, transfer_s in (
             ("parallel", self.parallel_per_px, move.row_readout_s),
             ("serial", self.serial_per_px, move.pixel_transfer_s),
         ):
             total, fractions = density.uniform(rng), rng.dirichlet(np.ones(len(RELEASE_TRANSFERS)))
-            if detector.sensor.architecture != "cmos" and transfer_s > 0 and total > 0:
+            if sensor.architecture != "cmos" and transfer_s > 0 and total > 0:
                 params[name] = [
                     {"density_per_px": float(total * fraction), "release_time_s": float(transfers * transfer_s)}
                     for fraction, transfers in zip(fractions, RELEASE_TRANSFERS, strict=True)
@@ -71,8 +71,7 @@ class RadiationTraps(Fault):
         """Return the camera with the added traps."""
         if not params:
             return camera
-        detector = camera.mosaic
-        move = detector.sensor.transfer
+        move = camera.mosaic.sensor.transfer
         more = {
             f"{name}_traps": getattr(move, f"{name}_traps") + tuple(TrapSpecies(**row) for row in species)
             for name, species in params.items()

@@ -78,7 +78,7 @@ class TextureOverwriting(Fault):
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
         """Return the image with the texture blended in."""
-        texture, alpha = self._fitted(params, context)
+        texture, alpha = _stretch(self.texture_file, params["sha256"], context.shape)
         where = np.flatnonzero(context.once(self._mask, params))
         out = quantity.array.copy()
         flat = out.reshape(-1, 4)
@@ -97,30 +97,21 @@ class TextureOverwriting(Fault):
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
         """Return the pixels that the texture can change, bool[y, x]."""
-        mask: NDArray[np.bool_] = context.once(self._mask, params).copy()
-        return mask
-
-    def _fitted(self, params: Params, context: FaultContext) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return the texture and its alpha at the frame's size."""
-        # the parameters hold the hash of the texture, not its name, so a renamed file gives the same dataset
-        return _stretch(self.texture_file, params["sha256"], context.shape)
+        return context.once(self._mask, params).copy()
 
     def _mask(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
         """Return the pixels that the texture can change, bool[y, x]."""
-        return _mask(params, *self._fitted(params, context))
-
-
-def _mask(params: Params, texture: NDArray[np.float32], alpha: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Return the pixels that the texture can change, bool[y, x]."""
-    mask = alpha > 0
-    used = texture[..., [CHANNELS.index(c) for c in params["channels"]]]
-    if params["blend"] == "add":
-        mask &= (used > 0).any(axis=-1)
-    elif params["blend"] == "multiply":
-        mask &= (used < 255).any(axis=-1)
-    elif params["blend"] == "mixture" and params["strength"] == 0:
-        mask[:] = False
-    return mask
+        # the parameters hold the hash of the texture, not its name, so a renamed file gives the same dataset
+        texture, alpha = _stretch(self.texture_file, params["sha256"], context.shape)
+        mask = alpha > 0
+        used = texture[..., [CHANNELS.index(c) for c in params["channels"]]]
+        if params["blend"] == "add":
+            mask &= (used > 0).any(axis=-1)
+        elif params["blend"] == "multiply":
+            mask &= (used < 255).any(axis=-1)
+        elif params["blend"] == "mixture" and params["strength"] == 0:
+            mask[:] = False
+        return mask
 
 
 def _blend(v: NDArray[np.float32], t: NDArray[np.float32], blend: str, strength: float) -> NDArray[np.float32]:

@@ -73,8 +73,7 @@ class FrameTransferSmear(Fault):
 
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
         """Return the cause and the changed parameters of the transfer; {} if the cause cannot occur."""
-        detector = context.camera.mosaic
-        sensor = detector.sensor
+        sensor = context.camera.mosaic.sensor
         move = sensor.transfer
         # the number of variates must not depend on the sensor
         row_s, leak, passed = (v.uniform(rng) for v in (self.row_transfer_s, self.leak, self.shutter_share))
@@ -98,6 +97,5 @@ class FrameTransferSmear(Fault):
         """Return the camera with the changed transfer."""
         if not params:
             return camera
-        detector = camera.mosaic
         changes = {key: value for key, value in params.items() if key != "cause"}
-        return with_sensor(camera, transfer=replace(detector.sensor.transfer, **changes))
+        return with_sensor(camera, transfer=replace(camera.mosaic.sensor.transfer, **changes))

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..detector.nodes import last_before, transmission_order
+from ..detector.readout import last_before, transmission_order
 from .context import FaultContext, Params
 from .contract import Fault
 from .fields import Interval, Severity, bounds, choice

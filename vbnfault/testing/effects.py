@@ -14,7 +14,7 @@ from pydantic import ValidationError
 from ..detector import load_sensor
 from ..detector.chain import Device, MosaicNoise
 from ..detector.effects import Effect, Exposure, is_packaged, order, registry
-from .contract import naming, pickled
+from .examples import naming, pickled
 
 _MAX_DRAWS = 100
 _SHAPE = (24, 40)

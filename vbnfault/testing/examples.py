@@ -1,13 +1,14 @@
-"""Make cameras, contexts and random quantities on which a fault can be tried."""
+"""Make cameras, contexts and random quantities on which a fault can be tried; name the example that breaks it."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+import pickle
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..camera import Camera, focal_length_mm
 from ..core.quantities import (
@@ -110,7 +111,10 @@ def random_quantity(step: str, context: FaultContext, seed: int = 0) -> Quantity
         relative = rng.uniform(0, 2, (*context.shape, len(white_e))).astype(np.float32)
         return Electrons(array=relative * white_e, white_e=white_e)
     if step == "rgbi":
-        return RGBI(array=_random_bytes(rng, context.shape))
+        image = rng.integers(0, 256, (*context.shape, 4), dtype=np.uint8)
+        image[::7, ::5] = 0
+        image[::5, ::7] = 255
+        return RGBI(array=image)
     readout = context.camera.mosaic.sensor.readout
     if step == "raw":
         return RawMosaic(array=rng.integers(0, readout.top_dn + 1, context.shape, dtype=np.uint16))
@@ -119,9 +123,19 @@ def random_quantity(step: str, context: FaultContext, seed: int = 0) -> Quantity
     return Charge(array=rng.uniform(0, 2 * readout.full_well_e, context.shape).astype(np.float32))
 
 
-def _random_bytes(rng: np.random.Generator, shape: tuple[int, int]) -> NDArray[np.uint8]:
-    """Return random R, G, B and I, uint8[y, x, 4], with zeros and full pixels among them."""
-    array = rng.integers(0, 256, (*shape, 4), dtype=np.uint8)
-    array[::7, ::5] = 0
-    array[::5, ::7] = 255
-    return array
+@contextlib.contextmanager
+def naming(title: str, example: str) -> Iterator[None]:
+    """Turn every error of a block into an AssertionError that names the class and the example that breaks it."""
+    try:
+        yield
+    except Exception as error:
+        text = str(error) if isinstance(error, AssertionError) else f"raised {type(error).__name__}: {error}"
+        raise AssertionError(f"{title}: {text} ({example})") from error
+
+
+def pickled(value: Any) -> Any:
+    """Return a value as another process gets it. Raises AssertionError if it cannot be pickled."""
+    try:
+        return pickle.loads(pickle.dumps(value))
+    except (pickle.PicklingError, AttributeError) as error:
+        raise AssertionError(f"cannot be pickled: {error}; define its class at the top of a module") from None

@@ -23,8 +23,7 @@ from ..faults import (
     physical_order,
     registry,
 )
-from .contract import naming, pickled
-from .examples import CCDS, draw_context, random_quantity, with_mosaic
+from .examples import CCDS, draw_context, naming, pickled, random_quantity, with_mosaic
 
 _PLAIN = (dict, list, str, int, float, bool, type(None))
 _MAX_DRAWS = 100

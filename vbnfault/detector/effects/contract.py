@@ -43,7 +43,7 @@ from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 from ...core.registry import DeclarationError, Registry, chained, is_name
 from ...core.tables import Table, did_you_mean
 from ..individual import stream
-from ..nodes import node_of
+from ..readout import node_of
 
 if TYPE_CHECKING:
     from ..chain import Device, MosaicNoise

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import compiled
 from ..charge import passing_dark_e
 from ..dark import Telegraph, silicon_factor
+from ..noise import poisson
 from .contract import F32, Effect, Exposure, FaultStep
 
 
@@ -66,7 +66,7 @@ class ShotNoise(Effect):
 
     def apply(self, signal: F32, exposure: Exposure) -> F32:
         """Return the collected electrons; without noise, the expected ones."""
-        return signal if exposure.noise is None else compiled.poisson(signal, exposure.noise.shot)
+        return signal if exposure.noise is None else poisson(signal, exposure.noise.shot)
 
 
 class ChargeStep(FaultStep):

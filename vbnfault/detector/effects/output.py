@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..converter import convert
 from ..individual import StuckPixels
-from ..readout import ReadoutIndividual, analogue_dn, clip_full_well, read_out
+from ..readout import ReadoutIndividual, analogue_dn, clip_full_well, convert
 from .contract import F32, Effect, Exposure, FaultStep
 
 Raw = NDArray[np.uint16]
@@ -66,12 +65,6 @@ class RawStep(FaultStep):
 
     name = "raw"
     after = "stuck_pixels"
-
-
-def full_well_to_codes(signal: F32, exposure: Exposure) -> Raw:
-    """Return what `FullWell`, `Analogue` and `Conversion` give one after the other, in one kernel."""
-    noise = None if exposure.noise is None else exposure.noise.readout
-    return read_out(signal, exposure.sensor.readout, noise, _with_offsets(exposure))
 
 
 def _with_offsets(exposure: Exposure) -> ReadoutIndividual:
