@@ -207,6 +207,16 @@ def test_four_nodes_read_each_half_to_its_own_side() -> None:
     assert charge[19, 20] == charge[44, 43] == charge[20, 19] == charge[43, 44] == 0
 
 
+def test_a_shutter_that_lets_light_through_smears() -> None:
+    light = np.zeros((64, 64), np.float32)
+    light[20, 30] = 5000.0
+    device = Device(ccd("full_frame_ccd", shutter_transmission=0.02), 1, shape=(64, 64))
+    dark = device.expected_e(0 * light, 0.01)
+    got = device.expected_e(light, 0.01) - dark
+    np.testing.assert_allclose(got[21:, 30], 5000 / 0.01 * 1e-3 * 0.02, rtol=1e-3)
+    np.testing.assert_allclose(got[:20, 30], 0, atol=1e-3)
+
+
 def test_a_global_shutter_lets_light_onto_charge_that_waits() -> None:
     """leak × rate × i row times, from the first row read on; none of it with a rolling shutter."""
     light = np.full((64, 64), 5000.0, np.float32)
@@ -217,6 +227,14 @@ def test_a_global_shutter_lets_light_onto_charge_that_waits() -> None:
         gained = device.expected_e(light, 0.05) - light - 40.0 * 0.05
         wanted = 5000 / 0.05 * leak * 1e-3 * np.arange(64)[:, None]
         np.testing.assert_allclose(gained, np.repeat(wanted, 64, axis=1), atol=1e-2)
+
+
+def test_a_devices_lines_have_their_pattern() -> None:
+    readout = replace(sensor().readout, column_pattern_e_rms=50.0, row_pattern_e_rms=20.0, full_well_e=4000.0)
+    device = Device(sensor(readout=readout), 1, shape=SHAPE)
+    raw = device.raw(np.full(SHAPE, 2000.0, np.float32), 0.01) / readout.system_gain_dn_per_e
+    assert raw.mean(axis=0).std() == pytest.approx(50.0, rel=0.2)
+    assert raw.mean(axis=1).std() == pytest.approx(20.0, rel=0.2)
 
 
 def test_the_chain_is_in_physical_order() -> None:
@@ -258,6 +276,16 @@ def test_telegraph_signals_of_a_device_are_in_its_charge() -> None:
     signals = device.individual.rts.at(293.0)
     dark = device.collected_e(np.zeros((64, 64), np.float32), 10.0)
     assert dark.sum() == pytest.approx(10 * (signals.amplitude_e_s * signals.duty).sum(), rel=1e-4)
+
+
+def test_smear_follows_the_direction_of_readout() -> None:
+    light = np.zeros((64, 64), np.float32)
+    light[20, 30] = 5000.0
+    made = sensor(architecture="frame_transfer_ccd", transfer=Transfer(row_transfer_s=1e-5))
+    for direction, behind in (("up", slice(21, None)), ("down", slice(0, 20))):
+        got = Device(made, 1, shape=(64, 64), direction=direction).expected_e(light, 0.01)[:, 30] - 0.4
+        assert got[behind].min() > 4
+        assert np.delete(got, np.r_[np.arange(64)[behind], 20]).max() < 0.1
 
 
 def test_intensity_is_what_pixels_without_a_filter_see() -> None:
@@ -351,14 +379,23 @@ def test_a_dark_signal_that_fills_the_well_gives_white_and_not_black() -> None:
             {"readout": {"bits": 20}, "sources": {"readout.bits": "x"}},
             ["d.toml: readout.bits = 20", "1 to 16"],
         ),
+        ({"readout": {"bits": "12"}}, ["d.toml: readout.bits = '12'", "whole number"]),
         ({"individual": {"prnuu": 0.1}}, ["d.toml: individual.prnuu: unknown key", "did you mean prnu?"]),
+        ({"readout": {"bits": 12}, "sources": {"readout.bits": " "}}, ["d.toml: sources", "readout.bits"]),
         ({"pixel_pitch_um": 0.0, "sources": {"pixel_pitch_um": "x"}}, ["d.toml: pixel_pitch_um = 0", "0.5 to 100"]),
+        ({"individual": []}, ["d.toml: individual = []", "must be"]),
         ({"pattern": []}, ["d.toml: pattern = []", "must be"]),
+        ({"correct_defects": ["yes"]}, ["d.toml: correct_defects = ['yes']", "must be"]),
+        (_one("individual", "years", [1.0, 2.0]), ["d.toml: individual.years = [1.0, 2.0]", "must be"]),
+        (_one("individual", "rts_time_s", 3.0), ["d.toml: individual.rts_time_s = 3.0", "must be"]),
+        (_one("readout", "stuck_bits", [["x"]]), ["d.toml: readout.stuck_bits[0]", "must be"]),
         (
             _one("readout", "node_offsets_dn", [float("nan")]),
             ["readout.node_offsets_dn[0] = nan", "finite"],
         ),
         (_one("transfer", "leak", 3.5), ["d.toml: transfer.leak = 3.5", "from 0 to 1"]),
+        (_one("transfer", "row_transfer_s", -1.0), ["d.toml: transfer.row_transfer_s = -1", "at least 0"]),
+        (_one("transfer", "parallel_traps", [3]), ["d.toml: transfer.parallel_traps[0] = 3", "must be"]),
         (
             {"architecture": "full_frame_ccd"}
             | _one("transfer", "serial_traps", [{"density_per_px": 1.0, "release_time_s": 1.0}]),

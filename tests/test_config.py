@@ -17,7 +17,7 @@ from vbnfault import faults
 from vbnfault.core import resources, tables
 from vbnfault.core.errors import InputError
 from vbnfault.detector import ThreeColourDetector
-from vbnfault.scene import keyed_random
+from vbnfault.scene import config, keyed_random
 from vbnfault.scene.config import Scene, load_scene, parse_scene
 from vbnfault.scene.hashing import content_hash
 
@@ -51,6 +51,7 @@ TITLE = 'title = "t"\n'
     ("text", "must_say"),
     [
         ("", ["scene file is empty"]),
+        ("\n", ["title", "missing"]),
         ("[camera]\nfov_deg = 30", ["title", "missing"]),
         ("title = 3", ["title = 3", "string"]),
         # unknown keys, with a hint where one is close
@@ -68,20 +69,31 @@ TITLE = 'title = "t"\n'
         (TITLE + '[camera]\nfov_deg = "65"', ["camera.fov_deg = '65':", "number", "0.01 to 140"]),
         (TITLE + "[dataset]\nseed = 1e3", ["dataset.seed = 1000.0:", "whole number"]),
         (TITLE + "camera = 3", ["camera = 3:", "must be"]),
+        (TITLE + "[[camera]]\nfov_deg = 3", ["camera =", "must be"]),
         (TITLE + '[dataset]\nlayers = "clean"', ["dataset.layers = 'clean':", "must be"]),
         (TITLE + "[sun]\njulian_date = 2014-11-12", ["sun.julian_date", "2014-11-12", "number"]),
         # ranges
         (TITLE + "[plan]\nclasses_per_sample = [0, 3]", ["plan.classes_per_sample", "= 0:", "1 to 64"]),
+        (TITLE + "[geometry]\nheight_m = [-3, 1]", ["geometry.height_m", "= -3:", "from 0"]),
         (TITLE + "[camera]\nexposure_s = 2e4", ["exposure_s = 20000.0:", "'auto'", "at most 10000"]),
+        (TITLE + "[camera]\nexposure_s = 0", ["exposure_s = 0", "'auto'", "above 0"]),
         (TITLE + "[render]\nsamples_per_pixel = 8", ["samples_per_pixel = 8:", "1, 4, 16, 64"]),
         # names
+        (TITLE + '[plan]\nmode = "x"', ["plan.mode = 'x':", "'per_class' or 'per_sample'"]),
         (TITLE + '[camera]\nresponse = "foo"', ["response = 'foo':", "nikon_5100"]),
+        (TITLE + '[camera]\narchitectures = ["cmoss"]', ["camera.architectures", "'cmoss'", "'cmos'"]),
         (TITLE + '[body]\nreflectance = "foo"', ["reflectance = 'foo':", "67p"]),
         (TITLE + '[dataset]\nlayers = ["foo"]', ["dataset.layers", "'foo'", "depth_m", "without_"]),
         # a converter without a code above that of no light
         (TITLE + "[camera]\nadc_bits = 8\nbias_dn = 300", ["bias_dn = 300:", "from 0 to 254", "adc_bits = 8"]),
+        (TITLE + "[camera]\nadc_bits = 9\nbias_dn = 511", ["bias_dn = 511:", "from 0 to 510", "adc_bits = 9"]),
         # reversed bounds
         (TITLE + "[geometry]\nx_m = [3, 1]", ["geometry.x_m = [3, 1]:", "reversed"]),
+        (
+            TITLE + "[geometry.sun_facing]\nroll_deg = [5, 1]",
+            ["geometry.sun_facing.roll_deg = [5, 1]:", "reversed"],
+        ),
+        (TITLE + "[plan]\nclasses_per_sample = [4, 3]", ["plan.classes_per_sample = [4, 3]:", "reversed"]),
         (TITLE + '[dataset]\nlayers = ["clean", "clean"]', ["dataset.layers = ", "clean is named twice"]),
         (
             TITLE + "[camera]\nexposure_min_s = 3\nexposure_max_s = 1",
@@ -93,12 +105,16 @@ TITLE = 'title = "t"\n'
         ),
         # not TOML
         (TITLE + "x = ", ["not a TOML file"]),
+        (TITLE + TITLE, ["not a TOML file"]),
         ('title = "a\n', ["not a TOML file", "line 1"]),
         (b"\xff\xfe\x00", ["not a TOML file"]),
         # shapes and sums
+        (TITLE + "[geometry]\nx_m = [3]", ["geometry.x_m = [3]"]),
         (TITLE + "[geometry]\nx_m = 3", ["geometry.x_m = 3:", "two"]),
         (TITLE + "[body]\nsemi_axes_m = [0, 1, 1]", ["body.semi_axes_m[0] = 0:", "1e+09"]),
+        (TITLE + '[camera]\nexposure_s = "fast"', ["exposure_s = 'fast'", "'auto'"]),
         (TITLE + "[dataset]\nsplit = {train = 0.5}", ["train", "0.5"]),
+        ("title = 2020-01-01", ["title"]),
         (TITLE + '"a\\nb" = 1', ["unknown key"]),
     ],
 )
@@ -161,6 +177,12 @@ def test_every_number_is_accepted_at_its_bounds() -> None:
                 extra |= {"detector": "x"} if key in ("individuals", "detector_temperature_K") else {}
                 scene = parse_scene({"title": "t", table: {key: value, **extra}}, source="here")
                 assert getattr(getattr(scene, table), key) == value
+
+
+@pytest.mark.parametrize(("bits", "bias"), [(8, 254), (10, 1000)])
+def test_a_bias_below_the_largest_number_leaves_a_gain(bits: int, bias: int) -> None:
+    camera = parse_scene({"title": "t", "camera": {"adc_bits": bits, "bias_dn": bias}}, source="here").camera
+    assert ThreeColourDetector(adc_bits=camera.adc_bits, bias_dn=camera.bias_dn).gain_dn_per_e > 0
 
 
 @pytest.mark.parametrize("bias", [-1, 255, 4096])
@@ -288,6 +310,12 @@ def test_paths_count_from_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert load_scene(write(folder, TITLE + '[body]\nshape = "embedded"')).body.shape == "embedded"
 
 
+def test_a_scene_cannot_be_edited() -> None:
+    scene = parse_scene({"title": "t"}, source="here")
+    with pytest.raises(ValueError, match="frozen"):
+        scene.camera.fov_deg = 3.0  # type: ignore[misc]
+
+
 # -------------------------------------------------------------------------------------------- packaged scenes
 
 
@@ -379,6 +407,33 @@ def test_the_models_own_defaults_are_the_papers_bounds() -> None:
 # ------------------------------------------------------------------------------------------------ JSON schema
 
 
+def test_json_schema_describes_the_scene_file() -> None:
+    schema = json.loads(json.dumps(config.json_schema(faults.json_schema())))
+    assert schema["$schema"].endswith("2020-12/schema")
+    assert schema["required"] == ["title"]
+    assert schema["additionalProperties"] is False
+    assert set(schema["properties"]) == set(Scene.model_fields)
+    assert set(schema["properties"]["faults"]["properties"]) == set(faults.registry())
+    fov = schema["$defs"]["CameraTable"]["properties"]["fov_deg"]
+    assert (fov["type"], fov["minimum"], fov["maximum"], fov["default"]) == ("number", 0.01, 140, 65)
+
+    def walk(node: Any) -> None:
+        if isinstance(node, dict):
+            if "$ref" in node:  # no reference leads nowhere
+                assert node["$ref"].rsplit("/", 1)[-1] in schema["$defs"]
+            if node.get("type") == "object" and "properties" in node:
+                assert node.get("additionalProperties") is False
+            if "minimum" in node and "maximum" in node:
+                assert node["minimum"] < node["maximum"]
+            for value in node.values():
+                walk(value)
+        elif isinstance(node, list):
+            for value in node:
+                walk(value)
+
+    walk(schema)
+
+
 # -------------------------------------------------------------------------------------------------- hash, rng
 
 
@@ -405,6 +460,19 @@ def test_content_hash_tells_everything_apart() -> None:
     assert content_hash(base) == content_hash({"b": [1, 2], "a": 1})
 
 
+def test_hash_of_a_scene_follows_every_number_of_it() -> None:
+    plain = load_scene("quickstart").resolved()
+    reference = content_hash(plain)
+    for table, key, schema in schema_numbers():
+        value = plain[table][key]
+        if isinstance(value, int | float):
+            changed = {
+                **plain,
+                table: {**plain[table], key: value + (1 if schema["type"] == "integer" else 1e-9)},
+            }
+            assert content_hash(changed) != reference, (table, key)
+
+
 def test_rng_is_keyed_by_all_four_and_by_nothing_else() -> None:
     first = keyed_random.rng(1, 2, "stage", "name").random(4)
     keyed_random.rng(9, 9, "other", "draws").random(1000)  # what else is drawn, and when, does not matter
@@ -419,6 +487,16 @@ def test_rng_is_keyed_by_all_four_and_by_nothing_else() -> None:
     ]
     drawn = {tuple(keyed_random.rng(*key).random(4)) for key in keys} | {tuple(first)}
     assert len(drawn) == len(keys) + 1
+
+
+def test_rng_streams_of_neighbours_are_uniform_and_uncorrelated() -> None:
+    # first number of 6000 streams that differ in the sample only, against those of the next name
+    n = 6000
+    a, b = (np.array([keyed_random.rng(3, i, "fault", name).random() for i in range(n)]) for name in ("x", "y"))
+    assert stats.kstest(a, "uniform").pvalue > 1e-4
+    # a correlation of independent numbers has the spread 1/√n: 4.5 of it is 7e-6 two-sided
+    for pair in ((a, b), (a[:-1], a[1:])):
+        assert abs(np.corrcoef(*pair)[0, 1]) < 4.5 / np.sqrt(n)
 
 
 SAMPLES = np.arange(100_000)
@@ -440,6 +518,14 @@ def test_keyed_uniform_is_uniform() -> None:
                 assert stats.chisquare(cells.ravel()).pvalue > 1e-4 / 36
                 tests += 2
     assert tests == 36
+
+
+def test_keyed_uniform_uses_its_low_bits() -> None:
+    # 53 bits: each is set in half of the numbers, 4.5 standard deviations of √(n/4)
+    bits = (keyed_random.keyed_uniform(5, SAMPLES, "plan", "x") * 2.0**53).astype(np.uint64)
+    for b in range(53):
+        ones = int(((bits >> np.uint64(b)) & np.uint64(1)).sum())
+        assert abs(ones - len(SAMPLES) / 2) < 4.5 * np.sqrt(len(SAMPLES) / 4)
 
 
 def test_keyed_uniform_is_independent_across_names_seeds_and_stages() -> None:

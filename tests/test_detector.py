@@ -429,3 +429,59 @@ def test_the_paper_worlds_detector_is_what_it_was() -> None:
     np.testing.assert_allclose(blocks[:, 1, 1], [36.38, 114.29, 191.95, 251.06], atol=0.02)
     np.testing.assert_allclose(blocks[2, 2], [191.71, 191.56, 12.82, 178.70], atol=0.02)
     np.testing.assert_allclose(d.white_balance, [1.4455802, 1.0, 1.3421254], rtol=1e-6)  # under TSIS-1 HSRS
+
+
+@pytest.mark.parametrize("mean", MEANS)
+def test_poisson_quantile_of_random_variates_is_poisson(mean: float) -> None:
+    n = 300_000
+    normal = np.random.default_rng([7, int(10 * mean)]).standard_normal(n, dtype=np.float32)
+    counts = poisson_quantile(np.full(n, mean, np.float32), normal)
+    assert counts.dtype == np.float32
+    np.testing.assert_array_equal(counts, np.rint(counts))
+    assert counts.min() >= 0
+    # spread of a mean √(m/n); of a variance √((2 + 1/m)/n) of itself. The stated errors (0.001 e, at 1e5
+    # 0.005 e; 0.05 %) are far below both
+    assert abs(counts.mean(dtype=np.float64) - mean) < 4 * np.sqrt(mean / n)
+    assert counts.var(dtype=np.float64) == pytest.approx(mean, rel=4 * np.sqrt((2 + 1 / mean) / n))
+    # cells of about 1/30 of the probability, none expected fewer than 5 times
+    edges = np.unique(stats.poisson.ppf(np.linspace(0, 1, 31)[1:-1], mean))
+    cdf = np.concatenate([[0], stats.poisson.cdf(edges, mean), [1]])
+    expected = n * np.diff(cdf)
+    observed = np.bincount(np.searchsorted(edges, counts), minlength=len(expected))
+    keep = expected > 5
+    merged = [np.append(v[keep], v[~keep].sum()) if not keep.all() else v for v in (observed, expected)]
+    if merged[1][-1] == 0:
+        merged = [v[:-1] for v in merged]
+    assert stats.chisquare(*merged).pvalue > 1e-3 / len(MEANS)
+
+
+def test_poisson_does_not_depend_on_neighbours_or_layout() -> None:
+    rng = np.random.default_rng(2)
+    mean = (10 ** rng.uniform(-1, 4, (30, 40))).astype(np.float32)
+    z = rng.standard_normal((30, 40), dtype=np.float32)
+    together = poisson_quantile(mean, z)
+    alone = [poisson_quantile(m[None], v[None])[0] for m, v in zip(mean.ravel(), z.ravel(), strict=True)]
+    np.testing.assert_array_equal(together.ravel(), alone)
+    np.testing.assert_array_equal(poisson_quantile(np.asfortranarray(mean), np.asfortranarray(z)), together)
+    np.testing.assert_array_equal(poisson_quantile(mean.T, z.T), together.T)
+
+
+def test_white_is_where_255_begins() -> None:
+    detector = ThreeColourDetector(dark_current_e_s=0)
+    for share, value in ((1.0, 255), (0.5, 127.5)):
+        white = Electrons(
+            array=np.broadcast_to(share * detector.white_e, (4, 4, 3)).astype(np.float32),
+            white_e=detector.white_e,
+        )
+        image = detector.develop(white, SHORT_S, None).array
+        # a code is 255/4031/wb of a step wide: half a code and half a step
+        assert np.abs(image.astype(float) - value).max() <= 0.5 + 0.5 * 255 / 4031 * float(
+            detector.white_balance.max()
+        )
+
+
+@pytest.mark.parametrize(("bits", "bias", "full_well"), [(12, 64, 13_500.0), (8, 0, 1000.0), (16, 500, 100_000.0)])
+def test_gain_takes_the_full_well_to_the_top_code(bits: int, bias: int, full_well: float) -> None:
+    detector = ThreeColourDetector(adc_bits=bits, bias_dn=bias, full_well_e=full_well)
+    assert detector.adc_max_dn == 2**bits - 1
+    assert detector.gain_dn_per_e * full_well + bias == pytest.approx(2**bits - 1)

@@ -36,11 +36,17 @@ def test_colours_have_their_curves_white_none_and_near_infrared_a_long_pass() ->
     np.testing.assert_allclose(found[4], [0, 0, 0, 0, 0.2, 0.4])
 
 
+def test_a_curve_of_a_file_takes_the_place_of_the_default() -> None:
+    own = Curve(channel="W", wavelength_nm=(500.0, 600.0, 700.0), value=(0.2, 0.6, 0.4))
+    found = QuantumEfficiency(channels=("W",), curves=(own,)).at(np.array([499.0, 500.0, 550.0, 650.0, 701.0]))
+    np.testing.assert_allclose(found, [[0, 0.2, 0.4, 0.5, 0]])
+
+
 def test_sensor_files_may_give_curves() -> None:
     rows = [{"channel": "W", "wavelength_nm": [400, 500, 700], "value": [0.91, 0.93, 0.86]}]
     table: dict[str, Any] = {"pattern": "mono", "quantum_efficiency": rows}
     sensor = parse_sensor(completed({**table, "sources": {"quantum_efficiency": "assumed"}}), source="x.toml")
-    np.testing.assert_allclose(sensor.efficiency.at(np.array([399.0, 450.0, 701.0])), [[0, 0.92, 0]])
+    np.testing.assert_allclose(sensor.efficiency.at(np.array([450.0])), [[0.92]])
     hash(sensor)  # devices are kept by their sensor
 
 

@@ -235,6 +235,15 @@ def test_params_restore_the_image_bit_for_bit(diffusion_um: float) -> None:
     assert (image_of(model, other, (200, 300)) != image_of(model, rays, (200, 300))).any()
 
 
+def test_tracks_do_not_know_each_other() -> None:
+    rays = MODEL.draw((100, 100), 3000.0, np.random.default_rng(6))
+    alone = sum(
+        image_of(MODEL, CosmicRays.from_params([row]), (100, 100)).astype(np.float64) for row in rays.params
+    )
+    # sums of a few float32 per pixel
+    np.testing.assert_allclose(image_of(MODEL, rays, (100, 100)), alone, rtol=1e-6, atol=1e-9)
+
+
 # --------------------------------------------------------------------------------- diffusion
 
 

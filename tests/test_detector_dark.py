@@ -133,6 +133,15 @@ def test_damage_of_an_individual_follows_the_law_and_so_does_each_further_dose()
 # --- hot pixels -------------------------------------------------------------------------------------------------
 
 
+def test_growth_laws_as_published() -> None:
+    assert APS_GROWTH.per_yr_mm2(1.0, 1.0) == pytest.approx(10**-1.13, rel=1e-12)
+    assert CCD_GROWTH.per_yr_mm2(1.0, 1.0) == pytest.approx(10**-1.849, rel=1e-12)
+    assert APS_GROWTH.per_yr_mm2(2.0, 1.0) / APS_GROWTH.per_yr_mm2(4.0, 1.0) == pytest.approx(2**3.05, rel=1e-12)
+    assert CCD_GROWTH.per_yr_mm2(2.0, 1.0) / CCD_GROWTH.per_yr_mm2(4.0, 1.0) == pytest.approx(2**2.25, rel=1e-12)
+    assert APS_GROWTH.per_yr_mm2(2.0, 400.0) / APS_GROWTH.per_yr_mm2(2.0, 100.0) == pytest.approx(4**0.505)
+    assert CCD_GROWTH.per_yr_mm2(2.0, 400.0) / CCD_GROWTH.per_yr_mm2(2.0, 100.0) == pytest.approx(4**0.687)
+
+
 @pytest.mark.parametrize("pitch", [2.2, 5.5, 10.0])
 @pytest.mark.parametrize("growth", [APS_GROWTH, CCD_GROWTH], ids=["aps", "ccd"])
 def test_counts_of_hot_pixels(growth: HotPixelGrowth, pitch: float) -> None:
@@ -371,6 +380,20 @@ def test_offsets_with_heavy_tails_follow_students_t() -> None:
         IndividualSpec(dsnu_freedom=2.0)
 
 
+def test_same_seed_same_device_other_seed_another() -> None:
+    a, b, c = sensor(BUSY, 3), sensor(BUSY, 3), sensor(BUSY, 4)
+    for name in ("gain", "dsnu_e", "dark_e_s", "damage_e_s"):
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+        assert (getattr(a, name) != getattr(c, name)).mean() > 0.1  # undamaged pixels stay at 0
+    for kind in KINDS:
+        one, same, other = (arrays(getattr(made, kind)) for made in (a, b, c))
+        for name, values in one.items():
+            assert len(values) > 5
+            np.testing.assert_array_equal(values, same[name])
+            n = min(len(values), len(other[name]))
+            assert (values[:n] != other[name][:n]).any()
+
+
 def test_one_property_leaves_the_others_alone() -> None:
     made = sensor(BUSY)
     changes: dict[str, set[str]] = {
@@ -424,6 +447,13 @@ def test_ageing_keeps_every_earlier_defect() -> None:
     apart = aged(young, years=20.0, hot_clustered_share=0.0)
     np.testing.assert_array_equal(apart.hot.row[: len(young.hot)], young.hot.row)
     assert (apart.hot.row[len(young.hot) :] != old.hot.row[len(young.hot) : len(apart.hot)]).any()
+
+
+def test_annealing_lowers_the_damage_of_radiation() -> None:
+    fresh = sensor(IndividualSpec(dose_TeV_g=300.0, hot_growth=None))
+    healed = aged(fresh, anneal_s=5e6)
+    ratio = annealing_factor(5e6) / annealing_factor(dark.WEEK_S)
+    np.testing.assert_allclose(healed.damage_e_s, fresh.damage_e_s * np.float32(ratio), rtol=1e-6)
 
 
 def test_dark_rate_over_temperature() -> None:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from vbnfault.core.errors import InputError
+from vbnfault.detector import demosaic as module
 from vbnfault.detector.demosaic import (
     bounded_at_edges,
     correct_defects,
@@ -69,7 +70,7 @@ def test_near_infrared_replaces_the_second_green() -> None:
     assert nir.channels == ("R", "G", "B", "NIR")
 
 
-# tiles of a user, also a high one
+# tiles of a user: their heights divide no power of two, or are larger than the blocks that are copied at a time
 SIX = Pattern(name="six", channels=("R", "W"), tile=((0, 1, 1, 1, 1, 1), *(((1,) * 6,) * 5)))
 TALL = Pattern(name="tall", channels=("R", "W"), tile=((0,),) * 3 + ((1,),) * 67)
 
@@ -131,6 +132,13 @@ def test_one_defect_spreads_by_the_published_bilinear_kernel_in_its_own_plane(
     assert rgb.dtype == np.float32
 
 
+def test_malvar_kernels_keep_flat_fields_and_their_symmetry() -> None:
+    for kernel in (module.MALVAR_GREEN, module.MALVAR_ALONG_ROW, module.MALVAR_ACROSS):
+        assert kernel.sum() == 1
+        np.testing.assert_array_equal(kernel, kernel[::-1])
+        np.testing.assert_array_equal(kernel, kernel[:, ::-1])
+
+
 @pytest.fixture(scope="module")
 def oracle() -> ModuleType:
     with warnings.catch_warnings():
@@ -173,6 +181,31 @@ def test_a_flat_colour_stays_flat_up_to_the_borders(name: str, method: str) -> N
         np.testing.assert_allclose(rgb, np.broadcast_to(expected, rgb.shape), rtol=2e-6)
 
 
+@pytest.mark.parametrize("name", ["rggb", "gbrg", "rgb_nir"])
+def test_bilinear_reproduces_planes_that_rise_linearly(name: str) -> None:
+    p = pattern(name)
+    y, x = np.indices((24, 30), dtype=np.float32)
+    planes = np.stack([3 * x + 5 * y + 7, 11 * x - 2 * y + 90, 4 * y - x + 60, 6 * x + 8], axis=-1)
+    raw = sample(planes[..., : len(p.channels)], p)
+    rgb = demosaic(raw, p)
+    # single-filter planes interpolate between pixels two apart; the borders extrapolate and do not
+    np.testing.assert_allclose(rgb[2:-2, 2:-2], planes[2:-2, 2:-2, :3], rtol=2e-6)
+
+
+@pytest.mark.parametrize("name", BAYER)
+@pytest.mark.parametrize("axis", [0, 1])
+def test_menon_interpolates_along_edges(name: str, axis: int) -> None:
+    # a grey scene that varies along one axis only, without any smoothness, is measured whole along the other:
+    # the right direction gives it back, to rounding of the thirds. Rounding alone would leave 0.01 of 1000
+    profile = np.random.default_rng(5).integers(0, 1000, 40).astype(np.float32)
+    grey = np.broadcast_to(profile[:, None] if axis == 0 else profile, (40, 40))
+    raw = sample(np.repeat(grey[..., None], 3, axis=2), pattern(name))
+    error = {m: np.abs(demosaic(raw, pattern(name), m) - grey[..., None]).max() for m in METHODS}
+    assert error["menon"] < 1e-3
+    assert error["bilinear"] > 100
+    assert error["malvar"] > 100
+
+
 @pytest.mark.parametrize(("name", "method"), FITTING)
 def test_measured_values_stay_and_the_mosaic_is_not_edited(name: str, method: str) -> None:
     p = pattern(name)
@@ -204,6 +237,16 @@ def test_monochrome_is_the_plane_itself() -> None:
     raw = random_raw()
     np.testing.assert_array_equal(demosaic(raw, pattern("mono")), np.repeat(raw[..., None], 3, axis=2))
     np.testing.assert_array_equal(interpolate(raw, pattern("mono"), "W"), raw)
+
+
+@pytest.mark.parametrize("name", ["rggb", "GBRG"])
+def test_interpolated_bayer_channels_are_the_bilinear_ones_inside(name: str) -> None:
+    # normalised convolution by the narrowest tent is bilinear interpolation: only the borders differ
+    raw = random_raw()
+    rgb = demosaic(raw, pattern(name))
+    for index, channel in enumerate("RGB"):
+        plane = interpolate(raw, pattern(name), channel)
+        np.testing.assert_allclose(plane[2:-2, 2:-2], rgb[2:-2, 2:-2, index], rtol=2e-6)
 
 
 def edges(shape: tuple[int, int] = (40, 44)) -> list[np.ndarray]:

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_faults_kit import make, make_context, noisy, rng, with_mosaic
+from test_faults_kit import flat_electrons, make, make_context, noisy, rng, with_mosaic
 
-from vbnfault.core.quantities import Charge
+from vbnfault.core.quantities import Charge, Electrons
 from vbnfault.faults import FaultContext
 
 FULL_WELL_E = 40_000.0
@@ -39,6 +39,18 @@ def test_a_column_by_hand() -> None:
     assert len(changed) == 5
 
 
+def test_nothing_exceeds_the_full_well_and_charge_is_kept() -> None:
+    c = context()
+    fault = make("blooming")
+    params = fault.draw(c, rng(1))
+    charge = np.zeros(c.shape, np.float32)
+    charge[20:24, 5:9] = rng(2).uniform(0, 2 * FULL_WELL_E, (4, 4))
+    out = fault.apply(Charge(array=charge), params, c).array
+    assert 0.7 * FULL_WELL_E <= params["full_well_e"] <= 0.95 * FULL_WELL_E
+    assert out.max() <= params["full_well_e"] * (1 + 1e-6)
+    assert out.sum(dtype=float) == pytest.approx(charge.sum(dtype=float), rel=1e-6)
+
+
 def test_a_lost_drain() -> None:
     c = context(drain=1.0)
     detector: Any = c.camera.detector
@@ -64,3 +76,23 @@ def test_nothing_on_cmos() -> None:
     charge = noisy("charge", c)
     assert params == {}
     assert fault.apply(charge, params, c) is charge
+
+
+def test_it_shows_in_a_picture() -> None:
+    c = context("interline_ccd")
+    detector: Any = c.camera.detector
+    fault = make("blooming", full_well_share=0.5)
+    params = fault.draw(c, rng())
+    dark, white = flat_electrons(c, 0.02), detector.white_e
+    light = dark.array.copy()
+    light[28:36, 20:28] = 0.9 * white
+    noise = detector.draw_noise(c.shape, lambda name: rng(len(name)))
+    expected = Electrons(array=light, white_e=white)
+    acts = {"charge": [lambda a: fault.apply(Charge(array=a), params, c).array]}
+    before, after = (detector.develop(expected, 0.01, noise, a).array[..., 3].astype(int) for a in ({}, acts))
+    rise = after - before
+    assert rise[26, 20:28].mean() > 10  # above the spot
+    assert rise[37, 20:28].mean() > 10  # below it
+    assert rise[30:34, 22:26].mean() < -10  # its wells hold less
+    assert not rise[:, :16].any()
+    assert not rise[:, 32:].any()

@@ -64,3 +64,10 @@ def test_contradicting_counts_are_refused() -> None:
         make("broken_lines", count=5, white_count=6)
     with pytest.raises(InputError, match=r"faults\.broken_lines\.white_count = 1\.5: must be a whole number"):
         make("broken_lines", white_count=1.5)
+
+
+def test_values_are_a_fair_coin() -> None:
+    context = make_context(64)
+    values = [v for s in range(300) for v in make("broken_lines", count=5).draw(context, rng(s))["row_values"]]
+    # 1500 tosses: standard deviation 19.4; four of them
+    assert abs(values.count(255) - 750) < 78

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from test_faults_kit import make, make_context, rng, with_mosaic
 
+from vbnfault.core.quantities import Electrons
 from vbnfault.faults import FaultContext
 
 FULL_WELL_E = 40_000.0
@@ -93,3 +94,21 @@ def test_nothing_where_there_is_no_transfer(architecture: str, transfer: dict[st
     fault = make("cti")
     assert fault.draw(c, rng()) == {}
     assert fault.alter(c.camera, {}) is c.camera
+
+
+def test_it_shows_in_a_picture() -> None:
+    c = context("frame_transfer_ccd")
+    fault = make("cti", parallel_per_px=100)  # over 64 rows as 6 over 1024
+    camera = fault.alter(c.camera, fault.draw(c, rng()))
+    white = camera.detector.white_e
+    light = np.zeros((*c.shape, 3), np.float32)
+    light[24:40, 24:40] = 0.5 * white
+    noise: Any = c.camera.detector.draw_noise(c.shape, lambda name: rng(len(name)))  # type: ignore[union-attr]
+    before, after = (
+        k.detector.develop(Electrons(array=light, white_e=white), 0.01, noise).array[..., 3].astype(int)
+        for k in (c.camera, camera)
+    )
+    change = (after - before)[:, 26:38].mean(axis=1)
+    assert change[40] > 3  # the first of the trail below
+    assert change[24] < -2  # the first row of the square lost most
+    assert np.abs(change[:20]).max() < 1

@@ -47,6 +47,15 @@ def test_the_sun_is_clipped_to_white_first() -> None:
     assert np.count_nonzero(blurred[..., 0]) == 17**2
 
 
+def test_flat_stays_flat() -> None:
+    context = make_context(256)
+    fault = make("optics_degradation")
+    params = fault.draw(context, rng())
+    flat = flat_electrons(context, 0.5)
+    assert np.allclose(fault.apply(flat, params, context).array, flat.array, rtol=1e-6, atol=0)
+    assert fault.footprint(params, context).all()  # type: ignore[union-attr]
+
+
 def test_sizes_are_odd_and_fill_the_table() -> None:
     context = make_context(1024, 8)
     sizes = {make("optics_degradation").draw(context, rng(s))["filter_size_px"] for s in range(200)}

@@ -20,6 +20,8 @@ from vbnfault.core.registry import undoing_registrations
 from vbnfault.detector.interface import with_luminance
 from vbnfault.detector.mosaic import pattern
 from vbnfault.faults import (
+    MOSAIC_STEPS,
+    STEPS,
     Fault,
     dataset_order,
     from_dict,
@@ -58,6 +60,17 @@ def test_contract(name: str, model: str, required: dict[str, dict[str, Any]]) ->
     check_fault(registry()[name][model], required=required.get(name), examples=examples)
 
 
+@pytest.mark.parametrize(("name", "model"), MODELS)
+def test_defaults_are_within_limits(name: str, model: str, required: dict[str, dict[str, Any]]) -> None:
+    fault = from_dict(name, required.get(name, {}) | {"model": model}, source="test.toml")
+    assert (fault.fault, fault.model) == (name, model)
+    assert fault.steps[0] == fault.step
+    assert set(fault.steps) <= set(STEPS)
+    assert fault.needs_mosaic >= bool(set(fault.steps) & set(MOSAIC_STEPS))
+    for f in dataclasses.fields(fault):
+        assert f.metadata["doc"]
+
+
 @pytest.mark.parametrize(("name", "model", "key"), WITH_BOUNDS)
 def test_bad_bounds_are_refused(name: str, model: str, key: str, required: dict[str, dict[str, Any]]) -> None:
     f = registry()[name][model].__dataclass_fields__[key]
@@ -94,6 +107,18 @@ def test_unknown_class_and_model_are_refused() -> None:
         from_dict("vigneting", {}, source="test.toml")
     with pytest.raises(InputError, match=r"faults\.vignetting\.model = 'cos5': must be one of"):
         from_dict("vignetting", {"model": "cos5"}, source="test.toml")
+
+
+@pytest.mark.parametrize(("name", "model"), MODELS)
+def test_params_are_plain(name: str, model: str, required: dict[str, dict[str, Any]]) -> None:
+    def check(value: Any) -> None:
+        assert type(value) in (dict, list, str, int, float, bool, type(None)), type(value)
+        for item in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
+            check(item)
+
+    fault = from_dict(name, required.get(name, {}) | {"model": model}, source="test.toml")
+    context = make_context(96, sun=(30.0, 20.0))
+    check(fault.draw(with_mosaic(context) if fault.needs_mosaic else context, np.random.default_rng(0)))
 
 
 @pytest.mark.parametrize(
@@ -188,6 +213,16 @@ def test_contradictory_declarations_are_refused(classes: dict[str, dict[str, Any
     with pytest.raises(TypeError, match=sentence):
         declare_all()
     assert registry() == known
+
+
+def test_a_model_has_to_be_a_frozen_dataclass() -> None:
+    @undoing_registrations()
+    def declare_it() -> None:
+        type("Bare", (Fault,), {"fault": "x", "model": "one", "step": "rgbi", "default": True, "after": "adc"})
+        registry()
+
+    with pytest.raises(TypeError, match=r"x/one: .* @dataclass\(frozen=True, kw_only=True\)"):
+        declare_it()
 
 
 def test_json_schema_names_every_key() -> None:

@@ -576,6 +576,24 @@ def test_every_number_of_the_command_line_has_both_limits_and_is_refused_beyond_
                 option.parser(bad)
 
 
+@pytest.mark.parametrize("value", ["nan", "inf", "-inf", "1e400", "361"])
+def test_angles_that_are_none_are_refused(value: str, tmp_path: Path) -> None:
+    arguments = [
+        "flare",
+        "tessar_50_f2p8",
+        "--out",
+        str(tmp_path / "f.png"),
+        "--sun-deg",
+        "10",
+        "--azimuth-deg",
+        value,
+    ]
+    done = command(*arguments, "--pixels", "16")
+    assert done.returncode == 2
+    assert "--azimuth-deg" in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("text", ["abc", "-1", "1.5", "9" * 400, "٣"])
 def test_a_number_of_threads_that_is_none_is_refused(text: str, monkeypatch: pytest.MonkeyPatch) -> None:
     from vbnfault.store import codec

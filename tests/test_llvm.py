@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import ctypes
 import os
 import pickle
 import subprocess
@@ -97,19 +98,35 @@ def test_the_variable_comes_first_then_the_wheel_then_the_system_newest_first(
 
 
 def test_candidates_keep_the_order_and_name_each_library_once(fake_libraries: Looked, tmp_path: Path) -> None:
-    found = fake_libraries(c=(15, 0, 7), a=(16, 0, 0), b=(17, 0, 6))
+    found = fake_libraries(a=(18, 1, 0), b=(17, 0, 6), c=(15, 0, 7))
     link = tmp_path / "link.so"
-    link.symlink_to(found[1][1])
+    link.symlink_to(found[0][1])
     found.append(("again", link))
     found.append(("gone", tmp_path / "gone.so"))
     got = list(llvm.candidates())
     assert [(c.origin, c.version, c.usable) for c in got] == [
-        ("c", (15, 0, 7), False),
-        ("a", (16, 0, 0), True),
+        ("a", (18, 1, 0), True),
         ("b", (17, 0, 6), True),
+        ("c", (15, 0, 7), False),
         ("gone", None, False),
     ]
-    assert llvm.find() == got[1]
+    assert llvm.find() == got[0]
+
+
+@pytest.mark.parametrize(("version", "usable"), [((14, 0, 6), False), ((15, 0, 7), False), ((16, 0, 0), True)])
+def test_the_oldest_usable_version_is_16(
+    version: tuple[int, int, int], usable: bool, fake_libraries: Looked
+) -> None:
+    fake_libraries(some=version)
+    (candidate,) = llvm.candidates()
+    assert candidate.version == version
+    assert candidate.usable is usable
+    assert usable or str(version[0]) in candidate.problem
+
+
+def test_the_first_usable_one_is_taken_whatever_comes_before(fake_libraries: Looked) -> None:
+    fake_libraries(a=(14, 0, 0), b=(19, 1, 7), c=(23, 1, 0))
+    assert llvm.find().origin == "b"
 
 
 def test_prepare_points_drjit_to_it(fake_libraries: Looked) -> None:
@@ -168,6 +185,14 @@ def test_an_unusable_variable_is_passed_over_with_a_reason(
     assert real_candidate().origin != llvm.VARIABLE
 
 
+def test_a_library_without_the_symbol_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert not hasattr(ctypes.CDLL(str(NOT_LLVM)), "LLVMGetVersion")
+    monkeypatch.setenv(llvm.VARIABLE, str(NOT_LLVM))
+    candidate = next(iter(llvm.candidates()))
+    assert candidate.version is None
+    assert "16" in candidate.problem
+
+
 @pytest.mark.parametrize(
     ("name", "major"),
     [
@@ -192,6 +217,17 @@ def test_old_versions_are_refused_by_name_without_loading(
         assert candidate.version == (major, 0, 0)
         assert not candidate.usable
         assert f"version {major}" in candidate.problem
+
+
+@pytest.mark.parametrize("name", ["libLLVM-16.so", "libLLVM.so.18.1", "libLLVM-19.so.1", "libLLVM.so", "other.so"])
+def test_newer_and_unversioned_names_are_loaded_to_ask(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    forbid_loading(monkeypatch)
+    (tmp_path / name).write_bytes(b"")
+    monkeypatch.setattr(llvm, "_paths", lambda: iter([("system", tmp_path / name)]))
+    with pytest.raises(AssertionError, match="was loaded"):
+        list(llvm.candidates())
 
 
 # --------------------------------------------------------------------------------------------- nothing usable

@@ -121,6 +121,16 @@ def test_a_sensor_with_an_effect_of_a_plugin_is_characterised(tmp_path: Path) ->
     assert json.loads((out / "emva1288.json").read_text())["effects"] == {"pedestal": {"level_e": 2000.0}}
 
 
+def test_a_plugin_that_defines_a_known_reflectance_is_refused(tmp_path: Path) -> None:
+    plugin(tmp_path, GROUND.replace("glazed", "lambert"), "my_ground.py")
+    with pytest.raises(
+        InputError,
+        match=r"my_ground.py': .*ground reflectance lambert is defined twice: in .*disc.*py and in .*my_ground.py",
+    ):
+        config.load_scene(scene_file(tmp_path, "my_ground.py", faults=""))
+    assert config.load_scene(scene_file(tmp_path, faults="")).body.photometry.model == "lambert"
+
+
 # --- one name, one definition ---------------------------------------------------------------------------------
 
 GLASS = """

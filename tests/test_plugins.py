@@ -320,12 +320,20 @@ BROKEN = {
         EFFECT.replace('    after = "dark_current"\n', ""),
         r"detector effect class Afterglow: states no after \(my_glint.py, line 5\)",
     ),
+    "effect without name": (
+        EFFECT.replace('    name = "afterglow"\n', ""),
+        r"effect class Afterglow: states no name \(my_glint.py, line 5\)",
+    ),
     "effect without all": (
         EFFECT[: EFFECT.index("    name")] + "    pass\n",
         r"effect class Afterglow: states no name, states no after, has no method apply \(my_glint.py, line 5\)",
     ),
     "effect without apply": (EFFECT.replace("def apply", "def aply"), r"Afterglow: has no method apply \(my_gl"),
     "effect with a typed name": (EFFECT.replace("name =", "name: str ="), r"write name: ClassVar\[str\] = \.\.\. "),
+    "effect with a space": (
+        EFFECT.replace('"afterglow"', '"after glow"'),
+        r"name = 'after glow': must be lower",
+    ),
     "law without name": (
         LAW.replace('    model: Literal["law"] = "law"\n', ""),
         r"ground reflectance class Law: states no model \(my_glint.py, line 7\)",
@@ -339,9 +347,19 @@ BROKEN = {
         GLINT.replace('"glint"', '"dust_on_optics"').replace('"square"', '"gaussian"'),
         r"fault model dust_on_optics/gaussian is defined twice: in .*dust.py and in .*my_glint.py",
     ),
+    "default": (GLINT.replace('"glint"', '"vignetting"'), r"default = True, but vignetting/cos4 is the default"),
     "order": (GLINT.replace('"straylight"', '"strailight"'), r"after = 'strailight': .* \(did you mean straylight"),
+    "circle": (
+        GLINT.replace('"straylight"', '"glint"'),
+        r"fault class: what glint state by `after` runs in a circle",
+    ),
+    "step": (GLINT.replace('"electrons"', '"light", "raw"'), r"my_glint.py, line"),
     "no step": (GLINT.replace('    step = "electrons"\n', ""), r"fault model glint/square: states no step"),
     "no dataclass": (GLINT.replace("@dataclass(frozen=True, kw_only=True)\n", ""), r"must be decorated with @data"),
+    "field": (
+        GLINT.replace("level: Interval = bounds", "x: int = 3\n    level: Interval = bounds"),
+        r"x must be dec",
+    ),
 }
 
 
