@@ -21,7 +21,7 @@ from vbnfault.dataset.identity import plan_numbers, stored_plan
 from vbnfault.dataset.statistics import statistics
 from vbnfault.scene import config, plan
 from vbnfault.scene.config import Scene
-from vbnfault.scene.retaken_plan import make_retaken_plan
+from vbnfault.scene.plan import make_retaken_plan
 from vbnfault.store import disk
 
 LAYERS = ["clean", "depth_m", "normal", "semantic", "mask_effect", "without_straylight", "scene_radiance"]

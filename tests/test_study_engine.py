@@ -487,12 +487,12 @@ def test_distributions_go_to_values_and_back() -> None:
     for factor in spec.factors[:3]:
         values = factor.values(u)
         np.testing.assert_allclose(values[[0, -1]], [factor.low, factor.high], rtol=1e-12)
+        assert (np.diff(values) > 0).all()
         assert values.min() >= factor.low
         assert values.max() <= factor.high
-        np.testing.assert_allclose(factor.points(values), u, atol=1e-9)
     uniform, logarithmic, normal, categorical = spec.factors
     assert uniform.values(0.5) == 2.0
     assert logarithmic.values(0.5) == pytest.approx(1.0)
     assert normal.values(normal.nominal()) == pytest.approx(1.0)
     assert list(categorical.values([0.0, 0.34, 0.99, 1.0])) == ["x", 2.5, "z", "z"]
-    np.testing.assert_allclose(categorical.points(["x", 2.5, "z"]), [1 / 6, 0.5, 5 / 6])
+    np.testing.assert_allclose(categorical.points(), [1 / 6, 0.5, 5 / 6])

@@ -38,9 +38,8 @@ from .rendering import (
     surroundings,
     with_body,
 )
-from .resolve import references_L
+from .resolve import in_local_frame, references_L
 from .session import Session
-from .sight import in_local_frame
 from .spec import Frame, Pose, Rendering, SampleSpec, SceneLight, Terrain
 from .stages import simulate_stored_view
 

@@ -3,7 +3,7 @@
     render ▶ metered light ▶ ghosts, starburst, glare, veil ▶ metrics
 
 A view is rendered once; optics, Sun and detector act on its radiance. The results of each stage are kept with all
-that the stage depends on (`kept`), a few of them at a time, so that the result of an evaluation does not depend on
+that the stage depends on (`_Kept`), a few of them at a time, so that the result of an evaluation does not depend on
 those before it. In a Sobol design the points AB differ from their point A in one factor, so most of their stages
 are found there.
 
@@ -17,11 +17,14 @@ of field of the render are those of the nominal lens.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
-from collections.abc import Callable, Hashable, Mapping, Sequence
+import time
+from collections import Counter, OrderedDict
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +32,7 @@ from numpy.typing import NDArray
 from ..camera import Camera
 from ..core import spectra
 from ..core.errors import InputError, in_file, shown
+from ..core.shared_results import SharedResults
 from ..core.spectra import Bands
 from ..core.tables import did_you_mean
 from ..faults import Fault, FaultContext
@@ -44,11 +48,20 @@ from ..pipeline.resolve import resolve
 from ..pipeline.session import Session
 from ..pipeline.spec import Injection, SampleSpec
 from ..scene.config import Scene, configure_faults
-from . import chosen_fault, image_metrics
+from . import image_metrics
 from . import navigation_metrics as nav
-from .factors import Factors, Setting, StudyScene, base_scene, changed_scene
+from .factors import (
+    FAULT_KEY,
+    FAULT_SCENE_KEY,
+    Factors,
+    Setting,
+    StudyScene,
+    acting_faults,
+    base_scene,
+    changed_scene,
+    fault_choices,
+)
 from .image_metrics import LitImage
-from .kept import Kept
 from .spec import Evaluation, Metric, StudySpec
 from .views import (
     CleanView,
@@ -64,6 +77,10 @@ from .views import (
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
+T = TypeVar("T")
+
+# How many results of each stage are kept beside those of the base row A of a Sobol design; default: two.
+_KEPT = {"render": 1}
 _NAVIGATION: Mapping[str, Metric] = {metric.name: metric for metric in nav.METRICS}
 
 
@@ -83,7 +100,7 @@ class SceneEvaluator:
 
     def __init__(self, spec: StudySpec) -> None:
         self.spec = spec
-        self.kept = Kept()
+        self.kept = _Kept()
         self._source = f"study {shown(spec.title)}"
         self._session: tuple[Hashable, Session] | None = None
         with in_file(self._source):
@@ -94,10 +111,10 @@ class SceneEvaluator:
                 plain = [self.scene_of(self._base.dataset.seed, model) for model in spec.models.compare]
             # a session also draws the plan of its scene and checks its faults
             cameras = [Session(made.scene, source=self._source).base_camera for made in plain]
-            self._chosen_faults = chosen_fault.choices(spec)
+            self._chosen_faults = fault_choices(spec)
             for choice in self._chosen_faults:
-                made = self.scene_of(spec.scene.seeds[0], "", ((chosen_fault.SCENE_KEY, choice),))
-                configure_faults(made.scene, f"{chosen_fault.KEY} = {choice!r}")
+                made = self.scene_of(spec.scene.seeds[0], "", ((FAULT_SCENE_KEY, choice),))
+                configure_faults(made.scene, f"{FAULT_KEY} = {choice!r}")
             self._nominal_camera = camera = cameras[0]
             adding = [name for made in plain for name, f in made.faults.items() if f.soft_layer.endswith("_added")]
             self._adding = adding[0] if adding else ""  # the fault that adds light
@@ -136,7 +153,7 @@ class SceneEvaluator:
         _ = self.metrics
         places: dict[str, set[str]] = {}
         for i, factor in enumerate(self.spec.factors):
-            if factor.key == chosen_fault.KEY:
+            if factor.key == FAULT_KEY:
                 continue  # a fault need not act in the first view
             try:
                 places[factor.key] = self._places_without(factor)
@@ -174,7 +191,7 @@ class SceneEvaluator:
     def _acts(self, model: str, point: Mapping[str, float | str], key: str, value: float | str) -> bool:
         """Return whether another value of a factor changes a bit of the light at a point, with any chosen fault."""
         for choice in self._chosen_faults or ("",):
-            at = {**point, chosen_fault.KEY: choice} if choice else point
+            at = {**point, FAULT_KEY: choice} if choice else point
             with self.kept.holding("check"):
                 base = self._fingerprint(model, at)
             if self._fingerprint(model, {**at, key: value}) != base:
@@ -229,7 +246,7 @@ class SceneEvaluator:
             if self._chosen_faults:
                 raise InputError(
                     f"metrics.names: {name!r} measures the straylight of the scene; "
-                    f"with the factor {chosen_fault.KEY} use metrics of navigation: {', '.join(_NAVIGATION)}"
+                    f"with the factor {FAULT_KEY} use metrics of navigation: {', '.join(_NAVIGATION)}"
                 )
             if not self._adding:
                 raise InputError(
@@ -417,7 +434,7 @@ class SceneEvaluator:
                 spec = replace(clean.spec, scene=made.scene, faults=made.faults)
                 view = spec, clean.pose, clean.rendering, clean.exposure
                 if first is None:
-                    chosen = chosen_fault.acting(made.faults, spec, clean.pose) if self._chosen_faults else None
+                    chosen = acting_faults(made.faults, spec, clean.pose) if self._chosen_faults else None
                     first = injection = inject_faults(*view, commanded=chosen)
                     if self._chosen_faults and not first.draws:
                         return []
@@ -429,7 +446,7 @@ class SceneEvaluator:
 
     def _clean_views(self, evaluation: Evaluation, setting: Setting, count: int) -> _CleanSequence:
         """Return the first `count` views of an evaluation's sequence without faults."""
-        without = replace(setting, scene={k: v for k, v in setting.scene.items() if k != chosen_fault.SCENE_KEY})
+        without = replace(setting, scene={k: v for k, v in setting.scene.items() if k != FAULT_SCENE_KEY})
         made = self._scene(evaluation, without)
         view = self._view(evaluation, made)
         key = made.render_key, evaluation.view, count
@@ -512,3 +529,85 @@ def _added_by(fault: Fault, exposed: Exposed, params: Any) -> dict[str, Any]:
     added = np.ascontiguousarray(np.moveaxis(image, -1, 0)) - exposed.clean
     light = {"kept": exposed.clean, "direct": exposed.direct_e, "added": np.maximum(added, 0)}
     return {**light, "parts_e": {}, "ghosts_e": ()}
+
+
+# --- results of stages -------------------------------------------------------------------------------------------
+
+
+class _Kept:
+    """Keep the last results of each stage, and count and time the computations.
+
+    Attributes
+    ----------
+    events
+        How often each stage was computed.
+    seconds
+        How long that took.
+    """
+
+    def __init__(self) -> None:
+        self.events: Counter[str] = Counter()
+        self.seconds: dict[str, float] = {}
+        self._results: dict[str, OrderedDict[Hashable, Any]] = {}
+        self._held: dict[str, set[tuple[str, Hashable]]] = {}
+        self._holder: str | None = None
+
+    @contextlib.contextmanager
+    def holding(self, holder: str) -> Iterator[None]:
+        """Hold what a block uses until the next block of the same holder, in place of what that one used."""
+        self._held[holder], self._holder = set(), holder
+        try:
+            yield
+        finally:
+            self._holder = None
+
+    def once(self, stage: str, key: Hashable, make: Callable[[], T], part: str = "") -> T:
+        """Return `make()` for a key, from the last results of the stage where it was computed before.
+
+        `part` separates results of one stage that have keys of their own.
+        """
+        name = f"{stage}/{part}"
+        results = self._results.setdefault(name, OrderedDict())
+        if self._holder is not None:
+            self._held[self._holder].add((name, key))
+        if key not in results:
+            with self.timed(stage):
+                results[key] = make()
+            if not part:
+                self.events[stage] += 1
+        value: T = results[key]
+        results.move_to_end(key)
+        held = set().union(*self._held.values())
+        loose = [other for other in results if (name, other) not in held]
+        for other in loose[: max(len(loose) - _KEPT.get(stage, 2), 0)]:
+            del results[other]
+        return value
+
+    def release(self, holder: str) -> None:
+        """Stop holding what a block used."""
+        self._held.pop(holder, None)
+
+    @contextlib.contextmanager
+    def timed(self, stage: str) -> Iterator[None]:
+        """Add the duration of a block to a stage."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
+
+    def of_view(self, view: Hashable) -> SharedResults:
+        """Return results of the pipeline's stages that evaluations with an equal `view` share."""
+        return _OfView(self, view)
+
+
+class _OfView(SharedResults):
+    """Keep the results of one view among those of all views."""
+
+    def __init__(self, kept: _Kept, view: Hashable) -> None:
+        super().__init__(kept=True)
+        self._all, self._view = kept, view
+
+    def once(self, name: str, key: Hashable, make: Callable[[], T]) -> T:
+        """Return `make()` for a name and a key, from the last results where it was computed before."""
+        return self._all.once(name, (self._view, key), make, "view")

@@ -48,10 +48,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from . import chosen_fault, ranking
+from . import ranking
 from .bootstrap import bootstrap
 from .control_variates import LEAST_SAMPLES, Surrogates, fit, make_basis
 from .designs import Design, levels, salib, unit_problem
+from .factors import FAULT_KEY, fault_choices
 from .sobol_terms import SobolTerms, complete_samples, explained_variance, ratios, sobol_terms, split
 from .spec import DUMMY, Metric
 
@@ -112,7 +113,7 @@ def compute(results: Results) -> xr.Dataset:
         _add_ranges(arrays, results)
     if spec.models is not None and method in ("sobol", "latin_hypercube", "grid"):
         _add_model_share(arrays, results)
-    if chosen_fault.KEY in spec.keys:
+    if FAULT_KEY in spec.keys:
         ranking.add(arrays, results)
     names = [*spec.keys, DUMMY]
     coordinates: dict[str, Any] = {
@@ -122,8 +123,8 @@ def compute(results: Results) -> xr.Dataset:
         "factor_b": names,
         "seed": list(spec.scene.seeds),
         "bound": ["low", "high"],
-        "fault": list(chosen_fault.choices(spec)),
-        "fault_b": list(chosen_fault.choices(spec)),
+        "fault": list(fault_choices(spec)),
+        "fault_b": list(fault_choices(spec)),
         "quantile": list(ranking.QUANTILES),
     }
     used = {name for dims, _ in arrays.values() for name in dims}
