@@ -338,6 +338,7 @@ def test_of_half_a_store_the_finished_samples_are_taken(
     # once the old store is complete, the new one keeps to its samples
     half._write_done(0, {0, 1, 2, 3})
     assert retake(half.path, scene, new).finished == 6
+    assert retake(half.path, scene, new, overwrite=True).samples == 8
 
 
 # --- bad input -------------------------------------------------------------------------------------------------

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -257,19 +256,6 @@ def test_each_stored_sample_is_taken_as_often_as_the_variants_say(
         retake._repeats(opened, scene, "scene")
 
 
-@pytest.mark.parametrize(
-    ("numbers", "ranges"),
-    [
-        ([0], [[0, 0]]),
-        ([1, 2, 3], [[1, 3]]),
-        ([0, 2, 3, 5], [[0, 0], [2, 3], [5, 5]]),
-        ([4, 7, 8], [[4, 4], [7, 8]]),
-    ],
-)
-def test_numbers_of_samples_are_written_as_ranges(numbers: list[int], ranges: list[list[int]]) -> None:
-    assert store.runs(numbers) == ranges
-
-
 def test_the_checksum_of_the_old_store_is_that_of_the_samples_taken(finished_store: Any) -> None:
 
     opened = store.open_store(finished_store)  # shards of 4 samples
@@ -296,23 +282,3 @@ def test_the_radiance_before_the_lens_and_without_stars_is_used(
 ) -> None:
     spec: Any = SimpleNamespace(layers=layers)
     assert retake._radiance_layer(spec, {"scene": scene}) == layer
-
-
-@pytest.mark.parametrize(("overwrite", "taken"), [(False, [1, 2]), (True, [0, 1, 2, 3])])
-def test_a_store_that_has_begun_keeps_its_samples_unless_it_is_replaced(
-    overwrite: bool, taken: list[int], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    finished: Any = SimpleNamespace(
-        begun=lambda: [0],
-        done=lambda _: dict.fromkeys(range(4), True),
-        samples=4,
-        path="s.zarr",
-        attributes={"blocks": [4]},
-    )
-    begun = SimpleNamespace(attributes={retake.RETAKE: {"samples": [[1, 2]]}})
-    monkeypatch.setattr(retake.store, "is_store", lambda _: True)
-    monkeypatch.setattr(retake.store, "open_store", lambda _: begun)
-    options: Any = SimpleNamespace(overwrite=overwrite)
-    assert retake._samples(finished, Path("new.zarr"), options).tolist() == taken
-    noted = ["s.zarr: 2 of 4 samples are taken, those that were finished"]
-    assert caplog.messages == ([] if overwrite else noted)

@@ -291,8 +291,7 @@ def _on_the_trajectory(spec: SampleSpec, flown: FlownPose) -> Pose:
             f"clearance, or the body.shape that the {made_for} were made for"
         )
     needs_sun = any(spec.faults[name].needs_sun for name in spec.commanded_in_view)
-    sees_sun = pose.sun_visible_fraction == 1.0 and float(pose.L_from_C[:, 2] @ pose.sun_L) > 0
-    return replace(pose, resolved=sees_sun or not needs_sun)
+    return replace(pose, resolved=pose.sees_sun or not needs_sun)
 
 
 # --- a camera that aims: on the shape model first, then on the terrain that is made for the pose ------------

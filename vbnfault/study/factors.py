@@ -247,9 +247,8 @@ def acting_faults(faults: Mapping[str, Fault], spec: SampleSpec, pose: Pose) -> 
     Those that need the Sun act as in a dataset: where the view is one of those that face the Sun, and the whole Sun
     is before the camera. A trajectory has no such views, so there the Sun alone decides.
     """
-    ahead = pose.sun_visible_fraction == 1 and float(pose.L_from_C[:, 2] @ pose.sun_L) > 0
     faces = spec.scene.is_flown or spec.plan.stratum[spec.index] == plan.SUN_FACING
-    return [name for name, fault in faults.items() if (ahead and faces) or not fault.needs_sun]
+    return [name for name, fault in faults.items() if (pose.sees_sun and faces) or not fault.needs_sun]
 
 
 # --- scenes ------------------------------------------------------------------------------------------------------

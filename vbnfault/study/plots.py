@@ -42,7 +42,7 @@ from ..core.figures import (
 from ..core.html_page import number_text, with_minus
 from ..faults import registry
 from .ranking import QUANTILES
-from .response_plots import NOISE, panel_width, responses, tornado
+from .response_plots import NOISE, responses, rows_of_factors, tornado
 from .summaries import DUMMY, StudyResults
 
 F64 = NDArray[np.float64]
@@ -143,7 +143,6 @@ def indices(results: StudyResults, metric: str) -> tuple[Figure, str] | None:
     if not drawn:
         return None
     shares, order = drawn[0].is_fraction, [*results.ranked(metric), DUMMY]
-    labels = [wrapped(factor) for factor in order]
     values = np.asarray([[_intervals(results, metric, m, s.name, order) for s in drawn] for m in results.models])
     exponent = 0 if shares else axis_exponent(values)
     values /= 10.0**exponent
@@ -152,14 +151,8 @@ def indices(results: StudyResults, metric: str) -> tuple[Figure, str] | None:
     if not shares:
         label = with_unit("μ*", results.about(metric, "unit"), exponent)
     handles: list[Any] = [Line2D([], [], lw=1.5, label=s.label, **s.style) for s in drawn]
-    with panels(
-        metric,
-        (1, len(results.models)),
-        (panel_width(results), row_height(labels) * len(order)),
-        legend=[*handles, NOISE] if results.has_noise_floor else handles,
-        heads=results.models,
-    ) as (figure, axes):
-        label_rows(axes, labels, separate_last=True)
+    legend = [*handles, NOISE] if results.has_noise_floor else handles
+    with rows_of_factors(results, metric, order, legend, separate_last=True) as (figure, axes):
         for one, model, of_model in zip(axes, results.models, values, strict=True):
             one.set_xlim(low, high)
             one.set_xlabel(label)
@@ -217,7 +210,6 @@ def seeds(results: StudyResults, metric: str) -> tuple[Figure, str] | None:
     if series is None or results.dataset.sizes.get("seed", 1) < 2:
         return None
     order = [*results.ranked(metric), DUMMY]
-    labels = [wrapped(factor) for factor in order]
     every = results.dataset[f"{series.name}_by_seed"].sel(metric=metric, factor=order)
     pooled = np.stack([_intervals(results, metric, model, series.name, order) for model in results.models])
     exponent = 0 if series.is_fraction else axis_exponent(every.values)
@@ -230,14 +222,7 @@ def seeds(results: StudyResults, metric: str) -> tuple[Figure, str] | None:
     if len(numbers) <= 6:
         handles += [Line2D([], [], ms=4, label=f"seed {n}", **m) for m, n in zip(marks, numbers, strict=True)]
     label = series.label if series.is_fraction else with_unit("μ*", results.about(metric, "unit"), exponent)
-    with panels(
-        metric,
-        (1, len(results.models)),
-        (panel_width(results), row_height(labels) * len(order)),
-        legend=handles,
-        heads=results.models,
-    ) as (figure, axes):
-        label_rows(axes, labels, separate_last=True)
+    with rows_of_factors(results, metric, order, handles, separate_last=True) as (figure, axes):
         y = np.arange(len(order))
         for one, model, (_, low, high) in zip(axes, results.models, pooled / unit, strict=True):
             one.set_xlim(*_index_limits(every.values / unit, pooled / unit, series.is_fraction))

@@ -218,14 +218,6 @@ def _middle(resampled: F64) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def error_with_interval(errors: Sequence[float] | F64, quantile: float) -> tuple[float, float, float]:
-    """Return the quantile over views of an error, and its 95 % interval by a bootstrap over the views."""
-    finite = np.array([error for error in errors if np.isfinite(error)])
-    if not len(finite):
-        return np.nan, np.nan, np.nan
-    return float(np.quantile(finite, quantile)), *_middle(_quantiles_of_resamples(finite, quantile))
-
-
 # --- the whole table ---------------------------------------------------------------------------------------------
 
 

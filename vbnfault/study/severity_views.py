@@ -150,7 +150,7 @@ def _views(spec: SampleSpec, count: int, facing_sun: bool) -> Iterator[CleanView
     """Render the views of a sequence; none where the Sun should be before the camera, but is not wholly visible."""
     pose = resolve(spec)
     spec = spec.at(pose)
-    if facing_sun and not (pose.sun_visible_fraction == 1 and pose.L_from_C[:, 2] @ pose.sun_L > 0):
+    if facing_sun and not pose.sees_sun:
         return
     first = RenderedView(spec=spec, pose=pose, rendering=render_view(spec, pose))
     for view in rendered_sequence(first, count):
