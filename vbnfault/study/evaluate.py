@@ -22,7 +22,7 @@ import hashlib
 import time
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property, lru_cache, partial
 from typing import Any, TypeVar
 
@@ -417,9 +417,9 @@ class SceneEvaluator:
         frames = self._navigation_frames(evaluation, setting, nav.views_needed(names))
         if not frames:
             return dict.fromkeys(names, float("nan"))
-        clean = self._clean_views(evaluation, setting, len(frames))
+        _, twins = self._clean_views(evaluation, setting, len(frames))
         with self.kept.timed("navigation"):
-            return nav.navigation_values(frames, names, clean.twins)
+            return nav.navigation_values(frames, names, twins)
 
     def _navigation_frames(self, evaluation: Evaluation, setting: Setting, count: int) -> list[nav.NavigationFrame]:
         """Return the clean and the faulted image of the first `count` views of an evaluation's sequence.
@@ -429,7 +429,7 @@ class SceneEvaluator:
         made = self._scene(evaluation, setting)
         frames: list[nav.NavigationFrame] = []
         first: Injection | None = None
-        for clean in self._clean_views(evaluation, setting, count).views:
+        for clean in self._clean_views(evaluation, setting, count)[0]:
             with self.kept.timed("faults"):
                 spec = replace(clean.spec, scene=made.scene, faults=made.faults)
                 view = spec, clean.pose, clean.rendering, clean.exposure
@@ -444,8 +444,10 @@ class SceneEvaluator:
                 frames.append(replace(clean.frame, image=image))
         return frames
 
-    def _clean_views(self, evaluation: Evaluation, setting: Setting, count: int) -> _CleanSequence:
-        """Return the first `count` views of an evaluation's sequence without faults."""
+    def _clean_views(
+        self, evaluation: Evaluation, setting: Setting, count: int
+    ) -> tuple[Sequence[CleanView], nav.CleanTwins]:
+        """Return the first `count` views of an evaluation's sequence without faults, and their clean twins."""
         without = replace(setting, scene={k: v for k, v in setting.scene.items() if k != FAULT_SCENE_KEY})
         made = self._scene(evaluation, without)
         view = self._view(evaluation, made)
@@ -453,28 +455,30 @@ class SceneEvaluator:
         sequence = self.kept.once("render", key, lambda: list(rendered_sequence(view, count)), "sequence")
         sun, detector = tuple(sorted(setting.sun.items())), tuple(sorted(setting.detector.items()))
 
-        def make() -> _CleanSequence:
+        def make() -> tuple[Sequence[CleanView], nav.CleanTwins]:
             seen = (self._seen(view, evaluation, made, setting) for view in sequence)
             views = [CleanView.of(view, nominal.spec.camera) for view, nominal in zip(seen, sequence, strict=True)]
-            return _CleanSequence(views=views, twins=nav.CleanTwins.of([view.frame for view in views]))
+            return views, nav.CleanTwins([view.frame for view in views])
 
         return self.kept.once("clean twins", (*key, made.scene.camera, tuple(setting.lens), detector, sun), make)
 
     # --- what a factor moves --------------------------------------------------------------------------------------
 
+    def _check_of(self, model: str, values: Mapping[str, float | str]) -> Evaluation:
+        """Return the evaluation of a point on the first view."""
+        seed, view = self.spec.scene.seeds[0], self.spec.scene.views[0]
+        return Evaluation(index=0, seed=seed, view=view, model=model, role="check", values=values)
+
     def _refuse(self, model: str, values: Mapping[str, float | str]) -> None:
         """Raise InputError if a scene, a sensor or a lens cannot have the values of a point."""
-        seed, view = self.spec.scene.seeds[0], self.spec.scene.views[0]
-        evaluation = Evaluation(index=0, seed=seed, view=view, model=model, role="check", values=values)
         setting = self.factors.setting(values)
         changed(self._nominal_lens, setting.lens)
         with_detector(self._nominal_camera, setting.detector)
-        self._scene(evaluation, setting)
+        self._scene(self._check_of(model, values), setting)
 
     def _fingerprint(self, model: str, values: Mapping[str, float | str]) -> str:
         """Return a digest of all light, noise and images of the first view at a point."""
-        seed, view = self.spec.scene.seeds[0], self.spec.scene.views[0]
-        evaluation = Evaluation(index=0, seed=seed, view=view, model=model, role="check", values=values)
+        evaluation = self._check_of(model, values)
         digest = hashlib.sha256()
         if any(name not in _NAVIGATION for name in self.spec.metrics.names):
             image = self._lit_image(evaluation, self.factors.setting(values))
@@ -486,14 +490,6 @@ class SceneEvaluator:
         if any(name in _NAVIGATION for name in self.spec.metrics.names):
             digest.update(repr(sorted(self.evaluate(evaluation).items())).encode())
         return digest.hexdigest()
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _CleanSequence:
-    """Hold the views of a sequence, and what the metrics need of their clean twins."""
-
-    views: Sequence[CleanView]
-    twins: nav.CleanTwins
 
 
 # --- values and images -------------------------------------------------------------------------------------------

@@ -85,11 +85,9 @@ class Results:
     metrics: tuple[Metric, ...]
     values: _Array
 
-    def blocks(self, metric: int, model: int, seed: int | None = None) -> _Array:
-        """Return the values of a metric with a model, float64[block, row]; of one seed, or of all."""
-        seeds = slice(None) if seed is None else slice(seed, seed + 1)
-        chosen = self.values[seeds, :, :, model, metric]
-        return chosen.reshape(-1, chosen.shape[-1])
+    def blocks(self, metric: int, model: int) -> _Array:
+        """Return the values of a metric with a model, float64[block, row]."""
+        return self.values[:, :, :, model, metric].reshape(-1, self.values.shape[2])
 
 
 def compute(results: Results) -> xr.Dataset:

@@ -295,9 +295,10 @@ def recompute(folder: str | Path) -> xr.Dataset:
     data.attrs["timings"] = before.attrs["timings"]
     with locked(path), _writing(path):
         from .report import write_report  # loads matplotlib
+        from .summaries import StudyResults
 
         results.write_indices(path / results.INDICES, data)
-        write_report(path, data, table, spec.resolved())
+        write_report(path, StudyResults(dataset=data, table=table, spec=spec.resolved()))
     return data
 
 
@@ -451,13 +452,14 @@ def _write_report(
 ) -> None:
     """Write the extreme images, the figures and the page of a study; without images where one fails."""
     from .report import write_images, write_report  # loads matplotlib
+    from .summaries import StudyResults
 
-    plain = spec.resolved()
+    found = StudyResults(dataset=data, table=table, spec=spec.resolved())
     try:
-        write_images(path, data, table, plain, evaluator)
+        write_images(path, found, evaluator)
     except VbnfaultError as error:
         print(f"warning: {path}: no images of best and worst values: {error}", file=sys.stderr)
-    write_report(path, data, table, plain)
+    write_report(path, found)
 
 
 def _too_few(spec: StudySpec) -> Iterator[str]:

@@ -234,7 +234,7 @@ class ViewWorker:
     def _errors(self, group: ViewGroup, views: Sequence[CleanView]) -> dict[str, list[tuple[float, float]]]:
         """Return the values and errors of each model, by its name."""
         width_px = views[0].spec.scene.camera.width_px
-        clean = navigation_metrics.CleanTwins.of([view.frame for view in views])
+        clean = navigation_metrics.CleanTwins([view.frame for view in views])
         return {
             model.name: measure(model, width_px, lambda fault: error_of(fault, views, self._metric, clean))
             for model in group.models
