@@ -132,7 +132,7 @@ def made_up(plan: Plan) -> StudyResults:
     return StudyResults(dataset=dataset, table=table, spec=spec.resolved())
 
 
-def ishigami(n: int = 256) -> StudyResults:
+def ishigami(n: int = 128) -> StudyResults:
     """Return results of Ishigami's function."""
 
     def function(u: np.ndarray) -> np.ndarray:

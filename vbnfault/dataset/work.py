@@ -155,7 +155,7 @@ class Job:
         listed = f"{noun} {names}" if len(failed) == 1 else f"{len(failed)} {noun}s ({names})"
         raise self.error(
             f"{self.path}: {listed} failed{why}, the first with: {self.failures[failed[0]].splitlines()[0]}; "
-            f"{kept or f'finished {noun}s are kept'}, and the same command tries the failed ones again",
+            f"{kept or f'all other {noun}s are kept'}; the same command tries the failed ones again",
             self.failures,
             **more,
         )
