@@ -133,7 +133,8 @@ def test_the_page_says_what_was_asked_and_what_went_wrong(compared: tuple[StudyR
     assert "812.4" in words  # the time of a stage
     for kind in ("overview", "indices", "models", "tornado", "responses", "interactions", "images"):
         assert f'<section id="{kind}">' in text
-    assert text.count('class="formula"><svg') == 4  # first order, total, pairs, model form
+    # first order, total, pairs, control variates, model form
+    assert text.count('class="formula"><svg') == 5
 
 
 def test_the_summary_names_factors_above_the_noise_floor_only() -> None:

@@ -91,6 +91,7 @@ class ChunkWorker:
         folder = self._source.path
         outcomes, seconds_before = _finished(folder, task.number)
         unwritten, written = 0, time.monotonic()
+        by_index = {evaluation.index: evaluation for evaluation in task.evaluations}
 
         def write() -> None:
             now = Counter(self._evaluator().timings())
@@ -102,14 +103,13 @@ class ChunkWorker:
             self._seconds = now
 
         try:
-            for evaluation in task.evaluations:
-                i = evaluation.index
+            for i in by_index:
                 if i in outcomes:
                     tick(i, "kept", "")
                     continue
                 if i in task.skip:
                     continue
-                values = attempt(i, lambda _, evaluation=evaluation: self._values(evaluation), tick)
+                values = attempt(i, lambda index: self._values(by_index[index]), tick)
                 if values is None:
                     continue
                 outcomes[i] = {"values": values, "error": ""}

@@ -522,6 +522,8 @@ def _add_model_share(arrays: dict[str, tuple[tuple[str, ...], _Array]], results:
         y = results.values[:, :, rows, :, i]  # [seed, view, row, model]
         y = y.reshape(-1, int(rows.sum()) // per_base, per_base * y.shape[-1])
         complete = np.asarray(np.isfinite(y).all(axis=-1))
+        if not complete.any():
+            continue  # a metric that never has a value
         y, complete = y[:, complete.any(axis=0)], complete[:, complete.any(axis=0)]
         y = np.where(complete[..., None], y, 0.0)
         centre = y.sum(axis=(1, 2)) / np.maximum(complete.sum(axis=1), 1) / y.shape[-1]
