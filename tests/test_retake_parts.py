@@ -15,6 +15,7 @@ from vbnfault.core.errors import InputError
 from vbnfault.dataset import retake
 from vbnfault.pipeline import retaken
 from vbnfault.pipeline.retaken import RetakeSession, StoredView
+from vbnfault.pipeline.spec import Pose
 
 ROWS, COLUMNS = 4, 6
 
@@ -133,13 +134,17 @@ class _Spec:
 def test_a_fault_that_needs_the_sun_is_resolved_only_where_it_is_seen(
     monkeypatch: pytest.MonkeyPatch, required: bool, commanded: tuple[str, ...], visible: float, towards: float
 ) -> None:
-    @dataclasses.dataclass(frozen=True)
-    class Pose:
-        sun_visible_fraction: float = visible
-        L_from_C: Any = dataclasses.field(default_factory=lambda: np.eye(3))
-        sun_L: Any = dataclasses.field(default_factory=lambda: np.array([0.0, 0, towards]))
-        resolved: bool = True
-
+    pose = Pose(
+        position_L_m=np.zeros(3),
+        L_from_C=np.eye(3),
+        sun_L=np.array([0.0, 0.0, towards]),
+        sun_azimuth_deg=0.0,
+        sun_elevation_deg=90.0,
+        sun_visible_fraction=visible,
+        tries=1,
+        variables={},
+        resolved=True,
+    )
     session = object.__new__(RetakeSession)
     scene = SimpleNamespace(
         geometry=SimpleNamespace(sun_visibility="required" if required else "any"),
@@ -151,7 +156,7 @@ def test_a_fault_that_needs_the_sun_is_resolved_only_where_it_is_seen(
     session._views = SimpleNamespace(repeats=1)  # type: ignore[assignment]
     session._world = SimpleNamespace(faults=faults)  # type: ignore[assignment]
     spec = _Spec(commanded, scene=SimpleNamespace(sun=None))
-    monkeypatch.setattr(session, "_view", lambda _: (spec, Pose(), None, 1))
+    monkeypatch.setattr(session, "_view", lambda _: (spec, pose, None, 1))
     monkeypatch.setattr(retaken, "simulate_stored_view", lambda spec, pose, *_: pose)
     seen = visible == 1.0 and towards > 0
     expected = seen or not required or commanded == ("vignetting",)
