@@ -13,6 +13,8 @@ import json
 import math
 from pathlib import Path
 
+import numpy as np
+
 from vbnfault.dataset import BuildOptions
 from vbnfault.faults import SeverityTable, read_table
 from vbnfault.study import severity
@@ -43,12 +45,16 @@ def reproduced(
             by_view = job.of_lens(k, model.name)
             if by_view:
                 errors.setdefault(model.name, {})[lens or "thin"] = [
-                    severity.error_with_interval(
-                        [dict(view)[model.at(value)[1]] for view in by_view], table.quantile
-                    )
+                    _with_interval([dict(view)[model.at(value)[1]] for view in by_view], table.quantile)
                     for value in model.values
                 ]
     return errors
+
+
+def _with_interval(errors: list[float], quantile: float) -> tuple[float, float, float]:
+    """Return the quantile over views of an error, and its 95 % interval by a bootstrap over the views."""
+    curve = severity.RisingCurve.over([{0.0: error} for error in errors], quantile)
+    return (math.nan,) * 3 if curve is None else (float(curve.at(np.zeros(1))[0]), *curve.interval(0.0))
 
 
 def main() -> None:

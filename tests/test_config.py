@@ -16,10 +16,10 @@ from scipy import stats
 from vbnfault import faults
 from vbnfault.core import resources, tables
 from vbnfault.core.errors import InputError
+from vbnfault.dataset.identity import content_hash
 from vbnfault.detector import ThreeColourDetector
 from vbnfault.scene import config, keyed_random
 from vbnfault.scene.config import Scene, load_scene, parse_scene
-from vbnfault.scene.hashing import content_hash
 
 PACKAGED = sorted(resources.packaged("scenes"))
 
@@ -94,7 +94,7 @@ TITLE = 'title = "t"\n'
             ["geometry.sun_facing.roll_deg = [5, 1]:", "reversed"],
         ),
         (TITLE + "[plan]\nclasses_per_sample = [4, 3]", ["plan.classes_per_sample = [4, 3]:", "reversed"]),
-        (TITLE + '[dataset]\nlayers = ["clean", "clean"]', ["dataset.layers = ", "clean is named twice"]),
+        (TITLE + '[dataset]\nlayers = ["clean", "clean"]', ["dataset.layers = ", "'clean' is given twice"]),
         (
             TITLE + "[camera]\nexposure_min_s = 3\nexposure_max_s = 1",
             ["exposure_min_s = 3", "exposure_max_s", "reversed"],

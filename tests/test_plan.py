@@ -65,12 +65,6 @@ PAPER_BOUNDS = {  # table of the boundaries of dataset variables; degrees, metre
 }
 
 
-def test_the_plan_has_the_papers_variables(paper: plan.Plan) -> None:
-    assert tuple(paper.variables) == redraw.VARIABLES == tuple(PAPER_BOUNDS)
-    assert len(paper) == N
-    assert all(v.shape == (N,) and v.dtype == np.float64 for v in paper.variables.values())
-
-
 @pytest.mark.parametrize("stratum", [NEAR, FAR])
 @pytest.mark.parametrize("name", PAPER_BOUNDS)
 def test_variables_are_uniform_within_the_papers_bounds(paper: plan.Plan, name: str, stratum: int) -> None:
@@ -458,31 +452,22 @@ def test_devices_are_shared_out_as_sites_are() -> None:
 # ------------------------------------------------------------------------------------------------------ speed
 
 
-@pytest.mark.parametrize(
-    "name", ["earth_observation", "interplanetary", "quickstart", "sssb_exploration", "navcam67p", "physical67p"]
-)
-def test_packaged_scenes_have_every_class_in_every_split(name: str) -> None:
+WHOLE = ("earth_observation", "interplanetary", "quickstart", "sssb_exploration", "navcam67p", "physical67p")
+
+
+@pytest.mark.parametrize("name", [*WHOLE, "landing", "flares"])
+def test_packaged_scenes_have_lit_views_and_every_class_in_every_split(name: str) -> None:
     s = config.load_scene(name)
     p = planned(s, list(s.faults))
+    asked = np.array([table.min_lit_fraction for table in redraw.strata(s)])[p.stratum]
+    assert (asked >= 0.01).mean() >= 0.8
+    if name not in WHOLE:
+        return
     assert plan.shortcomings(s, p) == []
     for code in range(len(plan.SPLITS)):
         here = p.split == code
         assert p.injected[here].any(axis=0).all()
         assert {bool(v) for v in p.injected[here].any(axis=1)} == {True, False}  # and samples without a fault
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        *("quickstart", "physical67p", "landing", "sssb_exploration"),
-        *("earth_observation", "interplanetary", "flares", "navcam67p"),
-    ],
-)
-def test_packaged_scenes_ask_for_lit_ground_in_four_of_five_views(name: str) -> None:
-    s = config.load_scene(name)
-    p = planned(s, list(s.faults))
-    asked = np.array([table.min_lit_fraction for table in redraw.strata(s)])[p.stratum]
-    assert (asked >= 0.01).mean() >= 0.8
 
 
 @given(st.integers(24, 300), st.integers(3, 12), st.integers(1, 8), st.sampled_from(["per_class", "per_sample"]))
@@ -507,35 +492,6 @@ def test_no_split_is_empty_and_classes_are_dealt_evenly(samples: int, sites: int
         shards = len(set((np.flatnonzero(here) // shard).tolist()))
         facing = (p.stratum == NEAR).mean() * here.sum()
         assert abs((p.stratum[here] == NEAR).sum() - facing) <= shards + 6
-
-
-@pytest.mark.parametrize(
-    ("theirs", "gains"),
-    [
-        (["A", "AB"], True),  # B for A and B: the first split wins A, and B stays in both
-        (["A", "A", "B"], False),  # B for A: the first split would lose B, its only one
-        (["A", "A", "B", "B"], False),  # nor does it matter that the other one has B to spare
-        (["B", "B"], False),  # nobody has what it lacks
-        (["A", "AC", "B", "C"], False),  # C is too rare to matter, and A costs B
-    ],
-)
-def test_rows_are_exchanged_where_a_split_wins_a_class_and_loses_none(theirs: list[str], gains: bool) -> None:
-    """The first split has one sample, with class B alone; the second has those of `theirs`."""
-    rows = ["B", *theirs]
-    traits = np.array([[name in row for name in "ABC"] for row in rows])
-    split = np.array([0] + [2] * len(theirs), dtype=np.uint8)
-    present = np.unique(split)
-    enough = np.array([traits[:, k].sum() >= 2 for k in range(2)] + [False])
-    pair = fault_matrix._exchange(traits, split, present, enough)
-    assert (pair is not None) == gains
-    if pair is None:
-        return
-    one, other = pair
-    assert (split[one], split[other]) == (0, 2)
-    after = traits.copy()
-    after[[one, other]] = traits[[other, one]]
-    for s in present:
-        assert after[split == s][:, enough].any(axis=0).all()
 
 
 def test_splits_that_cannot_hold_every_class_are_told() -> None:

@@ -21,7 +21,7 @@ from vbnfault.dataset.identity import plan_numbers, stored_plan
 from vbnfault.dataset.statistics import statistics
 from vbnfault.scene import config, plan
 from vbnfault.scene.config import Scene
-from vbnfault.scene.retaken_plan import make_retaken_plan
+from vbnfault.scene.plan import make_retaken_plan
 from vbnfault.store import disk
 
 LAYERS = ["clean", "depth_m", "normal", "semantic", "mask_effect", "without_straylight", "scene_radiance"]
@@ -338,6 +338,7 @@ def test_of_half_a_store_the_finished_samples_are_taken(
     # once the old store is complete, the new one keeps to its samples
     half._write_done(0, {0, 1, 2, 3})
     assert retake(half.path, scene, new).finished == 6
+    assert retake(half.path, scene, new, overwrite=True).samples == 8
 
 
 # --- bad input -------------------------------------------------------------------------------------------------

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -16,6 +15,7 @@ from vbnfault.core.errors import InputError
 from vbnfault.dataset import retake
 from vbnfault.pipeline import retaken
 from vbnfault.pipeline.retaken import RetakeSession, StoredView
+from vbnfault.pipeline.spec import Pose
 
 ROWS, COLUMNS = 4, 6
 
@@ -134,13 +134,17 @@ class _Spec:
 def test_a_fault_that_needs_the_sun_is_resolved_only_where_it_is_seen(
     monkeypatch: pytest.MonkeyPatch, required: bool, commanded: tuple[str, ...], visible: float, towards: float
 ) -> None:
-    @dataclasses.dataclass(frozen=True)
-    class Pose:
-        sun_visible_fraction: float = visible
-        L_from_C: Any = dataclasses.field(default_factory=lambda: np.eye(3))
-        sun_L: Any = dataclasses.field(default_factory=lambda: np.array([0.0, 0, towards]))
-        resolved: bool = True
-
+    pose = Pose(
+        position_L_m=np.zeros(3),
+        L_from_C=np.eye(3),
+        sun_L=np.array([0.0, 0.0, towards]),
+        sun_azimuth_deg=0.0,
+        sun_elevation_deg=90.0,
+        sun_visible_fraction=visible,
+        tries=1,
+        variables={},
+        resolved=True,
+    )
     session = object.__new__(RetakeSession)
     scene = SimpleNamespace(
         geometry=SimpleNamespace(sun_visibility="required" if required else "any"),
@@ -152,7 +156,7 @@ def test_a_fault_that_needs_the_sun_is_resolved_only_where_it_is_seen(
     session._views = SimpleNamespace(repeats=1)  # type: ignore[assignment]
     session._world = SimpleNamespace(faults=faults)  # type: ignore[assignment]
     spec = _Spec(commanded, scene=SimpleNamespace(sun=None))
-    monkeypatch.setattr(session, "_view", lambda _: (spec, Pose(), None, 1))
+    monkeypatch.setattr(session, "_view", lambda _: (spec, pose, None, 1))
     monkeypatch.setattr(retaken, "simulate_stored_view", lambda spec, pose, *_: pose)
     seen = visible == 1.0 and towards > 0
     expected = seen or not required or commanded == ("vignetting",)
@@ -257,19 +261,6 @@ def test_each_stored_sample_is_taken_as_often_as_the_variants_say(
         retake._repeats(opened, scene, "scene")
 
 
-@pytest.mark.parametrize(
-    ("numbers", "ranges"),
-    [
-        ([0], [[0, 0]]),
-        ([1, 2, 3], [[1, 3]]),
-        ([0, 2, 3, 5], [[0, 0], [2, 3], [5, 5]]),
-        ([4, 7, 8], [[4, 4], [7, 8]]),
-    ],
-)
-def test_numbers_of_samples_are_written_as_ranges(numbers: list[int], ranges: list[list[int]]) -> None:
-    assert store.runs(numbers) == ranges
-
-
 def test_the_checksum_of_the_old_store_is_that_of_the_samples_taken(finished_store: Any) -> None:
 
     opened = store.open_store(finished_store)  # shards of 4 samples
@@ -296,23 +287,3 @@ def test_the_radiance_before_the_lens_and_without_stars_is_used(
 ) -> None:
     spec: Any = SimpleNamespace(layers=layers)
     assert retake._radiance_layer(spec, {"scene": scene}) == layer
-
-
-@pytest.mark.parametrize(("overwrite", "taken"), [(False, [1, 2]), (True, [0, 1, 2, 3])])
-def test_a_store_that_has_begun_keeps_its_samples_unless_it_is_replaced(
-    overwrite: bool, taken: list[int], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    finished: Any = SimpleNamespace(
-        begun=lambda: [0],
-        done=lambda _: dict.fromkeys(range(4), True),
-        samples=4,
-        path="s.zarr",
-        attributes={"blocks": [4]},
-    )
-    begun = SimpleNamespace(attributes={retake.RETAKE: {"samples": [[1, 2]]}})
-    monkeypatch.setattr(retake.store, "is_store", lambda _: True)
-    monkeypatch.setattr(retake.store, "open_store", lambda _: begun)
-    options: Any = SimpleNamespace(overwrite=overwrite)
-    assert retake._samples(finished, Path("new.zarr"), options).tolist() == taken
-    noted = ["s.zarr: 2 of 4 samples are taken, those that were finished"]
-    assert caplog.messages == ([] if overwrite else noted)

@@ -329,7 +329,7 @@ class Failing(kit.Function):
 def test_evaluations_that_fail_are_marked_and_the_rest_goes_on(tmp_path: Path) -> None:
     spec = kit.spec(design={"n": 64, "resamples": 100})
     with pytest.raises(
-        vbnfault.study.StudyFailed, match=r"3 evaluations \(7, 8, 50\) of 320 failed, .*no image at 7"
+        vbnfault.study.StudyFailed, match=r"3 evaluations \(7, 8, 50\) failed, .*no image at 7"
     ) as error:
         run.run_study(spec, tmp_path / "s", QUIET, report=False, evaluator=Failing)
     table = results.read_table(tmp_path / "s").to_pylist()
@@ -343,7 +343,7 @@ def test_evaluations_that_fail_are_marked_and_the_rest_goes_on(tmp_path: Path) -
     assert abs(data["ST"] - whole["ST"]).max() < 0.1
     # the same study tries the failed ones again
     function = functools.partial(Failing, wrong=(50,))
-    with pytest.raises(vbnfault.study.StudyFailed, match=r"evaluation 50 of 320 failed"):
+    with pytest.raises(vbnfault.study.StudyFailed, match=r"evaluation 50 failed"):
         run.run_study(spec, tmp_path / "s", QUIET, report=False, evaluator=function)
 
 
@@ -503,12 +503,12 @@ def test_distributions_go_to_values_and_back() -> None:
     for factor in spec.factors[:3]:
         values = factor.values(u)
         np.testing.assert_allclose(values[[0, -1]], [factor.low, factor.high], rtol=1e-12)
+        assert (np.diff(values) > 0).all()
         assert values.min() >= factor.low
         assert values.max() <= factor.high
-        np.testing.assert_allclose(factor.points(values), u, atol=1e-9)
     uniform, logarithmic, normal, categorical = spec.factors
     assert uniform.values(0.5) == 2.0
     assert logarithmic.values(0.5) == pytest.approx(1.0)
     assert normal.values(normal.nominal()) == pytest.approx(1.0)
     assert list(categorical.values([0.0, 0.34, 0.99, 1.0])) == ["x", 2.5, "z", "z"]
-    np.testing.assert_allclose(categorical.points(["x", 2.5, "z"]), [1 / 6, 0.5, 5 / 6])
+    np.testing.assert_allclose(categorical.points(), [1 / 6, 0.5, 5 / 6])

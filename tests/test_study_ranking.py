@@ -16,7 +16,7 @@ from conftest import small_scene
 from vbnfault.core.errors import InputError
 from vbnfault.faults import registry
 from vbnfault.scene import plan
-from vbnfault.study import chosen_fault, plots, ranking, report, results, run
+from vbnfault.study import factors, plots, ranking, report, results, run
 from vbnfault.study.evaluate import SceneEvaluator
 from vbnfault.study.spec import Evaluation, Metric, StudySpec, load_study, parse_study
 from vbnfault.study.summaries import StudyResults
@@ -186,7 +186,7 @@ def test_on_a_trajectory_the_sun_alone_decides(is_flown: bool) -> None:
     )
     pose: Any = SimpleNamespace(sun_visible_fraction=1.0, L_from_C=np.eye(3), sun_L=np.array([0.0, 0.0, 1.0]))
     faults: Any = {"straylight": SimpleNamespace(needs_sun=True), "vignetting": SimpleNamespace(needs_sun=False)}
-    assert chosen_fault.acting(faults, view, pose) == (["straylight"] if is_flown else []) + ["vignetting"]
+    assert factors.acting_faults(faults, view, pose) == (["straylight"] if is_flown else []) + ["vignetting"]
 
 
 def test_the_packaged_ranking_names_every_class_that_its_camera_can_have() -> None:

@@ -22,7 +22,7 @@ from vbnfault.core.quantities import Radiance
 from vbnfault.core.shared_results import SharedResults
 from vbnfault.dataset.identity import scene_identity, store_spec
 from vbnfault.detector import MosaicDetector
-from vbnfault.pipeline import Session, injection, resolve, sight, stages
+from vbnfault.pipeline import Session, injection, resolve, stages
 from vbnfault.pipeline.exposure import exposure_factor
 from vbnfault.pipeline.record import to_sample
 from vbnfault.pipeline.spec import SampleSpec
@@ -223,12 +223,14 @@ def test_shared_views_of_faults_that_need_light_are_not_dark(monkeypatch: pytest
         light = []
         for spec, pose in poses:
             axes, sun_L = pose.L_from_C, pose.sun_L
-            fraction = sight.lit_fraction(camera, spec.terrain, pose.position_L_m[None], axes[None], sun_L[None])[0]
+            fraction = resolve._lit_fraction(
+                camera, spec.terrain, pose.position_L_m[None], axes[None], sun_L[None]
+            )[0]
             light.append(float(fraction) + float(axes[:, 2] @ sun_L > np.cos(np.radians(half_deg))))
         return light
 
     assert min(lit()) > 0
-    monkeypatch.setattr(resolve, "faults_needing_light", lambda spec: [])
+    monkeypatch.setattr(resolve, "_faults_needing_light", lambda spec: [])
     assert lit().count(0.0) > 0, "no view of this plan is dark, so the test says nothing"
     monkeypatch.undo()
     # a body that may lie between the rays of the grid is left to the render
@@ -240,11 +242,11 @@ def test_shared_views_of_faults_that_need_light_are_not_dark(monkeypatch: pytest
     # where such a fault is left out instead, and where a sample has a view of its own, views are as they were
     dropping = {**table, "plan": {**table["plan"], "on_invisible": "drop"}}
     left_out = Session(config.parse_scene(dropping, source="test"))
-    assert [sight.faults_needing_light(left_out.spec(k)) for k in range(8)] == [[]] * 8
+    assert [resolve._faults_needing_light(left_out.spec(k)) for k in range(8)] == [[]] * 8
     single = small_scene(dataset={"samples": 4, "sites": 1}, plan={"faulty_fraction": 1.0})
     single["faults"] = faults
     alone = Session(config.parse_scene(single, source="test"))
-    assert [sight.faults_needing_light(alone.spec(k)) for k in range(4)] == [[]] * 4
+    assert [resolve._faults_needing_light(alone.spec(k)) for k in range(4)] == [[]] * 4
 
 
 def test_exposures_follow_their_stops(session: Session) -> None:

@@ -91,6 +91,16 @@ def pair_within(lo: float, hi: float) -> Any:
     return Annotated[tuple[value, value], AfterValidator(ordered)]
 
 
+def each_once(values: tuple[T, ...]) -> tuple[T, ...]:
+    """Return values as they are. Raises ValueError if one is given twice."""
+    seen: set[T] = set()
+    for value in values:
+        if value in seen:
+            raise ValueError(f"{value!r} is given twice")
+        seen.add(value)
+    return values
+
+
 def parse(kind: type[T], plain: Mapping[str, Any], *, source: str, overrides: Sequence[str] = ()) -> T:
     """Return plain data, such as the contents of a TOML file, as a checked object.
 

@@ -32,7 +32,7 @@ from .processes import Pool
 from .progress import Progress, duration_text, size_text
 from .resume import blocks_of, check_same_scene, known_versions, planned_blocks, with_versions_noted
 from .tasks import BuildFailed, Run, SampleMaker, SampleWorkers, SessionFactory
-from .work import run_here
+from .work import Job, WorkerFactory, run_here
 
 __all__ = [
     "BuildFailed",
@@ -350,7 +350,7 @@ def _run(
     with run.progress:
         for line in summary.outlook():
             run.progress.say(line)
-        _do_tasks(session_factory, run, options)
+        do_tasks(SampleWorkers(session_factory, run.path.absolute()), run, options)
     return run
 
 
@@ -422,16 +422,31 @@ def _prepared_store(plan: BuildPlan, path: Location, options: BuildOptions) -> S
     return with_versions_noted(store, plan.spec, plan.expected, exact=plan.exact)
 
 
-def _do_tasks(session_factory: SessionFactory, run: Run, options: BuildOptions) -> None:
-    """Do all tasks of a run: on a cluster, in this process, or in worker processes."""
-    workers = SampleWorkers(session_factory, run.path.absolute())
+def do_tasks(
+    workers: WorkerFactory, job: Job, options: BuildOptions, here: WorkerFactory | None = None, recycle: int = 0
+) -> None:
+    """Do all tasks of a job: on a cluster, in this process, or in worker processes.
+
+    Parameters
+    ----------
+    workers
+        Makes a worker.
+    job
+        The job.
+    options
+        Where and by how many it is done.
+    here
+        Makes the worker of this process, if that is another one.
+    recycle
+        Number of tasks after which a process is replaced, if it is larger than `options.recycle_shards`.
+    """
     if options.scheduler is not None:
-        run_on_dask(workers, run, options.scheduler)
+        run_on_dask(workers, job, options.scheduler)
     elif options.workers == 1:
-        run_here(workers, run)
+        run_here(here or workers, job)
     else:
         threads = options.threads or max(1, environment.usable_cores() // options.workers)
-        Pool(workers, run, threads, options.recycle_shards).work(options.workers)
+        Pool(workers, job, threads, max(options.recycle_shards, recycle)).work(options.workers)
 
 
 def _check_room(summary: Summary, spec: StoreSpec) -> None:

@@ -10,7 +10,9 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
+import hashlib
 import importlib.metadata
+import json
 import operator
 import platform
 from collections.abc import Callable, Mapping, Sequence
@@ -32,9 +34,7 @@ from ..pipeline.record import proposal
 from ..pipeline.spec import mask_any_faults, stored_layers
 from ..scene import config, plan
 from ..scene.config import Scene
-from ..scene.hashing import content_hash
 from ..scene.instrument import OF_THE_DETECTOR
-from ..scene.retaken_plan import make_retaken_plan
 from ..scene.sampling import OF_AN_AIM
 from ..scene.target import EARTH
 from ..store import StoreSpec
@@ -394,7 +394,7 @@ def stored_plan(attributes: Mapping[str, Any], faults: Sequence[str]) -> tuple[S
     if RETAKE not in attributes:
         return scene, plan.make_plan(scene, faults, blocks, need_sun=need_sun)
     views = earlier_views(attributes)
-    return scene, make_retaken_plan(scene, faults, views, blocks, need_sun=need_sun)
+    return scene, plan.make_retaken_plan(scene, faults, views, blocks, need_sun=need_sun)
 
 
 def earlier_views(attributes: Mapping[str, Any]) -> plan.EarlierViews:
@@ -507,3 +507,13 @@ def verify(path: str | Path | store.Store, progress: Callable[[int], None] | Non
         exact=is_exact(attributes),
         progress=progress,
     )
+
+
+def content_hash(*parts: Any) -> str:
+    """Return the SHA-256 (hex) over JSON-able parts and bytes in order; the keys of a dictionary are sorted."""
+    digest = hashlib.sha256()
+    for part in parts:
+        data = part if isinstance(part, bytes) else json.dumps(part, sort_keys=True).encode()
+        digest.update(len(data).to_bytes(8, "little"))
+        digest.update(data)
+    return digest.hexdigest()

@@ -25,7 +25,6 @@ from ..pipeline.rendering import ANGLE_LAYERS
 from ..pipeline.retaken import TRUTH_LAYERS, RetakeSession, StoredView
 from ..scene import config, plan
 from ..scene.config import Scene
-from ..scene.retaken_plan import make_retaken_plan
 from ..scene.trajectory import with_rows
 from ..store import Store, StoreSpec
 from . import build
@@ -187,7 +186,7 @@ def _planned(
 
 def _retaken_plan(scene: Scene, attributes: Mapping[str, Any], faults: Mapping[str, Fault]) -> plan.Plan:
     """Return the plan of the new samples."""
-    return make_retaken_plan(
+    return plan.make_retaken_plan(
         scene,
         list(faults),
         earlier_views(attributes),

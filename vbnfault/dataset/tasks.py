@@ -6,8 +6,7 @@ loads the terrain of a site once.
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -16,27 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import store as store_module
-from ..core import activity
 from ..core.environment import release_unused
-from ..core.errors import InputChanged, VbnfaultError
+from ..core.errors import VbnfaultError
 from ..core.interrupts import check, finishing
 from ..core.quantities import Sample
 from ..store import Encoded, Location, Planned, SampleDigests, Store
 from .progress import Progress
-from .work import Fatal, Lazy, Queue, Tick, describe
-
-_HOPELESS = 32  # after so many failures without one success, the build stops: the others would fail, too
+from .work import ItemsFailed, Job, Lazy, Tick, attempt, describe
 
 
-class BuildFailed(VbnfaultError):
-    """Report that some samples could not be made.
-
-    `failures`: by sample, one line and the traceback, or a sentence on how its worker ended.
-    """
-
-    def __init__(self, sentence: str, failures: Mapping[int, str] | None = None) -> None:
-        super().__init__(sentence)
-        self.failures = dict(failures or {})
+class BuildFailed(ItemsFailed):
+    """Report that some samples could not be made."""
 
 
 class SampleMaker(Protocol):
@@ -95,14 +84,8 @@ class _SampleWorker:
 
     def do(self, task: Task, tick: Tick) -> None:
         """Do a task."""
-        work(self._simulate, store_module.open_store(self._path, "r+"), task, tick)
-
-    def _simulate(self, index: int) -> Sample:
-        """Return a sample. Raises Fatal if no session can be made, or if an input file has changed."""
-        try:
-            return self._session().simulate(index)
-        except InputChanged as error:  # every other sample would fail, too
-            raise Fatal(error) from error
+        store = store_module.open_store(self._path, "r+")
+        work(lambda index: self._session().simulate(index), store, task, tick)
 
 
 def work(simulate: Callable[[int], Sample], store: Store, task: Task, tick: Tick) -> None:
@@ -124,16 +107,9 @@ def work(simulate: Callable[[int], Sample], store: Store, task: Task, tick: Tick
                 if i not in wanted:
                     tick(i, "kept", checked.digests[i].hex())
             for i in sorted(wanted - task.skip, key=lambda i: (task.sites[i - samples.start], i)):
-                check()
-                tick(i, "begun", "")
-                try:
-                    with activity.reported_to(functools.partial(tick, i, "stage")):
-                        sample = simulate(i)
-                except Exception as error:
-                    check()
-                    tick(i, "failed", describe(error))
-                    continue
-                shard.add(sample, i)
+                sample = attempt(i, simulate, tick)
+                if sample is not None:
+                    shard.add(sample, i)
                 del sample  # its layers are freed as soon as they are encoded
             shard.collect()
         except OSError:
@@ -208,10 +184,14 @@ class _Shard:
         self._pending.difference_update(given)
 
 
-class Run:
-    """Assign the tasks of a build by site, and collect their results; `shards`: all of the store by default."""
+class Run(Job):
+    """Assign the tasks of a build by site, and collect their results; `shards`: all of the store by default.
 
-    task_noun, item_noun = "shard", "sample"
+    Shards that are marked as finished come last: a build of a large store begins with what is missing.
+    """
+
+    noun, task_noun, item_noun = "build", "shard", "sample"
+    error = BuildFailed
 
     def __init__(
         self,
@@ -223,24 +203,12 @@ class Run:
         exact: bool = False,
         shards: range | None = None,
     ) -> None:
-        self.store, self.sites, self.progress = store, sites, progress
-        self.path = store.path
+        self.store, self.sites = store, sites
+        leads = {shard: self.lead(shard) for shard in (range(store.shards) if shards is None else shards)}
+        super().__init__(store.path, progress, leads, store.whole_shards())
         self._expected, self._exact = expected, exact
-        self.built = 0
         self.digests = SampleDigests(store.samples)
-        self.failures: dict[int, str] = {}
-        self._outcome: dict[int, str] = {}
-        self._shards = range(store.shards) if shards is None else shards
-        # a build of a large store begins with what is missing, and checks afterwards what is there
-        leads, whole = {shard: self.lead(shard) for shard in self._shards}, store.whole_shards()
-        unfinished = [shard for shard in self._shards if shard not in whole]
-        self._queues = Queue(leads, unfinished), Queue(leads, [shard for shard in self._shards if shard in whole])
         self._begun = frozenset(store.begun())
-
-    @property
-    def tasks(self) -> int:
-        """Return the number of shards to complete."""
-        return len(self._shards)
 
     def items(self, number: int) -> Sequence[int]:
         """Return the samples of a shard."""
@@ -259,46 +227,6 @@ class Run:
             unplanned = store_module.unplanned_samples(self.store, shard, self._expected, exact=self._exact)
         return Task(shard=shard, sites=sites, unplanned=frozenset(unplanned), skip=skip, careful=careful)
 
-    def next_task(self, last: int | None = None, busy: Sequence[int] = ()) -> int | None:
-        """Return the shard that a worker does after the shard `last`, of the same site if one is left.
-
-        Shards that are marked as finished come last.
-        """
-        tasks = (queue.next(last, busy) for queue in self._queues)
-        return next((task for task in tasks if task is not None), None)
-
-    def tick(self, item: int, what: str, text: str) -> None:
-        """Record an event of a sample, see `Tick`. Raises BuildFailed after too many failures without a success."""
-        sample = item
-        if what == "begun":
-            return
-        if what == "stage":
-            self.progress.stage(text)
-            return
-        before = self._outcome.get(sample)
-        self._outcome[sample] = what
-        self.built += (what == "built") - (before == "built")
-        if what == "failed":
-            self.failures[sample] = text
-            self.progress.say(f"sample {sample} failed: {text.splitlines()[0]}")
-        else:
-            self.failures.pop(sample, None)
-            self.digests.add({sample: bytes.fromhex(text)})
-        if before is None:
-            self.progress.advance(what == "built")
-        if self.built == 0 and len(self.failures) >= _HOPELESS:
-            self.raise_failures(" before any succeeded, so the build was stopped")
-
-    def raise_failures(self, why: str = "") -> None:
-        """Raise BuildFailed with the failed samples, if there are any."""
-        if not self.failures:
-            return
-        failed = sorted(self.failures)
-        first = self.failures[failed[0]].splitlines()[0]
-        names = ", ".join(map(str, failed[:8])) + (", ..." if len(failed) > 8 else "")
-        listed = f"sample {names}" if len(failed) == 1 else f"{len(failed)} samples ({names})"
-        raise BuildFailed(
-            f"{self.store.path}: {listed} failed{why}, the first with: {first}; "
-            f"all others are kept, and the same command tries the failed ones again",
-            self.failures,
-        )
+    def keep(self, item: int, text: str) -> None:
+        """Record the digest of a sample."""
+        self.digests.add({item: bytes.fromhex(text)})

@@ -9,15 +9,19 @@ from __future__ import annotations
 import heapq
 import traceback
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
-from ..core.errors import VbnfaultError
+from ..core import activity
+from ..core.errors import InputChanged, VbnfaultError
 from ..core.interrupts import check
 from .progress import Progress
 
 T = TypeVar("T")
+
+_HOPELESS = 32  # after so many failures without one success a job stops: the others would fail, too
 
 # Arguments: the item; an event: "begun", "stage", "kept", "built" or "failed"; a text: the name of the stage,
 # what a job needs to know of a kept or built item, or one line and the traceback of a failure.
@@ -39,32 +43,60 @@ class Worker(Protocol):
 WorkerFactory = Callable[[], Worker]
 
 
-class Job(Protocol):
-    """Hand out tasks and collect what becomes of their items.
+class ItemsFailed(VbnfaultError):
+    """Report that some items of a job failed.
 
-    Attributes
+    `failures`: by item, one line and the traceback, or a sentence on how its worker ended.
+    """
+
+    def __init__(self, sentence: str, failures: Mapping[int, str] | None = None) -> None:
+        super().__init__(sentence)
+        self.failures = dict(failures or {})
+
+
+class Job:
+    """Hand out tasks and collect what becomes of their items; the base class of all jobs.
+
+    Parameters
     ----------
     path
         Where the results are written, for messages.
-    tasks
-        Number of tasks.
-    task_noun, item_noun
-        What messages call a task and an item.
+    progress
+        Where they are counted.
+    leads
+        The lead of each task by its number, see `Queue`.
+    later
+        Tasks that are assigned when all others are.
+
+    Attributes
+    ----------
+    noun, task_noun, item_noun
+        What messages call the job, a task and an item.
+    failures
+        By failed item, as in `ItemsFailed`.
     """
 
-    path: Any
-    progress: Progress
+    noun: str
     task_noun: str
     item_noun: str
+    error: type[ItemsFailed] = ItemsFailed  # what `raise_failures` raises
+    successes: Collection[str] = ("built",)  # events after which further failures do not stop the job
 
-    @property
-    def tasks(self) -> int:
-        """Return the number of tasks."""
-        ...
+    def __init__(
+        self, path: Any, progress: Progress, leads: Mapping[int, int], later: Collection[int] = frozenset()
+    ) -> None:
+        self.path, self.progress, self.tasks = path, progress, len(leads)
+        self._queues = (
+            Queue(leads, [n for n in leads if n not in later]),
+            Queue(leads, [n for n in leads if n in later]),
+        )
+        self._outcome: dict[int, str] = {}
+        self._counts: Counter[str] = Counter()  # of the outcomes
+        self.failures: dict[int, str] = {}
 
     def items(self, number: int) -> Sequence[int]:
         """Return the items of a task."""
-        ...
+        raise NotImplementedError
 
     def task(self, number: int, skip: frozenset[int] = frozenset(), *, careful: bool = False) -> Any:
         """Return a task as its worker gets it.
@@ -72,30 +104,73 @@ class Job(Protocol):
         `skip`: items that must not be tried. `careful`: write every item as soon as it is made, because the process
         may die at the next one.
         """
-        ...
+        raise NotImplementedError
+
+    def keep(self, item: int, text: str) -> None:
+        """Record what a tick says of an item that is kept or built."""
+
+    @property
+    def built(self) -> int:
+        """Return the number of items that were made."""
+        return self._counts["built"]
 
     def next_task(self, last: int | None = None, busy: Sequence[int] = ()) -> int | None:
         """Return the task that a worker does after the task `last`; None if none is left.
 
         `busy`: tasks that other workers do.
         """
-        ...
+        tasks = (queue.next(last, busy) for queue in self._queues)
+        return next((task for task in tasks if task is not None), None)
 
     def tick(self, item: int, what: str, text: str) -> None:
-        """Record an event of an item, see `Tick`."""
-        ...
+        """Record an event of an item, see `Tick`. A task whose process died is done again.
+
+        Raises what `raise_failures` raises after too many failures without a success.
+        """
+        if what == "stage":
+            self.progress.stage(text)
+        if what in ("begun", "stage"):
+            return
+        before = self._outcome.get(item)
+        self._outcome[item] = what
+        self._counts.subtract([before] if before else [])
+        self._counts.update([what])
+        if what == "failed":
+            self.failures[item] = text
+            self.progress.say(f"{self.item_noun} {item} failed: {text.splitlines()[0]}")
+        else:
+            self.failures.pop(item, None)
+            self.keep(item, text)
+        if before is None:
+            self.progress.advance(what == "built")
+        if len(self.failures) >= _HOPELESS and not any(self._counts[success] for success in self.successes):
+            self.raise_failures(f" before any succeeded, so the {self.noun} was stopped")
+
+    def raise_failures(self, why: str = "", kept: str = "", **more: Any) -> None:
+        """Raise an error that names the failed items, if there are any; `kept` says what is kept of the others."""
+        if not self.failures:
+            return
+        failed, noun = sorted(self.failures), self.item_noun
+        names = ", ".join(map(str, failed[:8])) + (", ..." if len(failed) > 8 else "")
+        listed = f"{noun} {names}" if len(failed) == 1 else f"{len(failed)} {noun}s ({names})"
+        raise self.error(
+            f"{self.path}: {listed} failed{why}, the first with: {self.failures[failed[0]].splitlines()[0]}; "
+            f"{kept or f'all other {noun}s are kept'}; the same command tries the failed ones again",
+            self.failures,
+            **more,
+        )
 
 
 class Queue:
     """Assign tasks so that a worker stays with one lead, such as a site, whose costly data it keeps.
 
-    `leads`: the lead of each task by its number. `tasks`: the tasks to assign; all by default.
+    `leads`: the lead of each task by its number. `tasks`: the tasks to assign.
     """
 
-    def __init__(self, leads: Mapping[int, int], tasks: Iterable[int] | None = None) -> None:
+    def __init__(self, leads: Mapping[int, int], tasks: Iterable[int]) -> None:
         self._leads = leads
         self._by_lead: dict[int, deque[int]] = {}
-        for task in leads if tasks is None else tasks:
+        for task in tasks:
             self._by_lead.setdefault(leads[task], deque()).append(task)
         # heap of leads, those with the most tasks left first; an entry is updated when it is taken out
         self._longest = [(-len(tasks), lead) for lead, tasks in self._by_lead.items()]
@@ -155,6 +230,24 @@ class Fatal(BaseException):
     def __init__(self, error: VbnfaultError) -> None:
         super().__init__(error)
         self.error = error
+
+
+def attempt(item: int, make: Callable[[int], T], tick: Tick) -> T | None:
+    """Return `make(item)`; None if it fails, which is reported.
+
+    Raises Fatal if an input file has changed: every other item would fail, too.
+    """
+    check()
+    tick(item, "begun", "")
+    try:
+        with activity.reported_to(partial(tick, item, "stage")):
+            return make(item)
+    except InputChanged as error:
+        raise Fatal(error) from error
+    except Exception as error:
+        check()
+        tick(item, "failed", describe(error))
+        return None
 
 
 def describe(error: Exception) -> str:

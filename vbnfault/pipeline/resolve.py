@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..body import Site
 from ..core import frames
 from ..core.errors import VbnfaultError, shown
 from ..render.description import Sunlight
 from ..scene import aims, exchange, names, plan, redraw
+from ..scene.instrument import CameraTable
 from ..scene.trajectory import FlownPose
 from ..world import ephemeris
 from ..world.aiming import AimedView, aimed_view
 from ..world.ground import encloses
-from .sight import LIT_GRID, faults_needing_light, grid_rays_C, lit_fraction, no_view, placed
+from ..world.spacecraft import SpacecraftMesh
 from .spec import Pose, SampleSpec, Terrain
 
 F64 = NDArray[np.float64]
@@ -30,6 +33,9 @@ _SAME_DISTANCE = 1e-3
 _IN_FRAME = 0.95
 # Number of views tried at once. Batches of one size share one compiled kernel.
 _BATCH = 8
+# Rays per direction that sample the frame for sunlit ground: 576 in total, so a fraction of 5 % has an error of
+# 0.9 %.
+_LIT_GRID = 24
 
 
 def resolve(spec: SampleSpec, first_try: int = 0) -> Pose:
@@ -71,7 +77,7 @@ def resolve(spec: SampleSpec, first_try: int = 0) -> Pose:
         tries = range(exchanged, exchanged + len(tries))
     pose = _first_usable(spec, tries, unmet, sun_required=required)
     if pose is None:
-        raise no_view(spec, names.STRATA[spec.plan.stratum[spec.index]], unmet)
+        raise _no_view(spec, names.STRATA[spec.plan.stratum[spec.index]], unmet)
     return pose
 
 
@@ -222,9 +228,10 @@ def _usable(
         met[f"the whole Sun visible before the camera{past}, for {', '.join(needing_sun)}"] = seen
     good = np.logical_and.reduce(list(met.values()))
     lit_fraction = redraw.strata(scene)[stratum].min_lit_fraction
-    needing_light = faults_needing_light(spec) if vehicle is None else []  # a spacecraft in view may be sunlit
+    needing_light = _faults_needing_light(spec) if vehicle is None else []  # a spacecraft in view may be sunlit
     if (lit_fraction or needing_light) and good[:count].any():
-        fraction = _lit_fraction(spec, views)
+        sun_L = np.stack([sun.direction_L for sun in views.suns])
+        fraction = _lit_fraction(scene.camera, spec.terrain, views.position_L_m, views.L_from_C, sun_L)
         enough = fraction >= lit_fraction if lit_fraction else (fraction > 0) | _may_have_light(spec, views)
         of_the_frame = f"geometry.min_lit_fraction = {lit_fraction:g} of the frame sunlit ground"
         met[of_the_frame if lit_fraction else f"sunlit ground, for {', '.join(needing_light)}"] = enough | ~good
@@ -258,13 +265,7 @@ def _may_have_light(spec: SampleSpec, views: _Views) -> Mask:
     centre_L_m = terrain.site.T_from_L.T @ (terrain.body.centre_of_mass_T_m - terrain.site.position_T_m)
     diameter_m = (6 * terrain.body.volume_m3 / np.pi) ** (1 / 3)
     size_rad = diameter_m / np.linalg.norm(centre_L_m - views.position_L_m, axis=1)
-    return np.asarray(sees_disc | (size_rad < 2 * np.radians(camera.fov_deg) / LIT_GRID))
-
-
-def _lit_fraction(spec: SampleSpec, views: _Views) -> F64:
-    """Return the fraction of each view's frame that shows sunlit ground, float64[view]."""
-    sun_L = np.stack([sun.direction_L for sun in views.suns])
-    return lit_fraction(spec.scene.camera, spec.terrain, views.position_L_m, views.L_from_C, sun_L)
+    return np.asarray(sees_disc | (size_rad < 2 * np.radians(camera.fov_deg) / _LIT_GRID))
 
 
 def _on_the_trajectory(spec: SampleSpec, flown: FlownPose) -> Pose:
@@ -277,7 +278,7 @@ def _on_the_trajectory(spec: SampleSpec, flown: FlownPose) -> Pose:
     from .. import render
 
     scene, surface = spec.scene, spec.terrain.surface
-    pose = placed(spec, spec.terrain, flown)
+    pose = _placed(spec, spec.terrain, flown)
     clearance = scene.geometry.clearance_m
     clear = render.is_clear(surface, pose.position_L_m[None], clearance)[0]
     if not clear or encloses(spec.terrain.body, flown.camera_position_T_m):
@@ -290,8 +291,7 @@ def _on_the_trajectory(spec: SampleSpec, flown: FlownPose) -> Pose:
             f"clearance, or the body.shape that the {made_for} were made for"
         )
     needs_sun = any(spec.faults[name].needs_sun for name in spec.commanded_in_view)
-    sees_sun = pose.sun_visible_fraction == 1.0 and float(pose.L_from_C[:, 2] @ pose.sun_L) > 0
-    return replace(pose, resolved=sees_sun or not needs_sun)
+    return replace(pose, resolved=pose.sees_sun or not needs_sun)
 
 
 # --- a camera that aims: on the shape model first, then on the terrain that is made for the pose ------------
@@ -331,7 +331,7 @@ def resolve_aimed(spec: SampleSpec, first_try: int) -> Pose:
                 return replace(pose, terrain=terrain, tries=attempt + 1, variables=values)
             del terrain, pose  # release the memory before the next terrain is made
         unmet[failed] = unmet.get(failed, 0) + 1
-    raise no_view(spec, f"aim {aim!r}", unmet)
+    raise _no_view(spec, f"aim {aim!r}", unmet)
 
 
 def _unmet_by_the_view(spec: SampleSpec, view: AimedView) -> str:
@@ -364,7 +364,7 @@ def _unmet(spec: SampleSpec, terrain: Terrain, view: AimedView) -> tuple[str, Po
 
     scene, geometry, surface = spec.scene, spec.scene.geometry, terrain.surface
     aim = spec.plan.aim_of(spec.index)
-    pose = placed(spec, terrain, view.pose)
+    pose = _placed(spec, terrain, view.pose)
     position = pose.position_L_m
     towards_site = terrain.site.T_from_L.T @ view.towards_site_T
     if not render.first_ground(surface, position, towards_site)[1]:
@@ -376,7 +376,7 @@ def _unmet(spec: SampleSpec, terrain: Terrain, view: AimedView) -> tuple[str, Po
         return "the whole Sun visible" + ("" if terrain.vehicle is None else ", past the spacecraft"), pose
     least = geometry.min_lit_fraction if aim != "sun" else 0.0
     if least:
-        lit = lit_fraction(scene.camera, terrain, position[None], pose.L_from_C[None], pose.sun_L[None])[0]
+        lit = _lit_fraction(scene.camera, terrain, position[None], pose.L_from_C[None], pose.sun_L[None])[0]
         if lit < least:
             return f"geometry.min_lit_fraction = {least:g} of the frame sunlit ground", pose
     if terrain.vehicle is not None:
@@ -400,7 +400,7 @@ def _body_in_frame(spec: SampleSpec, view: AimedView) -> bool:
     if ((z > 0) & (np.abs(x) < slope * z) & (np.abs(y) < slope * height_over_width * z)).any():
         return True
     position = _camera_L_m(terrain, view)
-    rays_L = grid_rays_C(camera.fov_deg, height_over_width) @ flown.T_from_C.T @ terrain.site.T_from_L
+    rays_L = _grid_rays_C(camera.fov_deg, height_over_width) @ flown.T_from_C.T @ terrain.site.T_from_L
     beyond_m = 2 * float(np.hypot(x, np.hypot(y, z)).max())
     return render.is_between(terrain.surface, position, position + beyond_m * rays_L)
 
@@ -409,3 +409,103 @@ def _camera_L_m(terrain: Terrain, view: AimedView) -> F64:
     """Return the camera's position in the terrain's L, float64[3]."""
     site = terrain.site
     return np.asarray(site.T_from_L.T @ (view.pose.camera_position_T_m - site.position_T_m))
+
+
+# --- what a camera sees of ground and Sun at a pose ----------------------------------------------------------
+
+
+def _placed(spec: SampleSpec, terrain: Terrain, flown: FlownPose) -> Pose:
+    """Return a pose in T as the pose of a sample over a terrain, in whose L it is. No condition is checked."""
+    from .. import render
+
+    pose = in_local_frame(terrain.site, flown)
+    light = ephemeris.sunlight(spec.scene, pose.sun_L)
+    position, axes = pose.position_L_m[None], pose.L_from_C[None]
+    visible = float(render.sun_visible_fraction(terrain.surface, position, [light], axes)[0])
+    variables = spec.plan.view(spec.scene, spec.index, 0)
+    return replace(pose, sun_visible_fraction=visible, variables=variables)
+
+
+def in_local_frame(site: Site, flown: FlownPose) -> Pose:
+    """Return a pose in T as a pose in the L of a site, without variables and as if the whole Sun were visible."""
+    L_from_T = site.T_from_L.T
+    sun_L = L_from_T @ flown.sun_direction_T
+    azimuth, elevation = frames.azimuth_elevation_deg(sun_L)
+    return Pose(
+        position_L_m=L_from_T @ (flown.camera_position_T_m - site.position_T_m),
+        L_from_C=L_from_T @ flown.T_from_C,
+        sun_L=sun_L,
+        sun_azimuth_deg=azimuth,
+        sun_elevation_deg=elevation,
+        sun_visible_fraction=1.0,
+        tries=1,
+        variables={},
+        resolved=True,
+    )
+
+
+def _no_view(spec: SampleSpec, kind: str, unmet: Mapping[str, int]) -> VbnfaultError:
+    """Return the error for a sample, of a `kind` of view, none of whose views met every condition.
+
+    `unmet` counts the views that did not meet each condition.
+    """
+    tries = spec.scene.geometry.max_tries
+    conditions = "; ".join(f"{text} ({n} of {tries} tries did not)" for text, n in unmet.items())
+    return VbnfaultError(
+        f"sample {spec.index} ({kind}, site {spec.plan.site[spec.index]}): no view met every condition in "
+        f"geometry.max_tries = {tries} tries: {conditions}; widen the bounds of [geometry], relax the "
+        f"condition, or raise max_tries"
+    )
+
+
+def _faults_needing_light(spec: SampleSpec) -> list[str]:
+    """Return the commanded faults in whose samples a dark view is replaced before its render.
+
+    A single sample finds out by its render. Of samples that share a view, each would have a second view rendered
+    for it, so the darkness is looked for before the render, on a grid of rays; so it is for samples that exchange
+    views, of which those with the Sun have its light.
+    """
+    exchanges = spec.plan.group is not None
+    if (spec.plan.variants == 1 and not exchanges) or spec.scene.plan.on_invisible == "drop":
+        return []
+    if exchanges and any(spec.faults[name].needs_sun for name in spec.commanded_in_view):
+        return []
+    return [name for name in spec.commanded_in_view if spec.faults[name].needs_light]
+
+
+def _lit_fraction(camera: CameraTable, terrain: Terrain, position_L_m: F64, L_from_C: F64, sun_L: F64) -> F64:
+    """Return the fraction of each view's frame that shows sunlit ground, float64[view].
+
+    It is counted with a grid of pinhole camera rays.
+
+    Parameters
+    ----------
+    camera, terrain
+        The camera, and the ground with the spacecraft that may hide it.
+    position_L_m, L_from_C, sun_L
+        float64[view, 3], float64[view, 3, 3], float64[view, 3].
+    """
+    from .. import render
+
+    vehicle = terrain.vehicle
+    rays_C = _grid_rays_C(camera.fov_deg, camera.height_px / camera.width_px)
+    rays_L = np.einsum("vij,nj->vni", L_from_C, rays_C)
+    lit = render.sunlit_ground(terrain.surface, position_L_m, rays_L, sun_L)
+    if vehicle is not None:
+        lit &= ~_hidden_by(vehicle, camera.fov_deg, camera.height_px / camera.width_px)
+    return np.asarray(lit.mean(axis=1))
+
+
+def _grid_rays_C(fov_deg: float, height_over_width: float) -> F64:
+    """Return unit directions through the centres of a grid of cells over the frame, float64[ray, 3]."""
+    centres = (np.arange(_LIT_GRID) + 0.5) / _LIT_GRID * 2 - 1
+    slope = np.tan(np.radians(fov_deg) / 2)
+    x, y = np.meshgrid(slope * centres, slope * height_over_width * centres)
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
+    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+
+
+@lru_cache(maxsize=4)
+def _hidden_by(vehicle: SpacecraftMesh, fov_deg: float, height_over_width: float) -> Mask:
+    """Return which rays of the grid meet the spacecraft, bool[ray]. They are the same in every view."""
+    return vehicle.blocked(_grid_rays_C(fov_deg, height_over_width))

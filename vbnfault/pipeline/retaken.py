@@ -38,9 +38,8 @@ from .rendering import (
     surroundings,
     with_body,
 )
-from .resolve import references_L
+from .resolve import in_local_frame, references_L
 from .session import Session
-from .sight import in_local_frame
 from .spec import Frame, Pose, Rendering, SampleSpec, SceneLight, Terrain
 from .stages import simulate_stored_view
 
@@ -140,8 +139,7 @@ class RetakeSession:
         )
         if self._scene.geometry.sun_visibility == "required" or self._scene.is_flown:
             needs_sun = any(faults[name].needs_sun for name in spec.commanded)
-            sees_sun = pose.sun_visible_fraction == 1.0 and float(pose.L_from_C[:, 2] @ pose.sun_L) > 0
-            pose = replace(pose, resolved=sees_sun or not needs_sun)
+            pose = replace(pose, resolved=pose.sees_sun or not needs_sun)
         return simulate_stored_view(spec, pose, rendering, views)
 
     def _view(self, earlier: int) -> tuple[SampleSpec, Pose, Rendering, int]:

@@ -216,7 +216,7 @@ class Session:
             body, site = self.body, self.sites[index]
             vertices = ((body.vertices_m - site.position_T_m) @ site.T_from_L).astype(np.float32)
             smooth = np.zeros(len(body.faces), dtype=bool)
-            vehicle = None if self.vehicle is None else assemble.render_vehicle(self.scene, self.vehicle)
+            vehicle = assemble.render_vehicle(self.scene, self.vehicle)
             surface = render.TerrainMesh(vertices, body.faces, smooth, vehicle=vehicle)
             self._model = Terrain(body=body, site=site, surface=surface, vehicle=self.vehicle)
         return self._model
@@ -229,15 +229,12 @@ class Session:
             render.set_threads(self._threads)
         activity.begin(f"terrain of site {site.index}")
         patch = self.patch(site, detail)
-        site, surface = patch.site, self.surface(patch)
-        del patch
-        return Terrain(body=self.body, site=site, surface=surface, vehicle=self.vehicle)
+        return Terrain(body=self.body, site=patch.site, surface=self.surface(patch), vehicle=self.vehicle)
 
     def surface(self, patch: Patch) -> TerrainMesh:
         """Return the renderer's copy of a patch, with relief finer than its facets and the scene's spacecraft."""
         from .. import render
 
-        vehicle = None if self.vehicle is None else assemble.render_vehicle(self.scene, self.vehicle)
         law = self.body.roughness.with_hurst(self.scene.patch.hurst)
         fine = render.FineRelief(
             slope=0.0,
@@ -256,7 +253,7 @@ class Session:
             patch.faces,
             patch.face_is_flat,
             dust=patch.dust,
-            vehicle=vehicle,
+            vehicle=assemble.render_vehicle(self.scene, self.vehicle),
             fine=replace(fine, slope=slope),
             albedo=assemble.render_albedo(self.scene, patch.site),
         )

@@ -67,6 +67,11 @@ class Pose:
     resolved: bool
     terrain: Terrain | None = None
 
+    @property
+    def sees_sun(self) -> bool:
+        """Return whether the whole Sun is visible before the camera."""
+        return self.sun_visible_fraction == 1.0 and float(self.L_from_C[:, 2] @ self.sun_L) > 0
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SampleSpec:

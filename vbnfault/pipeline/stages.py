@@ -140,17 +140,11 @@ def simulate_stored_view(
 
 def _frame(view: _RenderedView, views: int, run: StageRunner) -> Frame:
     """Run the last stages of a sample, whose view is kept, and return its frame."""
-    spec = view.spec
     return Frame(
-        spec=spec,
+        **vars(view),
         views=views,
-        pose=view.pose,
-        rendering=view.rendering,
-        starless=view.starless,
-        exposure=view.exposure,
-        injection=view.injection,
-        images=run(take_images, spec, view.injection),
-        labels=run(label, spec, view.injection),
+        images=run(take_images, view.spec, view.injection),
+        labels=run(label, view.spec, view.injection),
     )
 
 

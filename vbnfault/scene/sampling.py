@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from ..core.quantities import SOFT_KINDS
-from ..core.tables import Table, ordered, pair_within
+from ..core.tables import Table, each_once, ordered, pair_within
 
 _LAYERS = (
     "clean|depth_m|normal|semantic|raw|defects|radiance|scene_radiance|mask_effect|"
@@ -15,14 +15,6 @@ _LAYERS = (
     + "|".join(f"[a-z0-9_]+_{kind}" for kind in SOFT_KINDS)
 )
 Layer = Annotated[str, Field(pattern=f"^({_LAYERS})$")]
-
-
-def _each_once(layers: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the layers as they are. Raises ValueError if one is named twice."""
-    for k, layer in enumerate(layers):
-        if layer in layers[:k]:
-            raise ValueError(f"{layer} is named twice")
-    return layers
 
 
 class SplitTable(Table):
@@ -63,7 +55,7 @@ class DatasetTable(Table):
         "device of the detector, noise and, with camera.exposure_stops, exposure; must divide samples and "
         "shard_samples",
     )
-    layers: Annotated[tuple[Layer, ...], AfterValidator(_each_once)] = Field(
+    layers: Annotated[tuple[Layer, ...], AfterValidator(each_once)] = Field(
         DEFAULT_LAYERS, description="optional layers that are stored"
     )
     radiance_dtype: Literal["float32", "float16"] = Field(

@@ -11,39 +11,32 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-from ..core import activity, file_contents
-from ..core.errors import InputChanged, InputError, VbnfaultError
-from ..core.interrupts import check, finishing
+from ..core import file_contents
+from ..core.errors import InputError
+from ..core.interrupts import finishing
 from ..core.whole_files import kind_of
 from ..dataset.progress import Progress
-from ..dataset.work import Fatal, Lazy, Queue, Tick, describe
+from ..dataset.work import ItemsFailed, Job, Lazy, Tick, attempt
 from . import results
 from .designs import Design
 from .spec import Evaluation, Evaluator, EvaluatorFactory, StudySpec
 
 _LARGEST_CHUNK = 32  # evaluations in a task, and in a file of finished rows
 _SECONDS_BETWEEN_WRITES = 5.0  # a kill loses no more work of a worker than this
-_HOPELESS = 32  # after so many failures without one success the study stops: the others would fail, too
 
 
-class StudyFailed(VbnfaultError):
+class StudyFailed(ItemsFailed):
     """Report that some evaluations failed. All others are in the table; the indices leave out what is incomplete.
 
-    Attributes
-    ----------
-    failures
-        By evaluation, one line and the traceback, or a sentence on how its worker ended.
-    indices
-        The indices; None if the study was stopped before it was complete.
+    `indices`: the indices; None if the study was stopped before it was complete.
     """
 
     def __init__(self, sentence: str, failures: Mapping[int, str] | None = None, indices: Any = None) -> None:
-        super().__init__(sentence)
-        self.failures, self.indices = dict(failures or {}), indices
+        super().__init__(sentence, failures)
+        self.indices = indices
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,6 +91,7 @@ class ChunkWorker:
         folder = self._source.path
         outcomes, seconds_before = _finished(folder, task.number)
         unwritten, written = 0, time.monotonic()
+        by_index = {evaluation.index: evaluation for evaluation in task.evaluations}
 
         def write() -> None:
             now = Counter(self._evaluator().timings())
@@ -109,21 +103,14 @@ class ChunkWorker:
             self._seconds = now
 
         try:
-            for evaluation in task.evaluations:
-                i = evaluation.index
+            for i in by_index:
                 if i in outcomes:
                     tick(i, "kept", "")
                     continue
                 if i in task.skip:
                     continue
-                check()
-                tick(i, "begun", "")
-                try:
-                    with activity.reported_to(partial(tick, i, "stage")):
-                        values = self._values(evaluation)
-                except Exception as error:
-                    check()
-                    tick(i, "failed", describe(error))
+                values = attempt(i, lambda index: self._values(by_index[index]), tick)
+                if values is None:
                     continue
                 outcomes[i] = {"values": values, "error": ""}
                 unwritten += 1
@@ -140,16 +127,10 @@ class ChunkWorker:
                     write()
 
     def _values(self, evaluation: Evaluation) -> dict[str, float]:
-        """Return the metrics of an evaluation.
-
-        Raises Fatal if no evaluator can be made, or if an input file has changed.
-        """
+        """Return the metrics of an evaluation. Raises Fatal if no evaluator can be made."""
         evaluator = self._evaluator()
-        try:
-            with self._source.contents.in_use():
-                values = evaluator.evaluate(evaluation)
-        except InputChanged as error:  # every other evaluation would fail, too
-            raise Fatal(error) from error
+        with self._source.contents.in_use():
+            values = evaluator.evaluate(evaluation)
         missing = [name for name in self._source.metrics if name not in values]
         if missing:
             raise InputError(f"the evaluator gives no value for {', '.join(missing)}, of metrics.names")
@@ -174,13 +155,14 @@ def _as_error(folder: Path) -> Iterator[None]:
         ) from error
 
 
-class StudyJob:
+class StudyJob(Job):
     """Hand out the chunks of a study, and collect what became of their evaluations."""
 
-    task_noun, item_noun = "chunk", "evaluation"
+    noun, task_noun, item_noun = "study", "chunk", "evaluation"
+    error, successes = StudyFailed, ("built", "kept")
 
     def __init__(self, path: Path, design: Design, progress: Progress) -> None:
-        self.path, self.progress, self.design = path, progress, design
+        self.design = design
         seeds, views, rows, models = design.shape
         in_block = rows * models
         self.chunk_size = size = min(_LARGEST_CHUNK, max(1, in_block // 64))
@@ -189,21 +171,13 @@ class StudyJob:
             for block in range(seeds * views)
             for first in range(0, in_block, size)
         ]
-        self._queue = Queue({n: chunk.start // in_block for n, chunk in enumerate(self._chunks)})
+        super().__init__(path, progress, {n: chunk.start // in_block for n, chunk in enumerate(self._chunks)})
         self.finished = 0
         for number, chunk in enumerate(self._chunks):
             try:
                 self.finished += len(results.read_chunk(path, number)[0].keys() & set(chunk))
             except ValueError as damaged:
                 progress.say(f"note: {damaged}; its evaluations are made again")
-        self.failures: dict[int, str] = {}
-        self._succeeded = 0
-        self._counted: set[int] = set()
-
-    @property
-    def tasks(self) -> int:
-        """Return the number of chunks."""
-        return len(self._chunks)
 
     def items(self, number: int) -> Sequence[int]:
         """Return the evaluations of a chunk."""
@@ -213,27 +187,6 @@ class StudyJob:
         """Return the task that completes a chunk."""
         evaluations = tuple(self.design.evaluation(i) for i in self._chunks[number])
         return Chunk(number=number, evaluations=evaluations, skip=skip, careful=careful)
-
-    def next_task(self, last: int | None = None, busy: Sequence[int] = ()) -> int | None:
-        """Return the chunk that a worker does after the chunk `last`, of the same seed and view if one is left."""
-        return self._queue.next(last, busy)
-
-    def tick(self, item: int, what: str, text: str) -> None:
-        """Record an event. Raises StudyFailed after too many failures without a success."""
-        if what == "stage":
-            self.progress.stage(text)
-        elif what != "begun":
-            if what == "failed":
-                self.failures[item] = text
-                self.progress.say(f"evaluation {item} failed: {text.splitlines()[0]}")
-            else:
-                self.failures.pop(item, None)
-                self._succeeded += 1
-            if item not in self._counted:
-                self._counted.add(item)
-                self.progress.advance(what == "built")
-            if not self._succeeded and len(self.failures) >= _HOPELESS:
-                self.raise_failures(None, " before any succeeded, so the study was stopped")
 
     def outcomes(self) -> list[dict[str, Any]]:
         """Return values and error of each evaluation, in order."""
@@ -251,22 +204,3 @@ class StudyJob:
         for number in range(self.tasks):
             seconds.update(_finished(self.path, number)[1])
         return dict(seconds)
-
-    def raise_failures(self, indices: Any, why: str = "") -> None:
-        """Raise StudyFailed with the failed evaluations, if there are any."""
-        if not self.failures:
-            return
-        failed = sorted(self.failures)
-        names = ", ".join(map(str, failed[:8])) + (", ..." if len(failed) > 8 else "")
-        listed = f"evaluation {names}" if len(failed) == 1 else f"{len(failed)} evaluations ({names})"
-        rest = (
-            "all others are in the table, and the indices leave out incomplete base samples"
-            if indices is not None
-            else "finished evaluations stay"
-        )
-        raise StudyFailed(
-            f"{self.path}: {listed} of {len(self.design)} failed{why}, the first with: "
-            f"{self.failures[failed[0]].splitlines()[0]}; {rest}; the same command tries the failed ones again",
-            self.failures,
-            indices,
-        )

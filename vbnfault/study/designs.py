@@ -152,7 +152,7 @@ def levels(spec: StudySpec) -> list[NDArray[np.float64]]:
     """
     n = spec.design.n
     return [
-        factor.points(factor.choices)
+        factor.points()
         if isinstance(factor, Categorical)
         else np.linspace(0.0, 1.0, n)
         if n > 1

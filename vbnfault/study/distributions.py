@@ -5,14 +5,13 @@ Every design is made in the unit hypercube, so that one design serves all distri
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
-from ..core.tables import Table
+from ..core.tables import Table, each_once
 
 _MOST_DEVIATIONS = 1e6
 _NODES = 64  # of a quadrature
@@ -70,10 +69,6 @@ class Uniform(_Bounded):
         u = np.asarray(points, dtype=np.float64)
         return self.low * (1 - u) + self.high * u
 
-    def points(self, values: ArrayLike) -> NDArray[np.float64]:
-        """Return the points of the unit interval at which the values are taken."""
-        return (np.asarray(values, dtype=np.float64) - self.low) / (self.high - self.low)
-
 
 class LogUniform(_Bounded):
     """Distribute the logarithm of a factor evenly between two bounds above 0."""
@@ -86,11 +81,6 @@ class LogUniform(_Bounded):
         u = np.asarray(points, dtype=np.float64)
         logarithm = np.log(self.low) * (1 - u) + np.log(self.high) * u
         return np.clip(np.exp(logarithm), self.low, self.high)  # the exponential may round past a bound
-
-    def points(self, values: ArrayLike) -> NDArray[np.float64]:
-        """Return the points of the unit interval at which the values are taken."""
-        ratio = np.log(np.asarray(values, dtype=np.float64) / self.low)
-        return ratio / np.log(self.high / self.low)
 
 
 class TruncatedNormal(_Bounded):
@@ -119,16 +109,11 @@ class TruncatedNormal(_Bounded):
         scaled = stats.truncnorm.ppf(points, *self._limits(), loc=self.mean, scale=self.deviation)
         return np.clip(np.asarray(scaled, dtype=np.float64), self.low, self.high)
 
-    def points(self, values: ArrayLike) -> NDArray[np.float64]:
-        """Return the points of the unit interval at which the values are taken."""
-        from scipy import stats
-
-        fractions = stats.truncnorm.cdf(values, *self._limits(), loc=self.mean, scale=self.deviation)
-        return np.asarray(fractions, dtype=np.float64)
-
     def nominal(self) -> float:
         """Return the point of the unit interval at which a one-at-a-time design holds the factor: the mean."""
-        return float(self.points(self.mean))
+        from scipy import stats
+
+        return float(stats.truncnorm.cdf(self.mean, *self._limits(), loc=self.mean, scale=self.deviation))
 
     def coordinates(self, points: ArrayLike) -> NDArray[np.float64]:
         """Return the coordinates, from -1 to 1, of points of the unit interval: the values, scaled."""
@@ -157,14 +142,9 @@ class Categorical(_Factor):
     """Choose a factor's value from a list, each with the same probability. The first one is the nominal value."""
 
     distribution: Literal["categorical"] = Field(description="name of the distribution")
-    choices: tuple[float | _Text, ...] = Field(min_length=2, alias="values", description="the values, at least two")
-
-    @model_validator(mode="after")
-    def _differ(self) -> Categorical:
-        twice = [choice for i, choice in enumerate(self.choices) if choice in self.choices[:i]]
-        if twice:
-            raise ValueError(f"values = {list(self.choices)!r}: {twice[0]!r} is given twice")
-        return self
+    choices: Annotated[tuple[float | _Text, ...], Field(min_length=2), AfterValidator(each_once)] = Field(
+        alias="values", description="the values, at least two"
+    )
 
     def values(self, points: ArrayLike) -> NDArray[np.object_]:
         """Return the values at points of the unit interval, of which each value has an equal part."""
@@ -172,10 +152,9 @@ class Categorical(_Factor):
         chosen = np.array(self.choices, dtype=object)
         return np.asarray(chosen[np.clip(index, 0, len(self.choices) - 1)])
 
-    def points(self, values: ArrayLike | Sequence[str]) -> NDArray[np.float64]:
-        """Return the middle of the part of the unit interval in which each value is taken."""
-        index = [self.choices.index(value) for value in np.ravel(np.asarray(values, dtype=object)).tolist()]
-        return ((np.array(index, dtype=np.float64) + 0.5) / len(self.choices)).reshape(np.shape(values))
+    def points(self) -> NDArray[np.float64]:
+        """Return for each value the middle of the part of the unit interval in which it is taken."""
+        return (np.arange(len(self.choices)) + 0.5) / len(self.choices)
 
     def nominal(self) -> float:
         """Return the point of the unit interval at which a one-at-a-time design holds the factor."""

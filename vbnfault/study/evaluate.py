@@ -3,7 +3,7 @@
     render ▶ metered light ▶ ghosts, starburst, glare, veil ▶ metrics
 
 A view is rendered once; optics, Sun and detector act on its radiance. The results of each stage are kept with all
-that the stage depends on (`kept`), a few of them at a time, so that the result of an evaluation does not depend on
+that the stage depends on (`_Kept`), a few of them at a time, so that the result of an evaluation does not depend on
 those before it. In a Sobol design the points AB differ from their point A in one factor, so most of their stages
 are found there.
 
@@ -17,11 +17,14 @@ of field of the render are those of the nominal lens.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
-from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass, replace
+import time
+from collections import Counter, OrderedDict
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property, lru_cache, partial
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +32,7 @@ from numpy.typing import NDArray
 from ..camera import Camera
 from ..core import spectra
 from ..core.errors import InputError, in_file, shown
+from ..core.shared_results import SharedResults
 from ..core.spectra import Bands
 from ..core.tables import did_you_mean
 from ..faults import Fault, FaultContext
@@ -44,11 +48,20 @@ from ..pipeline.resolve import resolve
 from ..pipeline.session import Session
 from ..pipeline.spec import Injection, SampleSpec
 from ..scene.config import Scene, configure_faults
-from . import chosen_fault, image_metrics
+from . import image_metrics
 from . import navigation_metrics as nav
-from .factors import Factors, Setting, StudyScene, base_scene, changed_scene
+from .factors import (
+    FAULT_KEY,
+    FAULT_SCENE_KEY,
+    Factors,
+    Setting,
+    StudyScene,
+    acting_faults,
+    base_scene,
+    changed_scene,
+    fault_choices,
+)
 from .image_metrics import LitImage
-from .kept import Kept
 from .spec import Evaluation, Metric, StudySpec
 from .views import (
     CleanView,
@@ -64,6 +77,10 @@ from .views import (
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
+T = TypeVar("T")
+
+# How many results of each stage are kept beside those of the base row A of a Sobol design; default: two.
+_KEPT = {"render": 1}
 _NAVIGATION: Mapping[str, Metric] = {metric.name: metric for metric in nav.METRICS}
 
 
@@ -83,7 +100,7 @@ class SceneEvaluator:
 
     def __init__(self, spec: StudySpec) -> None:
         self.spec = spec
-        self.kept = Kept()
+        self.kept = _Kept()
         self._source = f"study {shown(spec.title)}"
         self._session: tuple[Hashable, Session] | None = None
         with in_file(self._source):
@@ -94,10 +111,10 @@ class SceneEvaluator:
                 plain = [self.scene_of(self._base.dataset.seed, model) for model in spec.models.compare]
             # a session also draws the plan of its scene and checks its faults
             cameras = [Session(made.scene, source=self._source).base_camera for made in plain]
-            self._chosen_faults = chosen_fault.choices(spec)
+            self._chosen_faults = fault_choices(spec)
             for choice in self._chosen_faults:
-                made = self.scene_of(spec.scene.seeds[0], "", ((chosen_fault.SCENE_KEY, choice),))
-                configure_faults(made.scene, f"{chosen_fault.KEY} = {choice!r}")
+                made = self.scene_of(spec.scene.seeds[0], "", ((FAULT_SCENE_KEY, choice),))
+                configure_faults(made.scene, f"{FAULT_KEY} = {choice!r}")
             self._nominal_camera = camera = cameras[0]
             adding = [name for made in plain for name, f in made.faults.items() if f.soft_layer.endswith("_added")]
             self._adding = adding[0] if adding else ""  # the fault that adds light
@@ -136,7 +153,7 @@ class SceneEvaluator:
         _ = self.metrics
         places: dict[str, set[str]] = {}
         for i, factor in enumerate(self.spec.factors):
-            if factor.key == chosen_fault.KEY:
+            if factor.key == FAULT_KEY:
                 continue  # a fault need not act in the first view
             try:
                 places[factor.key] = self._places_without(factor)
@@ -174,7 +191,7 @@ class SceneEvaluator:
     def _acts(self, model: str, point: Mapping[str, float | str], key: str, value: float | str) -> bool:
         """Return whether another value of a factor changes a bit of the light at a point, with any chosen fault."""
         for choice in self._chosen_faults or ("",):
-            at = {**point, chosen_fault.KEY: choice} if choice else point
+            at = {**point, FAULT_KEY: choice} if choice else point
             with self.kept.holding("check"):
                 base = self._fingerprint(model, at)
             if self._fingerprint(model, {**at, key: value}) != base:
@@ -229,7 +246,7 @@ class SceneEvaluator:
             if self._chosen_faults:
                 raise InputError(
                     f"metrics.names: {name!r} measures the straylight of the scene; "
-                    f"with the factor {chosen_fault.KEY} use metrics of navigation: {', '.join(_NAVIGATION)}"
+                    f"with the factor {FAULT_KEY} use metrics of navigation: {', '.join(_NAVIGATION)}"
                 )
             if not self._adding:
                 raise InputError(
@@ -400,9 +417,9 @@ class SceneEvaluator:
         frames = self._navigation_frames(evaluation, setting, nav.views_needed(names))
         if not frames:
             return dict.fromkeys(names, float("nan"))
-        clean = self._clean_views(evaluation, setting, len(frames))
+        _, twins = self._clean_views(evaluation, setting, len(frames))
         with self.kept.timed("navigation"):
-            return nav.navigation_values(frames, names, clean.twins)
+            return nav.navigation_values(frames, names, twins)
 
     def _navigation_frames(self, evaluation: Evaluation, setting: Setting, count: int) -> list[nav.NavigationFrame]:
         """Return the clean and the faulted image of the first `count` views of an evaluation's sequence.
@@ -412,12 +429,12 @@ class SceneEvaluator:
         made = self._scene(evaluation, setting)
         frames: list[nav.NavigationFrame] = []
         first: Injection | None = None
-        for clean in self._clean_views(evaluation, setting, count).views:
+        for clean in self._clean_views(evaluation, setting, count)[0]:
             with self.kept.timed("faults"):
                 spec = replace(clean.spec, scene=made.scene, faults=made.faults)
                 view = spec, clean.pose, clean.rendering, clean.exposure
                 if first is None:
-                    chosen = chosen_fault.acting(made.faults, spec, clean.pose) if self._chosen_faults else None
+                    chosen = acting_faults(made.faults, spec, clean.pose) if self._chosen_faults else None
                     first = injection = inject_faults(*view, commanded=chosen)
                     if self._chosen_faults and not first.draws:
                         return []
@@ -427,37 +444,41 @@ class SceneEvaluator:
                 frames.append(replace(clean.frame, image=image))
         return frames
 
-    def _clean_views(self, evaluation: Evaluation, setting: Setting, count: int) -> _CleanSequence:
-        """Return the first `count` views of an evaluation's sequence without faults."""
-        without = replace(setting, scene={k: v for k, v in setting.scene.items() if k != chosen_fault.SCENE_KEY})
+    def _clean_views(
+        self, evaluation: Evaluation, setting: Setting, count: int
+    ) -> tuple[Sequence[CleanView], nav.CleanTwins]:
+        """Return the first `count` views of an evaluation's sequence without faults, and their clean twins."""
+        without = replace(setting, scene={k: v for k, v in setting.scene.items() if k != FAULT_SCENE_KEY})
         made = self._scene(evaluation, without)
         view = self._view(evaluation, made)
         key = made.render_key, evaluation.view, count
         sequence = self.kept.once("render", key, lambda: list(rendered_sequence(view, count)), "sequence")
         sun, detector = tuple(sorted(setting.sun.items())), tuple(sorted(setting.detector.items()))
 
-        def make() -> _CleanSequence:
+        def make() -> tuple[Sequence[CleanView], nav.CleanTwins]:
             seen = (self._seen(view, evaluation, made, setting) for view in sequence)
             views = [CleanView.of(view, nominal.spec.camera) for view, nominal in zip(seen, sequence, strict=True)]
-            return _CleanSequence(views=views, twins=nav.CleanTwins.of([view.frame for view in views]))
+            return views, nav.CleanTwins([view.frame for view in views])
 
         return self.kept.once("clean twins", (*key, made.scene.camera, tuple(setting.lens), detector, sun), make)
 
     # --- what a factor moves --------------------------------------------------------------------------------------
 
+    def _check_of(self, model: str, values: Mapping[str, float | str]) -> Evaluation:
+        """Return the evaluation of a point on the first view."""
+        seed, view = self.spec.scene.seeds[0], self.spec.scene.views[0]
+        return Evaluation(index=0, seed=seed, view=view, model=model, role="check", values=values)
+
     def _refuse(self, model: str, values: Mapping[str, float | str]) -> None:
         """Raise InputError if a scene, a sensor or a lens cannot have the values of a point."""
-        seed, view = self.spec.scene.seeds[0], self.spec.scene.views[0]
-        evaluation = Evaluation(index=0, seed=seed, view=view, model=model, role="check", values=values)
         setting = self.factors.setting(values)
         changed(self._nominal_lens, setting.lens)
         with_detector(self._nominal_camera, setting.detector)
-        self._scene(evaluation, setting)
+        self._scene(self._check_of(model, values), setting)
 
     def _fingerprint(self, model: str, values: Mapping[str, float | str]) -> str:
         """Return a digest of all light, noise and images of the first view at a point."""
-        seed, view = self.spec.scene.seeds[0], self.spec.scene.views[0]
-        evaluation = Evaluation(index=0, seed=seed, view=view, model=model, role="check", values=values)
+        evaluation = self._check_of(model, values)
         digest = hashlib.sha256()
         if any(name not in _NAVIGATION for name in self.spec.metrics.names):
             image = self._lit_image(evaluation, self.factors.setting(values))
@@ -469,14 +490,6 @@ class SceneEvaluator:
         if any(name in _NAVIGATION for name in self.spec.metrics.names):
             digest.update(repr(sorted(self.evaluate(evaluation).items())).encode())
         return digest.hexdigest()
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _CleanSequence:
-    """Hold the views of a sequence, and what the metrics need of their clean twins."""
-
-    views: Sequence[CleanView]
-    twins: nav.CleanTwins
 
 
 # --- values and images -------------------------------------------------------------------------------------------
@@ -512,3 +525,85 @@ def _added_by(fault: Fault, exposed: Exposed, params: Any) -> dict[str, Any]:
     added = np.ascontiguousarray(np.moveaxis(image, -1, 0)) - exposed.clean
     light = {"kept": exposed.clean, "direct": exposed.direct_e, "added": np.maximum(added, 0)}
     return {**light, "parts_e": {}, "ghosts_e": ()}
+
+
+# --- results of stages -------------------------------------------------------------------------------------------
+
+
+class _Kept:
+    """Keep the last results of each stage, and count and time the computations.
+
+    Attributes
+    ----------
+    events
+        How often each stage was computed.
+    seconds
+        How long that took.
+    """
+
+    def __init__(self) -> None:
+        self.events: Counter[str] = Counter()
+        self.seconds: dict[str, float] = {}
+        self._results: dict[str, OrderedDict[Hashable, Any]] = {}
+        self._held: dict[str, set[tuple[str, Hashable]]] = {}
+        self._holder: str | None = None
+
+    @contextlib.contextmanager
+    def holding(self, holder: str) -> Iterator[None]:
+        """Hold what a block uses until the next block of the same holder, in place of what that one used."""
+        self._held[holder], self._holder = set(), holder
+        try:
+            yield
+        finally:
+            self._holder = None
+
+    def once(self, stage: str, key: Hashable, make: Callable[[], T], part: str = "") -> T:
+        """Return `make()` for a key, from the last results of the stage where it was computed before.
+
+        `part` separates results of one stage that have keys of their own.
+        """
+        name = f"{stage}/{part}"
+        results = self._results.setdefault(name, OrderedDict())
+        if self._holder is not None:
+            self._held[self._holder].add((name, key))
+        if key not in results:
+            with self.timed(stage):
+                results[key] = make()
+            if not part:
+                self.events[stage] += 1
+        value: T = results[key]
+        results.move_to_end(key)
+        held = set().union(*self._held.values())
+        loose = [other for other in results if (name, other) not in held]
+        for other in loose[: max(len(loose) - _KEPT.get(stage, 2), 0)]:
+            del results[other]
+        return value
+
+    def release(self, holder: str) -> None:
+        """Stop holding what a block used."""
+        self._held.pop(holder, None)
+
+    @contextlib.contextmanager
+    def timed(self, stage: str) -> Iterator[None]:
+        """Add the duration of a block to a stage."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
+
+    def of_view(self, view: Hashable) -> SharedResults:
+        """Return results of the pipeline's stages that evaluations with an equal `view` share."""
+        return _OfView(self, view)
+
+
+class _OfView(SharedResults):
+    """Keep the results of one view among those of all views."""
+
+    def __init__(self, kept: _Kept, view: Hashable) -> None:
+        super().__init__(kept=True)
+        self._all, self._view = kept, view
+
+    def once(self, name: str, key: Hashable, make: Callable[[], T]) -> T:
+        """Return `make()` for a name and a key, from the last results where it was computed before."""
+        return self._all.once(name, (self._view, key), make, "view")

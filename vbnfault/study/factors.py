@@ -5,7 +5,10 @@ There are four kinds of keys:
 `scene.<key>`
     Any key of the scene file. An interval of a fault, such as `scene.faults.straylight.roughness_nm`, is fixed to
     the value. A key that the renderer reads makes a render for every value. `scene.fault` chooses the fault that
-    acts (`chosen_fault`).
+    acts, a class or `class/model`, as the value of a categorical factor. The bounds of its draws are those of the
+    scene's table `[faults.<class>]` where the scene has one with this model, otherwise the model's own. Each
+    evaluation has this fault alone, so that it compares with the clean twin of the same view. A fault that cannot
+    act in a view, such as straylight with the Sun behind the camera, gives no value there.
 `lens.…`
     Changes of the prescription that the scene's faults trace, at its final size; a lens of the camera that has
     surfaces changes with it. Rows count from 0 at the front, as in the names of ghosts.
@@ -42,10 +45,15 @@ from ..core.tables import did_you_mean
 from ..faults import Fault, from_dict, registry
 from ..lens import Prescription
 from ..lens.adapt import Change
+from ..pipeline.spec import Pose, SampleSpec
+from ..scene import plan
 from ..scene.config import Scene, parse_scene, read_scene
 from ..scene.instrument import OF_THE_DETECTOR
-from . import chosen_fault
+from .distributions import Categorical
 from .spec import StudySpec
+
+FAULT_KEY = "scene.fault"  # its values name the fault that acts
+FAULT_SCENE_KEY = "fault"  # the same among the keys of a scene
 
 _SPELLINGS = {"electrons": "e", "e-": "e", "°": "deg", "um": "µm", "AU": "au", "1": "", "fraction": "", "dn": "DN"}
 _ENDINGS = {
@@ -179,6 +187,70 @@ def _fields(fault: str, model: str) -> dict[str, str]:
     return {f.name: f.metadata.get("unit", "") for f in dataclasses.fields(cls)}
 
 
+# --- a factor that chooses the fault ---------------------------------------------------------------------------
+
+
+def fault_choices(spec: StudySpec) -> tuple[str, ...]:
+    """Return the faults among which a factor of the study chooses; none where it has no such factor.
+
+    Raises
+    ------
+    InputError
+        The factor is no choice of names, or the study compares models, too.
+    """
+    for i, factor in enumerate(spec.factors):
+        if factor.key != FAULT_KEY:
+            continue
+        if not isinstance(factor, Categorical) or not all(isinstance(value, str) for value in factor.choices):
+            raise InputError(
+                f"factor[{i}].key = {FAULT_KEY!r}: must have distribution = 'categorical', and names of faults as "
+                "values"
+            )
+        if spec.models is not None:
+            raise InputError(
+                f"factor[{i}].key = {FAULT_KEY!r}: cannot stand beside [models]; name the models as values, such "
+                f"as '{spec.models.fault}/{spec.models.compare[0]}'"
+            )
+        return tuple(str(value) for value in factor.choices)
+    return ()
+
+
+def _only_fault(faults: Mapping[str, Mapping[str, Any]], choice: str) -> dict[str, dict[str, Any]]:
+    """Return the table `[faults]` of a scene that has the chosen fault alone.
+
+    Parameters
+    ----------
+    faults
+        The table `[faults]` of the scene.
+    choice
+        A fault class, or `class/model`.
+
+    Raises
+    ------
+    InputError
+        The class or the model is unknown.
+    """
+    name, _, model = choice.partition("/")
+    known = registry()
+    if name not in known:
+        raise InputError(f"{choice!r} is no fault{did_you_mean(name, list(known))}")
+    if model and model not in known[name]:
+        raise InputError(f"{choice!r} is no model of {name}{did_you_mean(model, list(known[name]))}")
+    default = next(key for key, cls in known[name].items() if cls.default)
+    own = {"model": default, **faults.get(name, {})}
+    return {name: own if model in ("", own["model"]) else {"model": model}}
+
+
+def acting_faults(faults: Mapping[str, Fault], spec: SampleSpec, pose: Pose) -> Sequence[str]:
+    """Return the faults that can act in a view.
+
+    Those that need the Sun act as in a dataset: where the view is one of those that face the Sun, and the whole Sun
+    is before the camera. A trajectory has no such views, so there the Sun alone decides.
+    """
+    faces = spec.scene.is_flown or spec.plan.stratum[spec.index] == plan.SUN_FACING
+    return [name for name, fault in faults.items() if (pose.sees_sun and faces) or not fault.needs_sun]
+
+
 # --- scenes ------------------------------------------------------------------------------------------------------
 
 
@@ -245,9 +317,9 @@ def changed_scene(
     """Return the scene of a study with a seed, with a model of the compared fault, and with changed keys."""
     table, own_changes = copy.deepcopy(base.resolved()), dict(changes)
     table["dataset"]["seed"] = seed
-    choice = own_changes.pop(chosen_fault.SCENE_KEY, None)
-    if chosen_fault.KEY in spec.keys:
-        table["faults"] = chosen_fault.table_of(table["faults"], choice) if choice else {}
+    choice = own_changes.pop(FAULT_SCENE_KEY, None)
+    if FAULT_KEY in spec.keys:
+        table["faults"] = _only_fault(table["faults"], choice) if choice else {}
         table["dataset"] |= {"layers": ["clean"], "mask_any": None}  # other layers may need other faults
     faults = table["faults"]
     if spec.models is not None and model:
@@ -283,7 +355,7 @@ def _scene_keys(spec: StudySpec, scene: Scene) -> list[Key]:
             models = list(spec.models.compare)
         for model in models:
             found |= {f"faults.{name}.{key}": unit for key, unit in _fields(name, model).items()}
-    keys = [Key(chosen_fault.KEY, (), _adder("scene", chosen_fault.SCENE_KEY))]
+    keys = [Key(FAULT_KEY, (), _adder("scene", FAULT_SCENE_KEY))]
     return keys + [_table_key("scene", key, unit) for key, unit in found.items()]
 
 

@@ -49,10 +49,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from . import chosen_fault, ranking
+from . import ranking
 from .bootstrap import bootstrap
 from .control_variates import LEAST_SAMPLES, Surrogates, fit, make_basis
 from .designs import Design, levels, salib, unit_problem
+from .factors import FAULT_KEY, fault_choices
 from .sobol_terms import SobolTerms, complete_samples, explained_variance, ratios, sobol_terms, split
 from .spec import DUMMY, Metric
 
@@ -85,11 +86,9 @@ class Results:
     metrics: tuple[Metric, ...]
     values: _Array
 
-    def blocks(self, metric: int, model: int, seed: int | None = None) -> _Array:
-        """Return the values of a metric with a model, float64[block, row]; of one seed, or of all."""
-        seeds = slice(None) if seed is None else slice(seed, seed + 1)
-        chosen = self.values[seeds, :, :, model, metric]
-        return chosen.reshape(-1, chosen.shape[-1])
+    def blocks(self, metric: int, model: int) -> _Array:
+        """Return the values of a metric with a model, float64[block, row]."""
+        return self.values[:, :, :, model, metric].reshape(-1, self.values.shape[2])
 
 
 def compute(results: Results) -> xr.Dataset:
@@ -113,7 +112,7 @@ def compute(results: Results) -> xr.Dataset:
         _add_ranges(arrays, results)
     if spec.models is not None and method in ("sobol", "latin_hypercube", "grid"):
         _add_model_share(arrays, results)
-    if chosen_fault.KEY in spec.keys:
+    if FAULT_KEY in spec.keys:
         ranking.add(arrays, results)
     names = [*spec.keys, DUMMY]
     coordinates: dict[str, Any] = {
@@ -123,8 +122,8 @@ def compute(results: Results) -> xr.Dataset:
         "factor_b": names,
         "seed": list(spec.scene.seeds),
         "bound": ["low", "high"],
-        "fault": list(chosen_fault.choices(spec)),
-        "fault_b": list(chosen_fault.choices(spec)),
+        "fault": list(fault_choices(spec)),
+        "fault_b": list(fault_choices(spec)),
         "quantile": list(ranking.QUANTILES),
     }
     used = {name for dims, _ in arrays.values() for name in dims}
@@ -532,6 +531,8 @@ def _add_model_share(arrays: dict[str, tuple[tuple[str, ...], _Array]], results:
         y = results.values[:, :, rows, :, i]  # [seed, view, row, model]
         y = y.reshape(-1, int(rows.sum()) // per_base, per_base * y.shape[-1])
         complete = np.asarray(np.isfinite(y).all(axis=-1))
+        if not complete.any():
+            continue  # a metric that never has a value
         y, complete = y[:, complete.any(axis=0)], complete[:, complete.any(axis=0)]
         y = np.where(complete[..., None], y, 0.0)
         centre = y.sum(axis=(1, 2)) / np.maximum(complete.sum(axis=1), 1) / y.shape[-1]

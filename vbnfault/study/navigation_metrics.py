@@ -246,23 +246,10 @@ def _sun_visible(spec: SampleSpec, pose: Pose, positions: F64) -> F64:
 
 
 class CleanTwins:
-    """Compute what the metrics need of the clean twins of a sequence once, for all faults on its views.
+    """Compute what the metrics need of the clean twins of a sequence of frames once, for all faults on them."""
 
-    Parameters
-    ----------
-    images
-        uint8[y, x, 4] each: the clean twins.
-    views
-        Their views.
-    """
-
-    def __init__(self, images: Sequence[NDArray[np.uint8]], views: Sequence[navigation.CameraView]) -> None:
-        self.images, self.views = images, views
-
-    @classmethod
-    def of(cls, frames: Sequence[NavigationFrame]) -> CleanTwins:
-        """Return what the metrics need of the clean twins of frames."""
-        return cls([frame.clean for frame in frames], [frame.view for frame in frames])
+    def __init__(self, frames: Sequence[NavigationFrame]) -> None:
+        self.images, self.views = [frame.clean for frame in frames], [frame.view for frame in frames]
 
     @cached_property
     def matches(self) -> navigation.Matches:
@@ -442,5 +429,5 @@ def navigation_values(
         raise ValueError(f"{len(frames)} views: these metrics need {needed}")
     if not needed:
         return {}
-    computed = _Frames(frames, clean or CleanTwins.of(frames))
+    computed = _Frames(frames, clean or CleanTwins(frames))
     return {name: float(_COMPUTED[name](computed)) for name in names if name in _COMPUTED}

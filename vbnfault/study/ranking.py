@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from . import chosen_fault
 from .bootstrap import bootstrap
+from .factors import FAULT_KEY, fault_choices
 
 if TYPE_CHECKING:
     from .indices import Results
@@ -76,8 +76,8 @@ def by_view(results: Results) -> F64:
     Each seed has its own views. The value is the median over the points of the design with this fault.
     """
     spec = results.design.spec
-    column = results.design.values[spec.keys.index(chosen_fault.KEY)]
-    names = chosen_fault.choices(spec)
+    column = results.design.values[spec.keys.index(FAULT_KEY)]
+    names = fault_choices(spec)
     seeds, views, _, models = results.design.shape
     out = np.full((len(results.metrics), models, len(names), seeds * views), np.nan)
     for k, name in enumerate(names):

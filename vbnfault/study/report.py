@@ -7,10 +7,9 @@ in its folder, with the images that `write_images` has made before. The template
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
@@ -21,14 +20,9 @@ from ..core.figures import formula, inline_svg, png_bytes, svg_text
 from ..core.html_page import image_url, number_text, with_minus, write_page
 from ..core.images import write_png
 from ..core.whole_files import own, own_folder, write_whole
-from .plots import drawings
-from .ranking_plots import ranking_rows
+from .plots import drawings, ranking_rows
 from .spec import Evaluation
 from .summaries import DUMMY, StudyResults
-
-if TYPE_CHECKING:
-    import pyarrow as pa
-    import xarray as xr
 
 PAGE = "report.html"
 PLOTS = "plots"
@@ -54,25 +48,12 @@ _COLUMNS = {
 }
 
 
-def write_report(
-    folder: str | os.PathLike[str], dataset: xr.Dataset, table: pa.Table, spec: Mapping[str, Any]
-) -> Path:
+def write_report(folder: Path, results: StudyResults) -> Path:
     """Draw all figures of a study and write its page; return the path of the page.
 
-    Parameters
-    ----------
-    folder
-        Folder of the study. The figures go to its folder `plots`; images are taken from its folder `images`.
-    dataset, table, spec
-        As in `summaries.StudyResults`.
-
-    Raises
-    ------
-    OSError
-        If a file cannot be written.
+    The figures go to the folder `plots` of the study's folder; images are taken from its folder `images`. Raises
+    OSError if a file cannot be written.
     """
-    folder = Path(folder)
-    results = StudyResults(dataset=dataset, table=table, spec=spec)
     own_folder(folder / PLOTS)
     figures: dict[str, list[tuple[Markup, str]]] = {}
     for drawing in drawings(results):
@@ -86,7 +67,7 @@ def write_report(
         own(path),
         "study/report.html",
         results=results,
-        design=spec["design"],
+        design=results.spec["design"],
         only_faults=results.has("fault_quantile") and len(results.factors) == 1,
         figures=figures,
         formula=formula,
@@ -102,9 +83,9 @@ def write_report(
         missed=_missed(results),
         without_value=_without_value(results),
         failures=_failures(results),
-        scene=Path(str(spec.get("scene", {}).get("base", ""))).name,
-        timings=_json(dataset.attrs.get("timings")),
-        versions=_json(dataset.attrs.get("versions")),
+        scene=Path(str(results.spec.get("scene", {}).get("base", ""))).name,
+        timings=_json(results.dataset.attrs.get("timings")),
+        versions=_json(results.dataset.attrs.get("versions")),
         most_rows=_MOST_ROWS,
         counts=_counts(results),
     )
@@ -121,9 +102,7 @@ def _counts(results: StudyResults) -> dict[str, int]:
 # ------------------------------------------------------------------------------------ best and worst images
 
 
-def write_images(
-    folder: str | os.PathLike[str], dataset: xr.Dataset, table: pa.Table, spec: Mapping[str, Any], evaluator: Any
-) -> list[Path]:
+def write_images(folder: Path, results: StudyResults, evaluator: Any) -> list[Path]:
     """Write the images with the best and the worst value of each metric to `images`; return their paths.
 
     Images of 8 bits are written as they are. Otherwise the two images of a metric have one exposure and one tone
@@ -133,7 +112,7 @@ def write_images(
 
     Parameters
     ----------
-    folder, dataset, table, spec
+    folder, results
         As for `write_report`. The images go to the folder `images`.
     evaluator
         Evaluator of the study; `picture(evaluation)` returns an image, [y, x] or [y, x, 3], in electrons, linear,
@@ -142,13 +121,12 @@ def write_images(
     picture = getattr(evaluator, "picture", None)
     if picture is None:
         return []
-    results = StudyResults(dataset=dataset, table=table, spec=spec)
     paths: list[Path] = []
     kept: dict[int, NDArray[Any]] = {}
 
     def image(row: int) -> NDArray[Any]:
         if row not in kept:
-            values = table.slice(row, 1).to_pylist()[0]
+            values = results.table.slice(row, 1).to_pylist()[0]
             evaluation = Evaluation(
                 index=int(values["evaluation"]),
                 seed=int(values["seed"]),
@@ -166,7 +144,7 @@ def write_images(
             continue
         names = ("best", "worst")
         pair = _shown([image(extremes.best_row), image(extremes.worst_row)])
-        images = own_folder(Path(folder) / IMAGES)
+        images = own_folder(folder / IMAGES)
         for name, each in zip(names, pair, strict=True):
             paths.append(write_png(own(images / f"{metric}_{name}.png"), each))
     return paths

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -41,9 +42,16 @@ _PANEL = (134.0, 88.0)  # width and height of a response curve in points
 _LOG_RATIO = 100.0  # a metric that varies more gets a logarithmic axis
 
 
-def panel_width(results: StudyResults) -> float:
-    """Return the width in points of one of the panels side by side, one for each model."""
-    return {1: 210.0, 2: 165.0}.get(len(results.models), 140.0)
+@contextlib.contextmanager
+def rows_of_factors(
+    results: StudyResults, metric: str, order: Sequence[str], legend: Sequence[Any], *, separate_last: bool = False
+) -> Iterator[tuple[Figure, Sequence[Axes]]]:
+    """Give a figure with a panel for each model, side by side, and a row for each factor in them."""
+    labels = [wrapped(factor) for factor in order]
+    size = {1: 210.0, 2: 165.0}.get(len(results.models), 140.0), row_height(labels) * max(len(order), 2)
+    with panels(metric, (1, len(results.models)), size, legend=legend, heads=results.models) as (figure, axes):
+        label_rows(axes, labels, separate_last=separate_last)
+        yield figure, axes
 
 
 def tornado(results: StudyResults, metric: str) -> tuple[Figure, str]:
@@ -52,7 +60,6 @@ def tornado(results: StudyResults, metric: str) -> tuple[Figure, str]:
     swings = {m: {f: points[m].swing(f) for f in results.factors} for m in results.models}
     sizes = {f: np.nan_to_num([swings[m][f].size for m in results.models], nan=-1).max() for f in results.factors}
     order = sorted(results.factors, key=lambda factor: -sizes[factor])
-    labels = [wrapped(factor) for factor in order]
     ends = np.asarray([end for m in results.models for s in swings[m].values() for end in (s.least, s.most)])
     exponent = axis_exponent(ends)
     unit = 10.0**exponent
@@ -64,14 +71,7 @@ def tornado(results: StudyResults, metric: str) -> tuple[Figure, str]:
         Line2D([], [], color=BLUE, marker=">", ms=5, ls="none", label="highest values"),
         *([NOISE] if results.shows_chance("tornado") else []),
     ]
-    with panels(
-        metric,
-        (1, len(results.models)),
-        (panel_width(results), row_height(labels) * max(len(order), 2)),
-        legend=legend,
-        heads=results.models,
-    ) as (figure, axes):
-        label_rows(axes, labels)
+    with rows_of_factors(results, metric, order, legend) as (figure, axes):
         for one, model in zip(axes, results.models, strict=True):
             one.set_xlabel(with_unit(f"mean {metric}", results.about(metric, "unit"), exponent, 30))
             set_linear(one.xaxis, 4)

@@ -23,18 +23,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .. import __version__
-from ..core import environment, file_contents, tables, toml_files, whole_files
+from ..core import file_contents, tables, toml_files, whole_files
 from ..core.errors import InputError, VbnfaultError, shown
 from ..core.interrupts import interruptible
 from ..core.path_checks import check_folder, path_of
 from ..dataset import BuildOptions
-from ..dataset.dask import check_scheduler, run_on_dask
+from ..dataset.build import do_tasks
+from ..dataset.dask import check_scheduler
 from ..dataset.identity import versions
 from ..dataset.lock import locked
-from ..dataset.processes import Pool
 from ..dataset.progress import Progress, duration_text
 from ..dataset.resume import differences
-from ..dataset.work import run_here
 from . import indices as indices_module
 from . import results
 from .chunks import ChunkWorkers, StudyJob
@@ -186,7 +185,9 @@ def run_study(
                     _write_report(path, data, table, spec, made)
         missed = _missed_half_widths(spec, data)
         _warn(missed)
-        job.raise_failures(data)
+        job.raise_failures(
+            kept="all others are in the table, and the indices leave out incomplete base samples", indices=data
+        )
     return StudySummary(
         path=path,
         indices=data,
@@ -294,9 +295,10 @@ def recompute(folder: str | Path) -> xr.Dataset:
     data.attrs["timings"] = before.attrs["timings"]
     with locked(path), _writing(path):
         from .report import write_report  # loads matplotlib
+        from .summaries import StudyResults
 
         results.write_indices(path / results.INDICES, data)
-        write_report(path, data, table, spec.resolved())
+        write_report(path, StudyResults(dataset=data, table=table, spec=spec.resolved()))
     return data
 
 
@@ -404,14 +406,8 @@ def _evaluate(source: ChunkWorkers, evaluator: Evaluator, job: StudyJob, options
             warnings += tuple(evaluator.check() or ())
     _warn(warnings)
     with job.progress:
-        if options.scheduler is not None:
-            run_on_dask(source, job, options.scheduler)
-        elif options.workers == 1:
-            run_here(partial(source.with_evaluator, evaluator), job)
-        else:
-            threads = options.threads or max(1, environment.usable_cores() // options.workers)
-            tasks = max(options.recycle_shards, _MOST_EVALUATIONS_OF_A_PROCESS // job.chunk_size)
-            Pool(source, job, threads, tasks).work(options.workers)
+        here = partial(source.with_evaluator, evaluator)
+        do_tasks(source, job, options, here, recycle=_MOST_EVALUATIONS_OF_A_PROCESS // job.chunk_size)
     return warnings
 
 
@@ -456,13 +452,14 @@ def _write_report(
 ) -> None:
     """Write the extreme images, the figures and the page of a study; without images where one fails."""
     from .report import write_images, write_report  # loads matplotlib
+    from .summaries import StudyResults
 
-    plain = spec.resolved()
+    found = StudyResults(dataset=data, table=table, spec=spec.resolved())
     try:
-        write_images(path, data, table, plain, evaluator)
+        write_images(path, found, evaluator)
     except VbnfaultError as error:
         print(f"warning: {path}: no images of best and worst values: {error}", file=sys.stderr)
-    write_report(path, data, table, plain)
+    write_report(path, found)
 
 
 def _too_few(spec: StudySpec) -> Iterator[str]:

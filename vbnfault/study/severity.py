@@ -12,7 +12,7 @@ import shlex
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -20,22 +20,21 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import isotonic_regression
 
-from ..core import environment, toml_files
+from ..core import toml_files
 from ..core.errors import InputError, VbnfaultError, shown
 from ..core.interrupts import interruptible
 from ..core.tables import did_you_mean
 from ..core.whole_files import write_whole
 from ..dataset import BuildOptions
-from ..dataset.processes import Pool
+from ..dataset.build import do_tasks
 from ..dataset.progress import Progress
-from ..dataset.work import run_here
 from ..faults import LEVELS, ModelLevels, SeverityTable, dataset_order, read_table, registry
 from ..lens import load_lens
 from ..scene import config
 from ..scene.instrument import CameraTable
 from ..world import cameras
 from . import navigation_metrics
-from .severity_views import TRIES, ModelUnderTest, SeverityJob, ViewGroup, ViewWorkers
+from .severity_views import TRIES, ModelUnderTest, SeverityJob, ViewGroup, ViewWorker
 
 F64 = NDArray[np.float64]
 
@@ -219,14 +218,6 @@ def _middle(resampled: F64) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def error_with_interval(errors: Sequence[float] | F64, quantile: float) -> tuple[float, float, float]:
-    """Return the quantile over views of an error, and its 95 % interval by a bootstrap over the views."""
-    finite = np.array([error for error in errors if np.isfinite(error)])
-    if not len(finite):
-        return np.nan, np.nan, np.nan
-    return float(np.quantile(finite, quantile)), *_middle(_quantiles_of_resamples(finite, quantile))
-
-
 # --- the whole table ---------------------------------------------------------------------------------------------
 
 
@@ -317,13 +308,9 @@ def evaluate_models(
     groups = _groups(models, views, detectors)
     planned = sum(group.count for group in groups)
     job = SeverityJob(path or Path(views.scene), groups, Progress(planned, shown=options.progress, noun="views"))
-    workers = ViewWorkers(metric=metric)
+    workers = partial(ViewWorker, metric)
     with interruptible(lambda: f"{job.path}: interrupted; nothing was written"), job.progress:
-        if options.workers == 1:
-            run_here(workers, job)
-        else:
-            threads = options.threads or max(1, environment.usable_cores() // options.workers)
-            Pool(workers, job, threads, options.recycle_shards).work(options.workers)
+        do_tasks(workers, job, options)
     if 2 * len(job.errors) < planned:
         raise VbnfaultError(
             f"{views.scene}: only {len(job.errors)} of {planned} views have {metric} without faults; take another "

@@ -18,7 +18,7 @@ from .. import navigation
 from ..core.errors import VbnfaultError
 from ..core.interrupts import check
 from ..dataset.progress import Progress
-from ..dataset.work import Fatal, Queue, Tick
+from ..dataset.work import Fatal, Job, Tick
 from ..faults import Fault, Severity, from_dict, registry
 from ..pipeline import Session
 from ..pipeline.development import Development
@@ -150,7 +150,7 @@ def _views(spec: SampleSpec, count: int, facing_sun: bool) -> Iterator[CleanView
     """Render the views of a sequence; none where the Sun should be before the camera, but is not wholly visible."""
     pose = resolve(spec)
     spec = spec.at(pose)
-    if facing_sun and not (pose.sun_visible_fraction == 1 and pose.L_from_C[:, 2] @ pose.sun_L > 0):
+    if facing_sun and not pose.sees_sun:
         return
     first = RenderedView(spec=spec, pose=pose, rendering=render_view(spec, pose))
     for view in rendered_sequence(first, count):
@@ -196,24 +196,6 @@ def measure(model: ModelUnderTest, width_px: int, error: Callable[[Fault], float
 # --- work --------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, kw_only=True)
-class GroupTask:
-    """Describe the task to evaluate one group; for `skip` see `dataset.work.Job.task`."""
-
-    group: ViewGroup
-    skip: frozenset[int]
-
-
-@dataclass(frozen=True, kw_only=True)
-class ViewWorkers:
-    """Make a worker; the object is a function that can be pickled."""
-
-    metric: str
-
-    def __call__(self) -> ViewWorker:
-        return ViewWorker(self.metric)
-
-
 class ViewWorker:
     """Render the views of groups and evaluate models on them."""
 
@@ -221,21 +203,21 @@ class ViewWorker:
         self._metric = metric
         self._session: tuple[Any, Session] | None = None
 
-    def do(self, task: GroupTask, tick: Tick) -> None:
-        """Evaluate the models on each view of a group, and report the values and errors as JSON.
+    def do(self, task: tuple[ViewGroup, frozenset[int]], tick: Tick) -> None:
+        """Evaluate the models on each view of a group but those to skip, and report values and errors as JSON.
 
         The text is empty for a view that the scene does not have.
         """
-        group = task.group
+        group, skip = task
         try:
             session = self._session_of(group)
         except VbnfaultError as error:  # all views would fail
             raise Fatal(error) from error
         views = sequences(group, self._metric, session)
         for number in range(group.first, group.first + group.count):
-            if number in task.skip:
+            if number in skip:
                 continue
-            if any(skipped < number for skipped in task.skip):  # the views of a site are found one after the other
+            if any(skipped < number for skipped in skip):  # the views of a site are found one after the other
                 tick(number, "failed", "left out: an earlier view of its site ended its process")
                 continue
             tick(number, "begun", "")
@@ -252,53 +234,38 @@ class ViewWorker:
     def _errors(self, group: ViewGroup, views: Sequence[CleanView]) -> dict[str, list[tuple[float, float]]]:
         """Return the values and errors of each model, by its name."""
         width_px = views[0].spec.scene.camera.width_px
-        clean = navigation_metrics.CleanTwins.of([view.frame for view in views])
+        clean = navigation_metrics.CleanTwins([view.frame for view in views])
         return {
             model.name: measure(model, width_px, lambda fault: error_of(fault, views, self._metric, clean))
             for model in group.models
         }
 
 
-class SeverityJob:
+class SeverityJob(Job):
     """Hand out groups of views, and collect the errors of each model on each view."""
 
-    task_noun, item_noun = "group of views", "view"
+    noun, task_noun, item_noun = "command", "group of views", "view"
 
     def __init__(self, path: Path, groups: Sequence[ViewGroup], progress: Progress) -> None:
-        self.path, self.progress, self._groups = path, progress, groups
-        self._queue = Queue(dict.fromkeys(range(len(groups)), 0))
+        super().__init__(path, progress, dict.fromkeys(range(len(groups)), 0))
+        self._groups = groups
         self.errors: dict[int, dict[str, list[tuple[float, float]]]] = {}
-        self._counted: set[int] = set()
-
-    @property
-    def tasks(self) -> int:
-        """Return the number of groups."""
-        return len(self._groups)
 
     def items(self, number: int) -> Sequence[int]:
         """Return the views of a group."""
         group = self._groups[number]
         return range(group.first, group.first + group.count)
 
-    def task(self, number: int, skip: frozenset[int] = frozenset(), *, careful: bool = False) -> GroupTask:
+    def task(
+        self, number: int, skip: frozenset[int] = frozenset(), *, careful: bool = False
+    ) -> tuple[ViewGroup, frozenset[int]]:
         """Return the task that evaluates a group."""
-        return GroupTask(group=self._groups[number], skip=skip)
+        return self._groups[number], skip
 
-    def next_task(self, last: int | None = None, busy: Sequence[int] = ()) -> int | None:
-        """Return the next group."""
-        return self._queue.next(last, busy)
-
-    def tick(self, item: int, what: str, text: str) -> None:
-        """Record an event of a view."""
-        if what == "stage":
-            self.progress.stage(text)
-        elif what == "failed":
-            self.progress.say(f"view {item} failed: {text.splitlines()[0]}")
-        elif what == "built" and text:
+    def keep(self, item: int, text: str) -> None:
+        """Record the errors on a view."""
+        if text:
             self.errors[item] = json.loads(text)
-        if what in ("built", "failed") and item not in self._counted:  # a task whose process died is done again
-            self._counted.add(item)
-            self.progress.advance(what == "built")
 
     def of_lens(self, lens: int, name: str) -> list[list[tuple[float, float]]]:
         """Return the values and errors of a model on each view behind a lens, in the order of the views."""

@@ -138,6 +138,8 @@ def _mean(y: _Array, rows: NDArray[np.bool_], surrogate: Surrogates | None) -> f
 
 def _slope(error: _Array, control: _Array) -> _Array:
     """Return the slopes of regressions on control variates, along the last axis, limited to 0 to 1."""
+    if not control.shape[-1]:  # a metric that never has a value
+        return np.zeros(control.shape[:-1])
     control = control - control.mean(axis=-1, keepdims=True)
     with np.errstate(divide="ignore", invalid="ignore"):
         slope = (error * control).sum(axis=-1) / (control**2).sum(axis=-1)

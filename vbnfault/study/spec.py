@@ -15,7 +15,7 @@ from pydantic import AfterValidator, ConfigDict, Field, model_validator
 
 from ..core import path_checks, resources, tables, toml_files
 from ..core.errors import shown
-from ..core.tables import Table
+from ..core.tables import Table, each_once
 from .distributions import Factor
 
 DUMMY = "dummy"  # the factor that acts on nothing; its index is the noise floor
@@ -157,16 +157,16 @@ class SceneTable(Table):
     samples: Annotated[int, Field(ge=1, le=_MOST_SAMPLES)] | tuple[_Index, ...] = Field(
         1, description="the scene's samples on which every point is evaluated: a list of indices, or a number"
     )
-    seeds: tuple[_Index, ...] = Field(
-        (1,), min_length=1, description="blocks: each one replaces dataset.seed and repeats the whole design"
+    seeds: Annotated[tuple[_Index, ...], Field(min_length=1), AfterValidator(each_once)] = Field(
+        (1,), description="blocks: each one replaces dataset.seed and repeats the whole design"
     )
 
     @model_validator(mode="after")
     def _differ(self) -> SceneTable:
         if not self.views:
             raise ValueError("samples = []: must name at least one sample")
-        _refuse_twice("samples", self.views)
-        _refuse_twice("seeds", self.seeds)
+        if len(set(self.views)) < len(self.views):
+            raise ValueError(f"samples = {shown(list(self.views))}: a sample is given twice")
         return self
 
     @property
@@ -196,32 +196,17 @@ class ModelsTable(Table):
     """Hold the models of one fault that are compared on the same samples."""
 
     fault: str = Field(min_length=1, description="fault class whose models are compared")
-    compare: tuple[_Key, ...] = Field(min_length=2, description="names of the models, at least two")
-
-    @model_validator(mode="after")
-    def _differ(self) -> ModelsTable:
-        _refuse_twice("compare", self.compare)
-        return self
+    compare: Annotated[tuple[_Key, ...], Field(min_length=2), AfterValidator(each_once)] = Field(
+        description="names of the models, at least two"
+    )
 
 
 class MetricsTable(Table):
     """Hold the metrics of the study."""
 
-    names: tuple[_Key, ...] = Field(min_length=1, description="metrics that every evaluation gives, at least one")
-
-    @model_validator(mode="after")
-    def _differ(self) -> MetricsTable:
-        _refuse_twice("names", self.names)
-        return self
-
-
-def _refuse_twice(key: str, values: Sequence[str | int]) -> None:
-    """Raise ValueError if a value is given twice."""
-    seen: set[str | int] = set()
-    for value in values:
-        if value in seen:
-            raise ValueError(f"{key} = {shown(list(values))}: {value!r} is given twice")
-        seen.add(value)
+    names: Annotated[tuple[_Key, ...], Field(min_length=1), AfterValidator(each_once)] = Field(
+        description="metrics that every evaluation gives, at least one"
+    )
 
 
 class StudySpec(Table):

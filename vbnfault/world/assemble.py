@@ -281,10 +281,12 @@ def _pose(name: str, table: PoseTable, vehicle: Spacecraft | None) -> HingePose:
     return HingePose(hinge_B_m=hinge_m, axis_B=axis, angle_deg=table.angle_deg)
 
 
-def render_vehicle(scene: Scene, mesh: SpacecraftMesh) -> Vehicle:
-    """Return the renderer's copy of the spacecraft."""
+def render_vehicle(scene: Scene, mesh: SpacecraftMesh | None) -> Vehicle | None:
+    """Return the renderer's copy of the spacecraft, if there is one."""
     from .. import render
 
+    if mesh is None:
+        return None
     return render.Vehicle(
         mesh.vertices_B_m, mesh.faces, mesh.face_material, mesh.reflectance(wavelengths_nm(scene))
     )
