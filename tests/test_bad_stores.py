@@ -154,6 +154,9 @@ def test_root_attributes_of_the_wrong_type_are_one_sentence(
         "store.attitude_references": ["sun", "moon"],
         "store.centre_of_mass_T_m": [1.0, 2.0],
         "store.height": 0,
+        "store.width": 2**63,
+        "store.rendered_shape": [2**40, 2],
+        "store.faults": ["a"] * 4,
         "store.shard_samples": -1,
     }
     for key, value in wrong.items():

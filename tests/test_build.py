@@ -302,23 +302,6 @@ def test_the_work_is_announced_and_stages_are_named(
     assert [line for line in lines if line.startswith("terrain")] == ["terrain of site 5"]
 
 
-def test_the_summary_counts_what_is_in_the_store(tmp_path: Path) -> None:
-    """A fault that is planned and not injected is not counted as realised: 49 planned, 44 realised."""
-    injected = np.array([fake_sample(make_spec(), i).scalars["injected"] for i in range(SAMPLES)])
-    planned = injected.copy()
-    i, off = (int(n[0]) for n in np.nonzero(~planned))
-    planned[i, off] = True
-    summary = run(tmp_path / "s.zarr", planned_faults=planned)
-    assert summary.counts is not None
-    faults = make_spec().faults
-    assert [summary.counts.realised(f) for f in faults] == injected.sum(axis=0).tolist()
-    assert [summary.counts.planned(f) for f in faults] == planned.sum(axis=0).tolist()
-    assert summary.counts.missing == {faults[off]: 1}
-    said = "\n".join(summary.lines())
-    assert f"planned, but without effect and not injected: {faults[off]} 1" in said
-    assert f"digest {st.digest(tmp_path / 's.zarr')}" in said
-
-
 def test_too_little_room_is_said_before_the_first_sample(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -338,21 +321,6 @@ def test_paths_that_cannot_be_used_are_bad_input(tmp_path: Path) -> None:
     for out in (tmp_path / "file", tmp_path / "file" / "s.zarr", Path("/proc/none/s.zarr"), long, long / "s.zarr"):
         with pytest.raises(InputError, match=str(out)):
             run(out)
-
-
-@pytest.mark.parametrize(
-    ("options", "sentence"),
-    [
-        ({"workers": 0}, "workers = 0: must be a whole number from 1 to 1024"),
-        ({"workers": 5000}, "workers = 5000: must be a whole number from 1 to 1024"),
-        ({"threads": 0}, "threads = 0: must be a whole number from 1 to 1024"),
-        ({"recycle_shards": 0}, "recycle_shards = 0: must be a whole number of at least 1"),
-        ({"workers": 2, "scheduler": "tcp://a:1"}, "--workers 2 and --scheduler tcp://a:1 exclude each other"),
-    ],
-)
-def test_options_are_checked_by_the_library(options: dict, sentence: str) -> None:
-    with pytest.raises(InputError, match=sentence):
-        bd.BuildOptions(**options)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no such locks there")
@@ -466,17 +434,6 @@ def test_progress_without_a_terminal_is_plain_lines(
     assert all(map(form.fullmatch, lines)), lines
 
 
-@pytest.mark.parametrize("what", ["mask", "image/zarr.json", "sample", "done", "fault/c"])
-def test_arrays_that_are_missing_are_made_again(undisturbed: tuple[Path, str], tmp_path: Path, what: str) -> None:
-    out = shutil.copytree(undisturbed[0], tmp_path / "s.zarr")
-    target = out / what
-    shutil.rmtree(target) if target.is_dir() else target.unlink()
-    assert len(st.verify(out)) == 1
-    assert run(out).built == (SAMPLES if what in ("mask", "done") else 0)
-    assert st.verify(out) == []
-    assert st.digest(out) == undisturbed[1]
-
-
 @pytest.mark.parametrize("what", ["", "zarr.json", "image", "image/c", "image/c/1", "done/c", "roll_deg/c/0"])
 def test_a_store_that_may_not_be_read_is_not_taken_for_damaged(
     undisturbed: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str
@@ -503,25 +460,6 @@ def test_a_store_without_room_for_its_first_file_leaves_nothing(tmp_path: Path) 
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_worker_returns_memory_after_every_shard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Once a shard, when its samples are written and no longer held; also after a shard that could not be made."""
-    opened = st.create(tmp_path / "s.zarr", make_spec(), 8)
-    events: list[str] = []
-    monkeypatch.setattr(tasks, "release_unused", lambda: events.append("released"))
-    monkeypatch.setattr(
-        st.Store, "write_shard", lambda self, number, given, damaged: events.append(f"wrote {number}") or set()
-    )
-
-    def simulate(index: int) -> Sample:
-        if index > 3:
-            raise VbnfaultError("no sample")
-        return fake_sample(opened.spec, index)
-
-    for number in range(2):
-        tasks.work(simulate, opened, tasks.Task(shard=number, sites=(0,) * 4), lambda *_: None)
-    assert events == ["wrote 0", "released", "released"]
 
 
 @pytest.mark.parametrize("careful", [False, True])

@@ -24,12 +24,9 @@ from test_cli import run
 from vbnfault import store as st
 from vbnfault.core import images
 from vbnfault.core.errors import InputError
-from vbnfault.faults import registry
 from vbnfault.output.contact_sheet import overlay
-from vbnfault.output.json_files import plain
 from vbnfault.output.viewer import Viewer, server
-from vbnfault.output.viewer.listing import NOT_KNOWN, Listing, _keys, _measure
-from vbnfault.output.viewer.server import _exact
+from vbnfault.output.viewer.listing import NOT_KNOWN, Listing
 from vbnfault.scene.names import STRATA
 
 
@@ -223,25 +220,6 @@ def test_severity_is_the_rank_of_what_was_drawn(tmp_path: Path) -> None:
     assert ranks[0].tolist() == [254, 0, 127, 127]
     assert ranks[2].tolist() == [0, 85, 169, 254]
     assert (ranks[[1, 3]] == NOT_KNOWN).all()
-
-
-def test_a_fault_is_more_severe_by_the_number_that_its_levels_change(finished_store: Path) -> None:
-    assert [_measure({"loss": 3}, "loss", less) for less in (False, True)] == [3.0, -3.0]
-    assert _measure({"loss": True, "x_px": [1, 2], "y_px": [1]}, "loss", False) == 2.0
-    assert np.isnan(_measure({"kind": "grain"}, "loss", False))
-    store = st.open_store(finished_store)
-    for fault, models in registry().items():
-        for name, model in models.items():
-            store.attributes["fault_models"] = dict.fromkeys(store.spec.faults, "") | {fault: name}
-            key, less_is_worse = dict(zip(store.spec.faults, _keys(store), strict=True)).get(fault, ("", False))
-            severity = model.severity if fault in store.spec.faults else None
-            assert key == ("" if severity is None else severity.key)
-            assert less_is_worse == (severity is not None and severity.high < severity.low)
-
-
-def test_numbers_that_neither_json_nor_a_browser_holds_are_sent_otherwise() -> None:
-    assert plain(np.array([np.inf, -np.inf, np.nan, 1.5])) == [None, None, None, 1.5]
-    assert [_exact(str(n)) for n in (2**53 - 1, 2**53, -(2**53))] == [2**53 - 1, str(2**53), str(-(2**53))]
 
 
 def test_numbers_without_end_and_a_stratum_without_a_name_are_shown(tmp_path: Path) -> None:
