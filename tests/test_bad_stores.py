@@ -255,7 +255,7 @@ _NO_TABLE = "sample 2: its parameters are damaged, they are no table in JSON; th
         (
             _without("split"),
             "report",
-            1,
+            2,
             "the scalars of all 6 finished samples cannot be read, so there is nothing to show",
         ),
         (

@@ -12,10 +12,10 @@ from matplotlib.transforms import Bbox
 
 from vbnfault.core import resources
 from vbnfault.core.errors import InputError
+from vbnfault.core.whole_files import write_json
 from vbnfault.lens import load_lens
 from vbnfault.lens.adapt import LensRequest, adapted_lens
 from vbnfault.output import flare_images, lens_sheet
-from vbnfault.output.json_files import write_json
 from vbnfault.output.sensor_report import SensorRequest
 
 

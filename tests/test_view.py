@@ -26,7 +26,7 @@ from vbnfault.core import images
 from vbnfault.core.errors import InputError
 from vbnfault.output.contact_sheet import overlay
 from vbnfault.output.viewer import Viewer, server
-from vbnfault.output.viewer.listing import NOT_KNOWN, Listing
+from vbnfault.output.viewer.server import NOT_KNOWN, Listing
 from vbnfault.scene.names import STRATA
 
 
