@@ -10,7 +10,6 @@ import os
 import pickle
 import platform
 import re
-import resource
 import shutil
 import subprocess
 import sys
@@ -449,17 +448,6 @@ def test_a_store_that_may_not_be_read_is_not_taken_for_damaged(
     assert not log.exists()
     assert {p: p.stat().st_mtime_ns for p in out.rglob("*")} == times
     assert sorted(p.name for p in tmp_path.iterdir()) == ["s.zarr"]
-
-
-def test_a_store_without_room_for_its_first_file_leaves_nothing(tmp_path: Path) -> None:
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
-    try:
-        with pytest.raises(VbnfaultError, match=r"no store can be created here: File too large"):
-            run(tmp_path / "s.zarr")
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("careful", [False, True])
