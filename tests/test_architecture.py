@@ -324,7 +324,6 @@ def test_modules_of_the_store_import_only_those_before_them() -> None:
         "codec",
         "disk",
         "bucket",
-        "files",
     ]
     order += ["layout", "opened", "group", "shards", "metadata", "check"]
     inside = {module for module in sources() if module.split(".")[0] == "store"}

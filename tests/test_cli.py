@@ -192,7 +192,7 @@ def test_the_real_shape_is_67ps(real_shape: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        ("build quickstart --out x.zarr --set camera.fov_deg=0", "quickstart: camera.fov_deg = 0"),
+        ("build quickstart --out x.zarr --set camera.fov_deg=0", "camera.fov_deg = 0"),
         ("build quickstart --out x.zarr --set faults.dust.count=3", "faults.dust"),
         ("build quickstart --out x.zarr --set faults.straylight.model=nope", "faults.straylight.model"),
         ("build quickstart --out x.zarr --set body.shape=absent.obj", "absent.obj"),
