@@ -27,28 +27,6 @@ def test_json_has_null_where_a_number_is_not_finite(tmp_path: Path) -> None:
     assert read == {"a": None, "b": [None, 1], "c": [[1.5, None]], "d": [{"e": True}]}
 
 
-def test_tables_of_lens_and_flare_hold_no_nan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A pupil at infinity, and a ghost without light, whose centroid is undefined."""
-    lens = load_lens("tessar_50_f2p8")
-    endless = {**lens_sheet.figures(lens), "exit_pupil_mm": float("inf")}
-    monkeypatch.setattr(lens_sheet, "figures", lambda _: endless)
-    lens_sheet.write_table(lens, tmp_path / "lens.json")
-    table = json.loads((tmp_path / "lens.json").read_text(), parse_constant=pytest.fail)
-    assert table["exit_pupil_mm"] is None
-    assert table["efl_mm"] == endless["efl_mm"]
-    request = flare_images.FlareRequest(lens=lens, sun_deg=12.0, wavelength_nm=flare_images.wavelengths_nm(550.0))
-    dark = flare_images.Ghost(
-        pair=(1, 3),
-        flux_fraction=0.0,
-        centroid_mm=(float("nan"), float("nan")),
-        rms_radius_mm=float("nan"),
-        peak_irradiance_fraction=0.0,
-    )
-    flare_images.write_table(flare_images.Flare(request=request, layers={}, ghosts=(dark,)), tmp_path / "f.json")
-    table = json.loads((tmp_path / "f.json").read_text(), parse_constant=pytest.fail)
-    assert table["ghosts"][0]["centroid_mm"] == [None, None]
-
-
 @pytest.mark.parametrize("name", sorted(resources.packaged("scenes/lenses")))
 def test_a_lens_is_drawn_with_the_number_of_every_row_and_none_overlaps(name: str) -> None:
     lens = load_lens(name)

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import re
-import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import matplotlib
 import numpy as np
 import pytest
 import xarray
+from conftest import Called
 from numcodecs import blosc
 from synthetic import FAULTS, filled, make_spec
 
-from vbnfault import cli, dataset
+from vbnfault import dataset
 from vbnfault import store as st
 from vbnfault.core.errors import InputError, VbnfaultError
 from vbnfault.store import codec
@@ -22,15 +23,6 @@ from vbnfault.store.compressors import compressor, fitting
 
 # Words of UDUNITS that the store uses; udunits 2.2.28 parses each of them.
 UNITS = {"1", "count", "m", "nm", "s", "d", "au", "degree", "W m-2 sr-1 nm-1"}
-
-
-def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    monkeypatch.setattr(sys, "argv", ["vbnfault", *map(str, arguments)])
-    try:
-        cli.main()
-    except SystemExit as stop:
-        return int(stop.code or 0)
-    return 0
 
 
 @pytest.fixture
@@ -78,27 +70,23 @@ def test_stores_of_other_codecs_are_merged(plain: st.Store, tmp_path: Path) -> N
 
 
 def test_the_command_says_what_it_did_and_refuses_in_one_sentence(
-    plain: st.Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    plain: st.Store, tmp_path: Path, call: Callable[..., Called]
 ) -> None:
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos/a.png").write_bytes(b"x")
     old = plain.path
     for arguments, sentence in (
-        ((tmp_path / "photos",), "is no vbnfault store"),
         ((old, "--out", tmp_path / "photos"), "photos: exists and is no vbnfault store, so it is left alone"),
         ((old, "--out", old / "sub.zarr"), "lies in the store"),
         ((old, "--out", old), "nothing to merge"),
         ((tmp_path / "none.zarr",), "no such store"),
     ):
-        assert run(monkeypatch, "migrate", *arguments) == 2
-        said = capsys.readouterr().err.splitlines()
-        assert len(said) == 1
-        assert sentence in said[0]
+        refused = call("migrate", *arguments)
+        assert (refused.code, sentence in refused.said) == (2, True)
     st.append_samples(old, 1)
-    assert run(monkeypatch, "migrate", old, "--out", tmp_path / "new.zarr") == 0
-    assert capsys.readouterr().out.splitlines()[-1] == f"{tmp_path / 'new.zarr'}: 6 samples, 5 finished, format 3"
-    assert run(monkeypatch, "migrate", old) == 0
-    assert capsys.readouterr().out == f"{old}: 6 samples, 5 finished, format 3\n"
+    copied = call("migrate", old, "--out", tmp_path / "new.zarr").out.splitlines()[-1]
+    assert copied == f"{tmp_path / 'new.zarr'}: 6 samples, 5 finished, format 3"
+    assert call("migrate", old).out == f"{old}: 6 samples, 5 finished, format 3\n"
 
 
 # --- codecs -------------------------------------------------------------------------------------------------

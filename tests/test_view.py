@@ -11,15 +11,15 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from browser import WHY_NOT, Page, found, opened
+from conftest import Called
 from synthetic import FAULTS, fake_sample, filled, flip, make_spec
-from test_cli import run
 
 from vbnfault import store as st
 from vbnfault.core import images
@@ -267,7 +267,7 @@ def test_the_command_prints_its_address_and_ends_with_ctrl_c(finished_store: Pat
 
 
 def test_a_view_that_is_ended_by_a_signal_says_nothing_of_files(
-    finished_store: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    finished_store: Path, monkeypatch: pytest.MonkeyPatch, call: Callable[..., Called]
 ) -> None:
     def ended(viewer: Viewer) -> None:
         viewer.server.server_close()
@@ -275,19 +275,19 @@ def test_a_view_that_is_ended_by_a_signal_says_nothing_of_files(
         time.sleep(60)
 
     monkeypatch.setattr(Viewer, "serve", ended)
-    assert run(monkeypatch, "view", str(finished_store), "--no-browser") == 143
-    assert capsys.readouterr().err == f"vbnfault: the view of {finished_store} was ended\n"
+    ended_view = call("view", finished_store, "--no-browser")
+    assert (ended_view.code, ended_view.said) == (143, f"the view of {finished_store} was ended")
 
 
 def test_the_command_opens_a_browser_unless_told_not_to(
-    finished_store: Path, monkeypatch: pytest.MonkeyPatch
+    finished_store: Path, monkeypatch: pytest.MonkeyPatch, call: Callable[..., Called]
 ) -> None:
     asked: list[str] = []
     monkeypatch.setattr("webbrowser.open", asked.append)
     monkeypatch.setattr(Viewer, "serve", lambda viewer: viewer.server.server_close())
-    assert run(monkeypatch, "view", str(finished_store), "--browser") == 0
+    assert call("view", finished_store, "--browser").code == 0
     assert [url[:17] for url in asked] == ["http://127.0.0.1:"]
-    assert run(monkeypatch, "view", str(finished_store), "--no-browser") == 0
+    assert call("view", finished_store, "--no-browser").code == 0
     assert len(asked) == 1
 
 
