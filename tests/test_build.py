@@ -28,6 +28,8 @@ from vbnfault.core.errors import InputError, VbnfaultError
 from vbnfault.core.quantities import Sample
 from vbnfault.dataset import build as bd
 from vbnfault.dataset import claims, lock, progress, tasks
+from vbnfault.dataset.resume import planned_blocks
+from vbnfault.dataset.tasks import BuildFailed
 from vbnfault.store import codec, disk
 
 HERE = Path(__file__).resolve().parent
@@ -98,7 +100,7 @@ def test_samples_that_fail_are_named_and_all_others_are_built(
 ) -> None:
     out = tmp_path / "s.zarr"
     with pytest.raises(
-        bd.BuildFailed, match=r"2 samples \(5, 9\) failed, the first with: KeyError.*for 5.*py:\d"
+        BuildFailed, match=r"2 samples \(5, 9\) failed, the first with: KeyError.*for 5.*py:\d"
     ) as e:
         run(out, Session(raises=frozenset({5, 9})))
     assert set(e.value.failures) == {5, 9}
@@ -111,7 +113,7 @@ def test_samples_that_fail_are_named_and_all_others_are_built(
 
 def test_a_hopeless_build_stops_early(tmp_path: Path) -> None:
     log = tmp_path / "log"
-    with pytest.raises(bd.BuildFailed, match=r"32 samples .* before any succeeded"):
+    with pytest.raises(BuildFailed, match=r"32 samples .* before any succeeded"):
         run(tmp_path / "s.zarr", Session(raises=frozenset(range(60)), log=str(log)), samples=60)
     assert len(log.read_text().splitlines()) == 32
 
@@ -124,25 +126,25 @@ def test_a_session_that_cannot_start_ends_the_build_with_its_sentence(tmp_path: 
 
 def test_append_keeps_earlier_bits_and_resumes_itself(undisturbed: tuple[Path, str], tmp_path: Path) -> None:
     out = tmp_path / "s.zarr"
-    assert bd.planned_blocks(out, SAMPLES) == (SAMPLES,)
+    assert planned_blocks(out, SAMPLES) == (SAMPLES,)
     with pytest.raises(InputError, match="there is no store"):
-        bd.planned_blocks(out, SAMPLES, append=3)
+        planned_blocks(out, SAMPLES, append=3)
     run(out)
     old = [st.open_store(out).read_sample(i) for i in (0, 16, 17)]
-    blocks = bd.planned_blocks(out, SAMPLES, append=5)
+    blocks = planned_blocks(out, SAMPLES, append=5)
     assert blocks == (SAMPLES, 5)
-    with pytest.raises(bd.BuildFailed):
+    with pytest.raises(BuildFailed):
         run(out, Session(raises=frozenset({20})), samples=23, blocks=blocks)
-    assert bd.planned_blocks(out, SAMPLES, append=5) == blocks  # the same command resumes
-    assert bd.planned_blocks(out, SAMPLES) == blocks
+    assert planned_blocks(out, SAMPLES, append=5) == blocks  # the same command resumes
+    assert planned_blocks(out, SAMPLES) == blocks
     assert run(out, samples=23, blocks=blocks).built == 1
-    assert bd.planned_blocks(out, SAMPLES, append=5) == (SAMPLES, 5, 5)
+    assert planned_blocks(out, SAMPLES, append=5) == (SAMPLES, 5, 5)
     assert st.verify(out) == []
     for sample in old:
         again = st.open_store(out).read_sample(sample.index)
         assert all(again.layers[n].tobytes() == a.tobytes() for n, a in sample.layers.items())
     with pytest.raises(InputError, match=r"samples = 20, but the store was made with 18; use --append"):
-        bd.planned_blocks(out, 20)
+        planned_blocks(out, 20)
     with pytest.raises(InputError, match=r"holds blocks of 18 \+ 5 samples, not 23"):
         run(out, samples=23)
 
@@ -195,7 +197,7 @@ def test_free_texts_of_a_scene_do_not_hinder_a_resume(tmp_path: Path) -> None:
         }
 
     out = tmp_path / "s.zarr"
-    with pytest.raises(bd.BuildFailed):
+    with pytest.raises(BuildFailed):
         run(out, Session(raises=frozenset({5})), spec=make_spec(attributes=retaken("before")))
     for others in (retaken("now", camera={"fov_deg": 9}), {**retaken("now"), "fault_models": {"adc": "now"}}):
         with pytest.raises(InputError, match=r"holds another dataset: [^;]*; choose another --out"):
@@ -218,13 +220,13 @@ def test_a_store_of_other_versions_is_completed_on_request_and_says_by_whom(
         entries = st.open_store(out).attributes.get("versions_of_samples", [])
         return {entry["versions"]["numpy"]: entry["samples"] for entry in entries}
 
-    with pytest.raises(bd.BuildFailed):
+    with pytest.raises(BuildFailed):
         made_with("1", session=Session(raises=frozenset({5, 9, 10})))
     with pytest.raises(InputError, match=r"made with other versions: numpy 1 \(now 2\); --accept-versions") as e:
         made_with("2")
     assert "machine" not in str(e.value)
     assert noted() == {}
-    with pytest.raises(bd.BuildFailed):
+    with pytest.raises(BuildFailed):
         made_with("2", accept=True, session=Session(raises=frozenset({10})))
     assert noted() == {"2": [[5, 5], [9, 10]]}
     assert made_with("2").built == 1  # accepted once
@@ -285,7 +287,7 @@ def test_the_work_is_announced_and_stages_are_named(
     """Samples, sites, bytes and time come first; a stage of any process is a line where there is no terminal."""
     session = Session(stage="terrain of site", raises=frozenset({5}))
     options = {"workers": workers, "progress": True, "estimated_seconds": 90.0, "samples": 8}
-    with pytest.raises(bd.BuildFailed):
+    with pytest.raises(BuildFailed):
         run(tmp_path / "s.zarr", session, **options)
     lines = capsys.readouterr().err.splitlines()
     assert lines[0].startswith(f"{tmp_path / 's.zarr'}: 8 samples at 3 sites in 2 shards, about ")
@@ -294,7 +296,7 @@ def test_the_work_is_announced_and_stages_are_named(
         f"terrain of site {i}" for i in range(8)
     ]
     # what is left of the time is that of the samples left
-    with pytest.raises(bd.BuildFailed):
+    with pytest.raises(BuildFailed):
         run(tmp_path / "s.zarr", session, **options)
     lines = capsys.readouterr().err.splitlines()
     assert lines[1].startswith("estimated time: 11 s, ")

@@ -22,10 +22,11 @@ from vbnfault import cli
 from vbnfault import store as st
 from vbnfault.core import environment
 from vbnfault.core.errors import InputError, VbnfaultError
+from vbnfault.core.interrupts import Interrupted
 from vbnfault.core.quantities import Sample
-from vbnfault.dataset import build as bd
 from vbnfault.dataset import lock
 from vbnfault.dataset.merge import MergeSummary, join_stores, merge_stores
+from vbnfault.dataset.tasks import BuildFailed
 from vbnfault.store import disk
 
 SHARDS = 5
@@ -170,7 +171,7 @@ def test_one_of_the_stores_may_get_the_samples(parts: list[Path], whole: Path) -
 
 def lacking(path: Path, *numbers: int, shards: range = range(SHARDS)) -> Path:
     """Make a store that lacks some samples."""
-    with pytest.raises(bd.BuildFailed):
+    with pytest.raises(BuildFailed):
         run(path, Session(raises=frozenset(numbers)), shard_range=shards)
     return path
 
@@ -237,7 +238,7 @@ def test_ctrl_c_ends_a_merge_after_the_shard_in_work(
 
     monkeypatch.setattr(st.Store, "copy_shard", interrupted)
     out = tmp_path / "m.zarr"
-    with pytest.raises(bd.Interrupted, match="merged samples stay, and the same command resumes") as stopped:
+    with pytest.raises(Interrupted, match="merged samples stay, and the same command resumes") as stopped:
         merge(parts, out)
     assert stopped.value.exit_code == 130
     assert st.open_store(out).finished() == 8

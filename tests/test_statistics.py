@@ -138,7 +138,7 @@ def test_a_build_writes_the_card_once(copy: Path, monkeypatch: pytest.MonkeyPatc
             return made[0]
 
     monkeypatch.setattr(from_scene.build, "build", lambda *_: Summary())
-    monkeypatch.setattr(from_scene.build, "planned_blocks", lambda *_, **__: (6,))
+    monkeypatch.setattr(from_scene, "planned_blocks", lambda *_, **__: (6,))
     monkeypatch.setattr(from_scene, "_prepared", lambda *_: (None, None, []))
     monkeypatch.setattr(from_scene.dataclasses, "replace", lambda thing, **_: thing)
     monkeypatch.setattr(from_scene.llvm, "find", lambda: None)

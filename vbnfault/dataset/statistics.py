@@ -239,8 +239,7 @@ def _described(values: _Parameter) -> list[str]:
 
 
 def aligned(table: list[list[str]]) -> list[str]:
-    """Return the rows of a table as lines with aligned columns: those of numbers to the right, "
-    "others to the left."""
+    """Return the rows of a table as lines; columns of numbers are aligned to the right, others to the left."""
     columns = list(zip(*table, strict=True))
     adjusted = []
     for column in columns:

@@ -233,7 +233,7 @@ def _write_part(
     store: Store, kind: Format, part: ExportPart, folder: Folder, stop: threading.Event, masks: str
 ) -> ExportPart:
     """Write the files of a part, and then its record."""
-    own, rows = folder.fresh(), []
+    own, rows = Folder(folder.path), []
     layers = {*kind.layers(store.spec)} | ({MASK_RULES[masks]} if masks != "footprint" else set())
 
     def samples() -> Iterator[Sample]:
