@@ -59,7 +59,8 @@ def frames(scene: str, samples: tuple[int, ...], overrides: dict[str, Any] | Non
 def rgb(frame: Frame, name: str) -> U8:
     """Return one of a sample's images as uint8[y, x, 3] R, G, B."""
     images = frame.images
-    return np.asarray({"image": images.image, "clean": images.clean}[name].array[..., :3])
+    twins = {f"without_{fault}": twin for fault, twin in images.without.items()}
+    return np.asarray({"image": images.image, "clean": images.clean, **twins}[name].array[..., :3])
 
 
 def mask(frame: Frame, *classes: str) -> U8:

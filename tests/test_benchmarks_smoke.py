@@ -67,3 +67,19 @@ def test_the_cost_of_variants_is_measured_on_equal_faults(tmp_path: Path) -> Non
     assert alone.calls["faulty"] == shared.calls["faulty"] == 2
     assert shared.calls["render_view"] < alone.calls["render_view"]
     assert "K=2 over K=1: " in table(alone, shared)
+
+
+def test_a_scene_is_drawn_beside_its_twin_and_its_masks(monkeypatch: pytest.MonkeyPatch) -> None:
+    import scene_pictures
+
+    load, drawn = scene_pictures.config.load_scene, []
+    small = {"camera.width_px": 64, "camera.height_px": 64, "patch.max_triangles": 300_000}
+    monkeypatch.setattr(scene_pictures.config, "load_scene", lambda scene, keys: load(scene, {**keys, **small}))
+    frames = scene_pictures.frames
+    monkeypatch.setattr(scene_pictures, "frames", lambda *given: drawn.extend(frames(*given)) or drawn)
+    picture = scene_pictures.paper_example()
+    assert picture.shape == (2 * 400 + scene_pictures.GAP_PX, 4 * 400 + 3 * scene_pictures.GAP_PX, 3)
+    # the second picture is the twin without straylight, not the image
+    images = drawn[0].images
+    assert (scene_pictures.rgb(drawn[0], "without_straylight") == images.without["straylight"].array[..., :3]).all()
+    assert (images.without["straylight"].array != images.image.array).any()

@@ -134,6 +134,22 @@ def test_a_latin_hypercube_gives_delta_and_keeps_the_global_random_numbers(
     assert np.array_equal(np.random.get_state()[1], state)  # noqa: NPY002
 
 
+def test_delta_does_not_depend_on_the_scale_of_the_values() -> None:
+    """The densities of the values themselves gave deltas from -4.4 to 1.9 for veils with a few bright ones."""
+    spec = kit.spec(2, 0.0, 1.0, design={"method": "latin_hypercube", "n": 128, "resamples": 100})
+    plain, steep = (analysed(spec, f)["delta"].values for f in (lambda x: x[0], lambda x: np.exp(40 * x[0])))
+    np.testing.assert_array_equal(plain, steep)
+    assert ((plain > -0.1) & (plain < 1)).all()
+
+
+def test_a_latin_hypercube_of_nearly_constant_values_has_no_delta() -> None:
+    """One value of 128 differs: some resamples lack it, and a single value has no density."""
+    spec = kit.spec(2, 0.0, 1.0, design={"method": "latin_hypercube", "n": 128, "resamples": 100})
+    data = analysed(spec, lambda x: (x[0] == x[0].max()).astype(float))
+    assert np.isnan(data["delta"].values).all()
+    assert np.isfinite(data["S1"].values).all()
+
+
 def test_the_law_of_total_variance_splits_models_from_factors() -> None:
     spec = kit.spec(design={"n": 64}, models={"fault": "f", "compare": ["a", "b", "c"]})
     design = make_design(spec)

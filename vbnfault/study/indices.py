@@ -43,6 +43,7 @@ import itertools
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -427,8 +428,12 @@ def _add_morris(arrays: dict[str, tuple[tuple[str, ...], _Array]], results: Resu
 def _add_delta(arrays: dict[str, tuple[tuple[str, ...], _Array]], results: Results) -> None:
     """Add the moment-independent index delta and the first-order index of given data, by SALib; means over blocks.
 
-    Delta needs 100 samples; from fewer it is nan. Its bootstrap has at most 20 resamples.
+    Delta needs 100 samples; from fewer it is nan. Its bootstrap has at most 20 resamples. Where nearly all values
+    are equal, a resample can have a single value, which has no density, and delta is nan, too. Delta is that of the
+    values' ranks, since it does not depend on the scale of the values (Borgonovo 2007, section 2).
     """
+    from scipy import stats
+
     analyze = salib("analyze.delta", "design.method = 'latin_hypercube'").analyze
     design, table = results.design, results.design.spec.design
     problem = unit_problem(design.spec)
@@ -442,16 +447,20 @@ def _add_delta(arrays: dict[str, tuple[tuple[str, ...], _Array]], results: Resul
             used[i, j] = max(used[i, j], rows.sum())
             if rows.sum() < 2 or np.ptp(y[rows]) == 0:
                 continue
+            analysed = partial(
+                analyze,
+                problem,
+                design.points[rows],
+                num_resamples=min(table.resamples, _MOST_RESAMPLES_OF_DELTA),
+                conf_level=table.confidence,
+                seed=table.seed % (2**32 - 1) + 1,  # SALib takes 0 as no seed
+            )
             with _steady():
-                found = analyze(
-                    problem,
-                    design.points[rows],
-                    y[rows],
-                    num_resamples=min(table.resamples, _MOST_RESAMPLES_OF_DELTA),
-                    conf_level=table.confidence,
-                    seed=table.seed % (2**32 - 1) + 1,  # SALib takes 0 as no seed
-                    method="all" if rows.sum() >= LEAST_SAMPLES_OF_DELTA else "sobol",
-                )
+                found = analysed(y[rows], method="sobol")
+                if rows.sum() >= LEAST_SAMPLES_OF_DELTA:
+                    # ranks have the same delta; densities of a few far values lie between the nodes of SALib's grid
+                    with contextlib.suppress(ValueError):
+                        found |= analysed(stats.rankdata(y[rows]), method="delta")
             for name in values.keys() & found.keys():
                 values[name][i, j, :, k] = found[name]
     dims = ("metric", "model", "factor")
