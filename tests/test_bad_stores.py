@@ -156,7 +156,6 @@ def test_root_attributes_of_the_wrong_type_are_one_sentence(
         "store.height": 0,
         "store.width": 2**63,
         "store.rendered_shape": [2**40, 2],
-        "store.faults": ["a"] * 4,
         "store.shard_samples": -1,
     }
     for key, value in wrong.items():

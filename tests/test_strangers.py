@@ -190,6 +190,8 @@ def test_names_are_refused_where_a_store_is_created_too(tmp_path: Path) -> None:
     for key, changes in wrong.items():
         with pytest.raises(InputError, match=key.replace(".", r"\.")):
             st.create(tmp_path / "s.zarr", make_spec(**changes), 4)
+    with pytest.raises(InputError, match=r"store\.faults: must be at most 1024 different names"):
+        st.create(tmp_path / "s.zarr", make_spec(faults=("a", "a"), mask_any_faults=(), layers=()), 4)
     with pytest.raises(InputError, match="samples = 10000001: must be a whole number from 0 to 10000000"):
         st.create(tmp_path / "s.zarr", make_spec(), 10_000_001)
     assert not [*tmp_path.iterdir()]
