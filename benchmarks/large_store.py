@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 
 from vbnfault import dataset, pipeline, store
+from vbnfault.core import interrupts
 from vbnfault.core.quantities import Sample
 from vbnfault.dataset import build
 from vbnfault.dataset.identity import stored_plan
@@ -95,7 +96,7 @@ def resume(opened: store.Store) -> None:
     plan = build.BuildPlan(spec=opened.spec, site=site, blocks=(opened.samples,))
     try:
         build.build(Maker(), plan, opened.path, build.BuildOptions(progress=False))
-    except build.Interrupted:
+    except interrupts.Interrupted:
         return
     raise AssertionError("the build made no sample")
 

@@ -17,7 +17,7 @@ import tempfile
 import threading
 from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -192,6 +192,39 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     digest = run(out).digest
     assert digest is not None
     return out, digest
+
+
+class Called(NamedTuple):
+    """What a command did: its exit code, and what it printed."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def said(self) -> str:
+        """The one line on standard error besides warnings, notes and progress."""
+        (line,) = [line for line in self.err.splitlines() if line.startswith("vbnfault: ")]
+        assert "Traceback" not in self.err
+        return line.removeprefix("vbnfault: ")
+
+
+@pytest.fixture
+def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., Called]:
+    """What runs the command line in this process."""
+    from vbnfault import cli
+
+    def run(*arguments: object) -> Called:
+        capsys.readouterr()
+        monkeypatch.setattr(sys, "argv", ["vbnfault", *map(str, arguments)])
+        code: Any = None
+        try:
+            cli.main()
+        except SystemExit as stop:
+            code = stop.code
+        return Called(int(code or 0), *capsys.readouterr())
+
+    return run
 
 
 def calls_of(action: Callable[[], Any]) -> int:

@@ -9,6 +9,7 @@ import urllib.request
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
+from unittest import mock
 
 BUCKET = "bucket"
 
@@ -98,16 +99,6 @@ class S3Server:
             self.before = earlier
 
 
-@contextlib.contextmanager
-def in_environment(server: S3Server) -> Iterator[None]:
+def in_environment(server: S3Server) -> Any:
     """Let obstore in this process find the server in a `with` block."""
-    before = {name: os.environ.get(name) for name in server.environment}
-    os.environ.update(server.environment)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+    return mock.patch.dict(os.environ, server.environment)

@@ -99,15 +99,6 @@ def test_a_session_keeps_what_is_costly_and_gives_any_sample() -> None:
     assert session.terrain(int(session.plan.site[0])) is session.terrain(int(session.plan.site[2]))
 
 
-def test_errors_name_what_is_wrong(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="sample 3: must be a whole number from 0 to 2"):
-        vbnfault.simulate(small(), 3)
-    with pytest.raises(InputError, match="nowhere"):
-        vbnfault.load_scene("nowhere")
-    with pytest.raises(InputError, match=r"none\.zarr: "):
-        vbnfault.open_dataset(tmp_path / "none.zarr")
-
-
 @pytest.mark.parametrize("index", [-1, 3, 1.0, np.float64(1), True, None, "1", [1], np.array([1])])
 def test_a_session_refuses_what_is_no_sample_of_it(index: Any) -> None:
     with pytest.raises(InputError, match=r"scene: sample .*: must be a whole number from 0 to 2$"):
@@ -144,48 +135,6 @@ def test_numbers_of_numpy_and_paths_are_settings_as_those_of_python(tmp_path: Pa
     assert summary.samples == 2
 
 
-def test_a_merge_of_one_text_is_refused(tmp_path: Path) -> None:
-    """A text is a sequence, too: its letters would be taken for stores."""
-    with pytest.raises(InputError, match=r"stores = 'a\.zarr': must be a list of stores"):
-        vbnfault.merge("a.zarr", tmp_path / "out.zarr")
-
-
-def test_options_and_overrides_of_another_type_are_refused_in_a_sentence(tmp_path: Path) -> None:
-    """A number, or a list of assignments as the command line takes them, would end in an AttributeError."""
-    with pytest.raises(InputError, match=r"overrides = \['camera.fov_deg=3'\]: must be a table of dotted keys"):
-        vbnfault.load_scene("quickstart", ["camera.fov_deg=3"])  # type: ignore[arg-type]
-    with pytest.raises(InputError, match=r"5 = 3: the key must be a text"):
-        vbnfault.load_scene("quickstart", {5: 3})  # type: ignore[dict-item]
-    with pytest.raises(InputError, match=r"options = \{'workers': 2\}: must be BuildOptions$"):
-        vbnfault.build(small(), tmp_path / "s.zarr", {"workers": 2})  # type: ignore[arg-type]
-    with pytest.raises(InputError, match=r"options = 2: must be BuildOptions$"):
-        vbnfault.retake(tmp_path / "a.zarr", small(), tmp_path / "s.zarr", 2)  # type: ignore[call-overload]
-    assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize(
-    ("given", "sentence"),
-    [
-        ({"sun_deg": "16"}, "sun_deg = '16': must be from 0 to 90, and a number"),
-        ({"sun_deg": None}, "sun_deg = None: must be from 0 to 90, and a number"),
-        ({"sun_deg": 16, "pixels": "128"}, "pixels = '128': must be from 16 to 4096, and a number"),
-        ({"sun_deg": 16, "pixels": 128.5}, "pixels = 128.5: must be a whole number"),
-        (
-            {"sun_deg": 16, "wavelength_nm": [550, 600]},
-            r"wavelength_nm = \[550, 600\]: must be from 250 to 2500, and a number",
-        ),
-    ],
-)
-def test_a_flare_of_what_is_no_number_is_refused_in_a_sentence(given: dict[str, Any], sentence: str) -> None:
-    with pytest.raises(InputError, match=sentence):
-        vbnfault.trace_flare("tessar_50_f2p8", **given)
-
-
-def test_a_session_of_a_path_is_refused_in_a_sentence() -> None:
-    with pytest.raises(InputError, match=r"scene = 'quickstart': must be a Scene, as vbnfault\.load_scene returns"):
-        vbnfault.Session("quickstart")  # type: ignore[arg-type]
-
-
 def test_a_misspelt_name_and_one_without_its_ending_get_a_suggestion(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -197,6 +146,33 @@ def test_a_misspelt_name_and_one_without_its_ending_get_a_suggestion(
         vbnfault.load_scene("a")
     with pytest.raises(InputError, match=r"^zzz: neither a file nor a packaged name; lenses: "):
         vbnfault.load_lens("zzz")
+
+
+@pytest.mark.parametrize(
+    ("wrong", "sentence"),
+    [
+        (lambda out: vbnfault.simulate(small(), 3), "sample 3: must be a whole number from 0 to 2"),
+        (lambda out: vbnfault.load_scene("nowhere"), "nowhere"),
+        (lambda out: vbnfault.open_dataset(out), r"s\.zarr: no such store"),
+        # a text is a sequence, too: its letters would be taken for stores
+        (lambda out: vbnfault.merge("a.zarr", out), r"stores = 'a\.zarr': must be a list of stores"),
+        (
+            lambda out: vbnfault.load_scene("quickstart", ["camera.fov_deg=3"]),
+            r"overrides = \['camera.fov_deg=3'\]: must be a table of dotted keys",
+        ),
+        (lambda out: vbnfault.load_scene("quickstart", {5: 3}), "5 = 3: the key must be a text"),
+        (lambda out: vbnfault.build(small(), out, {"workers": 2}), r"options = \{'workers': 2\}: must be BuildO"),
+        (lambda out: vbnfault.retake("a.zarr", small(), out, 2), "options = 2: must be BuildOptions$"),
+        (
+            lambda out: vbnfault.Session("quickstart"),
+            r"scene = 'quickstart': must be a Scene, as vbnfault\.load_sc",
+        ),
+    ],
+)
+def test_what_is_wrong_is_named(wrong: Callable[[Path], object], sentence: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=sentence):
+        wrong(tmp_path / "s.zarr")
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("path", [None, 3, b"x", []])
@@ -233,6 +209,12 @@ def test_what_is_no_path_is_refused_in_a_sentence(tmp_path: Path, path: Any) -> 
         ({"recycle_shards": None}, "recycle_shards = None: must be a whole number of at least 1"),
         ({"scheduler": 8786}, "scheduler = 8786: must be a string"),
         ({"append": 1.5}, r"--append 1\.5: must be at least 1, and a whole number"),
+        ({"workers": 5000}, "workers = 5000: must be a whole number from 1 to 1024"),
+        ({"threads": 0}, "threads = 0: must be a whole number from 1 to 1024"),
+        ({"workers": 2, "scheduler": "tcp://a:1"}, "--workers 2 and --scheduler tcp://a:1 exclude each other"),
+        ({"shard_range": range(2, 2)}, "--shard-range 2:2: must be A:B, whole numbers with 0 <= A < B"),
+        ({"shard_range": range(-1, 2)}, "--shard-range -1:2: must be A:B"),
+        ({"shard_range": range(1), "overwrite": True}, "--shard-range and --overwrite exclude each other"),
     ],
 )
 def test_options_of_a_build_are_checked(tmp_path: Path, options: dict[str, Any], sentence: str) -> None:
@@ -259,6 +241,12 @@ def test_lens_sensor_and_flare_are_at_hand() -> None:
     [
         ({"sun_deg": 90.0}, "sun_deg = 90"),
         ({"sun_deg": float("nan")}, "sun_deg = nan: must be from 0 to 90"),
+        ({"sun_deg": "16"}, "sun_deg = '16': must be from 0 to 90, and a number"),
+        ({"sun_deg": 16, "pixels": 128.5}, "pixels = 128.5: must be a whole number"),
+        (
+            {"sun_deg": 16, "wavelength_nm": [550, 600]},
+            r"wavelength_nm = \[550, 600\]: must be from 250 to 2500, a",
+        ),
         ({"sun_deg": 10.0, "pixels": 5}, "pixels = 5: must be from 16 to 4096"),
         ({"sun_deg": 10.0, "model": "painted"}, "model = 'painted': must be one of"),
         ({"sun_deg": 10.0, "reflections": 3}, "reflections = 3: must be 2 or 4"),

@@ -10,7 +10,6 @@ import os
 import pickle
 import platform
 import re
-import resource
 import shutil
 import subprocess
 import sys
@@ -29,6 +28,8 @@ from vbnfault.core.errors import InputError, VbnfaultError
 from vbnfault.core.quantities import Sample
 from vbnfault.dataset import build as bd
 from vbnfault.dataset import claims, lock, progress, tasks
+from vbnfault.dataset.resume import planned_blocks
+from vbnfault.dataset.tasks import BuildFailed
 from vbnfault.store import codec, disk
 
 HERE = Path(__file__).resolve().parent
@@ -99,7 +100,7 @@ def test_samples_that_fail_are_named_and_all_others_are_built(
 ) -> None:
     out = tmp_path / "s.zarr"
     with pytest.raises(
-        bd.BuildFailed, match=r"2 samples \(5, 9\) failed, the first with: KeyError.*for 5.*py:\d"
+        BuildFailed, match=r"2 samples \(5, 9\) failed, the first with: KeyError.*for 5.*py:\d"
     ) as e:
         run(out, Session(raises=frozenset({5, 9})))
     assert set(e.value.failures) == {5, 9}
@@ -112,7 +113,7 @@ def test_samples_that_fail_are_named_and_all_others_are_built(
 
 def test_a_hopeless_build_stops_early(tmp_path: Path) -> None:
     log = tmp_path / "log"
-    with pytest.raises(bd.BuildFailed, match=r"32 samples .* before any succeeded"):
+    with pytest.raises(BuildFailed, match=r"32 samples .* before any succeeded"):
         run(tmp_path / "s.zarr", Session(raises=frozenset(range(60)), log=str(log)), samples=60)
     assert len(log.read_text().splitlines()) == 32
 
@@ -125,25 +126,25 @@ def test_a_session_that_cannot_start_ends_the_build_with_its_sentence(tmp_path: 
 
 def test_append_keeps_earlier_bits_and_resumes_itself(undisturbed: tuple[Path, str], tmp_path: Path) -> None:
     out = tmp_path / "s.zarr"
-    assert bd.planned_blocks(out, SAMPLES) == (SAMPLES,)
+    assert planned_blocks(out, SAMPLES) == (SAMPLES,)
     with pytest.raises(InputError, match="there is no store"):
-        bd.planned_blocks(out, SAMPLES, append=3)
+        planned_blocks(out, SAMPLES, append=3)
     run(out)
     old = [st.open_store(out).read_sample(i) for i in (0, 16, 17)]
-    blocks = bd.planned_blocks(out, SAMPLES, append=5)
+    blocks = planned_blocks(out, SAMPLES, append=5)
     assert blocks == (SAMPLES, 5)
-    with pytest.raises(bd.BuildFailed):
+    with pytest.raises(BuildFailed):
         run(out, Session(raises=frozenset({20})), samples=23, blocks=blocks)
-    assert bd.planned_blocks(out, SAMPLES, append=5) == blocks  # the same command resumes
-    assert bd.planned_blocks(out, SAMPLES) == blocks
+    assert planned_blocks(out, SAMPLES, append=5) == blocks  # the same command resumes
+    assert planned_blocks(out, SAMPLES) == blocks
     assert run(out, samples=23, blocks=blocks).built == 1
-    assert bd.planned_blocks(out, SAMPLES, append=5) == (SAMPLES, 5, 5)
+    assert planned_blocks(out, SAMPLES, append=5) == (SAMPLES, 5, 5)
     assert st.verify(out) == []
     for sample in old:
         again = st.open_store(out).read_sample(sample.index)
         assert all(again.layers[n].tobytes() == a.tobytes() for n, a in sample.layers.items())
     with pytest.raises(InputError, match=r"samples = 20, but the store was made with 18; use --append"):
-        bd.planned_blocks(out, 20)
+        planned_blocks(out, 20)
     with pytest.raises(InputError, match=r"holds blocks of 18 \+ 5 samples, not 23"):
         run(out, samples=23)
 
@@ -196,7 +197,7 @@ def test_free_texts_of_a_scene_do_not_hinder_a_resume(tmp_path: Path) -> None:
         }
 
     out = tmp_path / "s.zarr"
-    with pytest.raises(bd.BuildFailed):
+    with pytest.raises(BuildFailed):
         run(out, Session(raises=frozenset({5})), spec=make_spec(attributes=retaken("before")))
     for others in (retaken("now", camera={"fov_deg": 9}), {**retaken("now"), "fault_models": {"adc": "now"}}):
         with pytest.raises(InputError, match=r"holds another dataset: [^;]*; choose another --out"):
@@ -219,13 +220,13 @@ def test_a_store_of_other_versions_is_completed_on_request_and_says_by_whom(
         entries = st.open_store(out).attributes.get("versions_of_samples", [])
         return {entry["versions"]["numpy"]: entry["samples"] for entry in entries}
 
-    with pytest.raises(bd.BuildFailed):
+    with pytest.raises(BuildFailed):
         made_with("1", session=Session(raises=frozenset({5, 9, 10})))
     with pytest.raises(InputError, match=r"made with other versions: numpy 1 \(now 2\); --accept-versions") as e:
         made_with("2")
     assert "machine" not in str(e.value)
     assert noted() == {}
-    with pytest.raises(bd.BuildFailed):
+    with pytest.raises(BuildFailed):
         made_with("2", accept=True, session=Session(raises=frozenset({10})))
     assert noted() == {"2": [[5, 5], [9, 10]]}
     assert made_with("2").built == 1  # accepted once
@@ -286,7 +287,7 @@ def test_the_work_is_announced_and_stages_are_named(
     """Samples, sites, bytes and time come first; a stage of any process is a line where there is no terminal."""
     session = Session(stage="terrain of site", raises=frozenset({5}))
     options = {"workers": workers, "progress": True, "estimated_seconds": 90.0, "samples": 8}
-    with pytest.raises(bd.BuildFailed):
+    with pytest.raises(BuildFailed):
         run(tmp_path / "s.zarr", session, **options)
     lines = capsys.readouterr().err.splitlines()
     assert lines[0].startswith(f"{tmp_path / 's.zarr'}: 8 samples at 3 sites in 2 shards, about ")
@@ -295,28 +296,11 @@ def test_the_work_is_announced_and_stages_are_named(
         f"terrain of site {i}" for i in range(8)
     ]
     # what is left of the time is that of the samples left
-    with pytest.raises(bd.BuildFailed):
+    with pytest.raises(BuildFailed):
         run(tmp_path / "s.zarr", session, **options)
     lines = capsys.readouterr().err.splitlines()
     assert lines[1].startswith("estimated time: 11 s, ")
     assert [line for line in lines if line.startswith("terrain")] == ["terrain of site 5"]
-
-
-def test_the_summary_counts_what_is_in_the_store(tmp_path: Path) -> None:
-    """A fault that is planned and not injected is not counted as realised: 49 planned, 44 realised."""
-    injected = np.array([fake_sample(make_spec(), i).scalars["injected"] for i in range(SAMPLES)])
-    planned = injected.copy()
-    i, off = (int(n[0]) for n in np.nonzero(~planned))
-    planned[i, off] = True
-    summary = run(tmp_path / "s.zarr", planned_faults=planned)
-    assert summary.counts is not None
-    faults = make_spec().faults
-    assert [summary.counts.realised(f) for f in faults] == injected.sum(axis=0).tolist()
-    assert [summary.counts.planned(f) for f in faults] == planned.sum(axis=0).tolist()
-    assert summary.counts.missing == {faults[off]: 1}
-    said = "\n".join(summary.lines())
-    assert f"planned, but without effect and not injected: {faults[off]} 1" in said
-    assert f"digest {st.digest(tmp_path / 's.zarr')}" in said
 
 
 def test_too_little_room_is_said_before_the_first_sample(
@@ -338,21 +322,6 @@ def test_paths_that_cannot_be_used_are_bad_input(tmp_path: Path) -> None:
     for out in (tmp_path / "file", tmp_path / "file" / "s.zarr", Path("/proc/none/s.zarr"), long, long / "s.zarr"):
         with pytest.raises(InputError, match=str(out)):
             run(out)
-
-
-@pytest.mark.parametrize(
-    ("options", "sentence"),
-    [
-        ({"workers": 0}, "workers = 0: must be a whole number from 1 to 1024"),
-        ({"workers": 5000}, "workers = 5000: must be a whole number from 1 to 1024"),
-        ({"threads": 0}, "threads = 0: must be a whole number from 1 to 1024"),
-        ({"recycle_shards": 0}, "recycle_shards = 0: must be a whole number of at least 1"),
-        ({"workers": 2, "scheduler": "tcp://a:1"}, "--workers 2 and --scheduler tcp://a:1 exclude each other"),
-    ],
-)
-def test_options_are_checked_by_the_library(options: dict, sentence: str) -> None:
-    with pytest.raises(InputError, match=sentence):
-        bd.BuildOptions(**options)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no such locks there")
@@ -466,17 +435,6 @@ def test_progress_without_a_terminal_is_plain_lines(
     assert all(map(form.fullmatch, lines)), lines
 
 
-@pytest.mark.parametrize("what", ["mask", "image/zarr.json", "sample", "done", "fault/c"])
-def test_arrays_that_are_missing_are_made_again(undisturbed: tuple[Path, str], tmp_path: Path, what: str) -> None:
-    out = shutil.copytree(undisturbed[0], tmp_path / "s.zarr")
-    target = out / what
-    shutil.rmtree(target) if target.is_dir() else target.unlink()
-    assert len(st.verify(out)) == 1
-    assert run(out).built == (SAMPLES if what in ("mask", "done") else 0)
-    assert st.verify(out) == []
-    assert st.digest(out) == undisturbed[1]
-
-
 @pytest.mark.parametrize("what", ["", "zarr.json", "image", "image/c", "image/c/1", "done/c", "roll_deg/c/0"])
 def test_a_store_that_may_not_be_read_is_not_taken_for_damaged(
     undisturbed: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str
@@ -492,36 +450,6 @@ def test_a_store_that_may_not_be_read_is_not_taken_for_damaged(
     assert not log.exists()
     assert {p: p.stat().st_mtime_ns for p in out.rglob("*")} == times
     assert sorted(p.name for p in tmp_path.iterdir()) == ["s.zarr"]
-
-
-def test_a_store_without_room_for_its_first_file_leaves_nothing(tmp_path: Path) -> None:
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
-    try:
-        with pytest.raises(VbnfaultError, match=r"no store can be created here: File too large"):
-            run(tmp_path / "s.zarr")
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_worker_returns_memory_after_every_shard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Once a shard, when its samples are written and no longer held; also after a shard that could not be made."""
-    opened = st.create(tmp_path / "s.zarr", make_spec(), 8)
-    events: list[str] = []
-    monkeypatch.setattr(tasks, "release_unused", lambda: events.append("released"))
-    monkeypatch.setattr(
-        st.Store, "write_shard", lambda self, number, given, damaged: events.append(f"wrote {number}") or set()
-    )
-
-    def simulate(index: int) -> Sample:
-        if index > 3:
-            raise VbnfaultError("no sample")
-        return fake_sample(opened.spec, index)
-
-    for number in range(2):
-        tasks.work(simulate, opened, tasks.Task(shard=number, sites=(0,) * 4), lambda *_: None)
-    assert events == ["wrote 0", "released", "released"]
 
 
 @pytest.mark.parametrize("careful", [False, True])

@@ -30,10 +30,11 @@ from synthetic import SAMPLES, Broken, Session, fake_sample, make_spec, run, sit
 from vbnfault import store as st
 from vbnfault.core import toml_files
 from vbnfault.core.errors import InputError, VbnfaultError
+from vbnfault.core.interrupts import Interrupted
 from vbnfault.core.quantities import Sample
 from vbnfault.core.registry import undoing_registrations
 from vbnfault.dataset import BuildOptions, build_scene, dask
-from vbnfault.dataset import build as bd
+from vbnfault.dataset.tasks import BuildFailed
 from vbnfault.faults import plugins
 from vbnfault.scene.config import load_scene
 from vbnfault.study import results
@@ -204,7 +205,7 @@ def test_a_sample_that_kills_its_workers_fails_alone(
 ) -> None:
     out = tmp_path / "s.zarr"
     sentence = rf"sample {AT} failed, the first with: a worker of the cluster died while it was in work"
-    with pytest.raises(bd.BuildFailed, match=sentence):
+    with pytest.raises(BuildFailed, match=sentence):
         run(out, Disturbing("worker dies", str(tmp_path)), scheduler=processes.scheduler_address)
     assert finished(out) == set(range(SAMPLES)) - {AT}
     assert resumed(out) == undisturbed[1]
@@ -220,7 +221,7 @@ def test_ctrl_c_waits_until_the_workers_have_written(
     processes: Any, undisturbed: tuple[Path, str], tmp_path: Path
 ) -> None:
     out = tmp_path / "s.zarr"
-    with pytest.raises(bd.Interrupted, match=r"interrupted; (\d+) of 18 samples are finished") as stopped:
+    with pytest.raises(Interrupted, match=r"interrupted; (\d+) of 18 samples are finished") as stopped:
         run(
             out,
             Disturbing("user interrupts", str(tmp_path), os.getpid()),
@@ -332,7 +333,7 @@ def test_a_dask_cluster_makes_the_same_bits(
     with distributed.LocalCluster(
         n_workers=2, threads_per_worker=2, processes=False, dashboard_address=None
     ) as cluster:
-        with pytest.raises(bd.BuildFailed, match=r"sample 5 failed.*KeyError"):
+        with pytest.raises(BuildFailed, match=r"sample 5 failed.*KeyError"):
             run(out, Session(raises=frozenset({5})), scheduler=cluster.scheduler_address)
         summary = run(out, Session(stage="terrain of"), scheduler=cluster.scheduler_address, progress=True)
         assert (summary.built, summary.digest) == (1, undisturbed[1])

@@ -22,8 +22,8 @@ from tools import victim
 from vbnfault import store as st
 from vbnfault.core.errors import VbnfaultError
 from vbnfault.core.quantities import Sample
-from vbnfault.dataset import build as bd
 from vbnfault.dataset import processes
+from vbnfault.dataset.tasks import BuildFailed
 
 HERE = Path(__file__).resolve().parent
 
@@ -147,7 +147,7 @@ def test_ctrl_c_as_workers_start_twice_leaves_nobody(tmp_path: Path) -> None:
 
 def test_a_worker_that_dies_costs_its_sample_alone(undisturbed: tuple[Path, str], tmp_path: Path) -> None:
     out = tmp_path / "s.zarr"
-    with pytest.raises(bd.BuildFailed, match=r"sample 6 failed.*worker process was killed \(signal 9.*twice"):
+    with pytest.raises(BuildFailed, match=r"sample 6 failed.*worker process was killed \(signal 9.*twice"):
         run(out, Session(dies=frozenset({6})), workers=2)
     assert st.problem_samples(out) == [6]
     assert run(out).built == 1

@@ -94,6 +94,12 @@ def test_a_path_to_write_is_no_url() -> None:
                 assert isinstance(shown.exception, InputError), (command, option.name)
                 start = f"{option.opts[0]} {url.split(':')[0]}://"
                 assert re.fullmatch(rf"{start}.*: is a URL; must be a path on this machine", str(shown.exception))
+            for path, sentence in (
+                (" ", "must be a path, and not empty"),
+                ("/", "is the root folder; choose a folder"),
+            ):
+                refused = CliRunner().invoke(cli.app, [command, option.opts[0], path], env={"COLUMNS": "200"})
+                assert (refused.exit_code, sentence in refused.output) == (2, True), (command, option.name)
             seen += 1
     assert seen == 14
     assert not Path("s3:").exists()

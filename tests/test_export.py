@@ -22,7 +22,6 @@ from vbnfault import cli
 from vbnfault import store as st
 from vbnfault.core import registry
 from vbnfault.core.errors import InputError, VbnfaultError
-from vbnfault.core.whole_files import replacing
 from vbnfault.output.export import Entry, Format, export_store, formats
 from vbnfault.output.export.folder import Folder
 from vbnfault.output.export.formats import coco
@@ -375,14 +374,6 @@ def test_a_complete_export_with_a_flipped_bit_is_written_again(described_store: 
     assert export_store(described_store, tmp_path, "png", progress=False).written == 0
 
 
-def test_an_outline_runs_through_the_centres_of_pixels() -> None:
-    """So that a reader which cuts off decimals gets the pixels, also where a fraction is not exact."""
-    mask = np.zeros((8, 9), bool)
-    mask[2:5, 3:7] = True
-    (region,) = regions(mask)
-    assert sorted(map(tuple, polygon(region))) == [(3.5, 2.5), (3.5, 4.5), (6.5, 2.5), (6.5, 4.5)]
-
-
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # webdataset leaves files open
 def test_webdataset_reads_the_tar_files(exported: Any, data: st.Store) -> None:
     tool = reader("webdataset")
@@ -489,17 +480,6 @@ def test_a_full_disk_is_one_sentence_and_loses_nothing(
     assert not [name for name in before if name.endswith(".partial")]
     assert export_store(described_store, out, "yolo", progress=False).samples == SAMPLES
     assert tree(out) == tree(exported("yolo"))
-
-
-def test_a_file_that_cannot_be_streamed_leaves_the_old_one(tmp_path: Path) -> None:
-    def failing(path: Path) -> None:
-        path.write_bytes(b"half")
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    (tmp_path / "a.tar").write_bytes(b"old")
-    with pytest.raises(OSError, match="No space left"), replacing(tmp_path / "a.tar") as temporary:
-        failing(temporary)
-    assert tree(tmp_path) == {"a.tar": hashlib.sha256(b"old").hexdigest()}
 
 
 def test_a_finished_part_is_not_written_again_unless_a_file_is_missing(
@@ -609,14 +589,3 @@ def test_another_store_or_format_does_not_mix_into_an_export(
     with pytest.raises(InputError, match="holds another export: contents_sha256"):
         export_store(other, exported("png"), "png", progress=False)
     assert tree(exported("png")) == before
-
-
-def test_a_damaged_sample_ends_an_export_until_it_is_repaired(finished_store: Path, tmp_path: Path) -> None:
-    copy = Path(shutil.copytree(finished_store, tmp_path / "s.zarr"))
-    file = st.open_store(copy).file("mask", 1)
-    good = file.read_bytes()
-    file.write_bytes(good[:40] + bytes([good[40] ^ 1]) + good[41:])
-    with pytest.raises(VbnfaultError, match="build command repairs it"):
-        export_store(copy, tmp_path / "out", "coco", progress=False)
-    file.write_bytes(good)
-    assert export_store(copy, tmp_path / "out", "coco", progress=False).samples == 10

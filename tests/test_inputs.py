@@ -28,15 +28,14 @@ from vbnfault.body.geometry import signed_volume
 from vbnfault.core import images, path_checks, resources, spice, user_files
 from vbnfault.core.errors import InputError, VbnfaultError, shown
 from vbnfault.core.toml_files import read_toml
-from vbnfault.core.whole_files import write_whole
+from vbnfault.core.whole_files import write_json, write_whole
 from vbnfault.dataset.lock import locked
 from vbnfault.detector.sensor import load_sensor
 from vbnfault.faults import from_dict, registry
 from vbnfault.faults.levels import Levels
 from vbnfault.lens import load_lens
 from vbnfault.lens.prescription_file import write_lens
-from vbnfault.output.json_files import write_json
-from vbnfault.output.template_files import write_template
+from vbnfault.output.starters import write_template
 from vbnfault.scene import config
 from vbnfault.study.severity import write_table
 from vbnfault.world.spacecraft import load_spacecraft

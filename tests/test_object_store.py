@@ -11,7 +11,6 @@ from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from s3_server import BUCKET, S3Server, in_environment
 from synthetic import fake_sample, make_spec, run
@@ -354,22 +353,7 @@ def test_commands_take_urls(tmp_path: Path, built: str, digest: str, monkeypatch
     assert (tmp_path / "p.png").stat().st_size > 1000
     assert "samples" in call("stats", built)
     assert call("card", built).split() == [f"{built}/README.md", f"{built}/croissant.json"]
+    assert call("report", built, "--out", str(tmp_path / "r.html")).strip() == str(tmp_path / "r.html")
     assert "8 samples as png" in call("export", built, "--format", "png", "--out", str(tmp_path / "e"))
     shown = CliRunner().invoke(cli.app, ["verify", "ftp://a/b"])
     assert "ftp:// is unknown" in str(shown.exception)
-
-
-def test_a_bucket_is_viewed_and_reported(built: str, tmp_path: Path) -> None:
-    from vbnfault.output.report import write_report
-    from vbnfault.output.viewer import Viewer
-
-    viewer = Viewer(st.open_store(built))
-    try:
-        np.testing.assert_array_equal(viewer.pixels("mask", 2), st.open_dataset(built)["mask"].values[2])
-        columns, faults = viewer.columns(), len(viewer.store.spec.faults)
-        assert len(columns) == viewer.store.samples * (3 + 4 * -(-faults // 32))
-        assert columns[-viewer.store.samples :] == bytes([1]) * viewer.store.samples
-        assert viewer.about["name"] == built.rpartition("/")[2]
-    finally:
-        viewer.server.server_close()
-    assert write_report(built, tmp_path / "r.html").stat().st_size > 100_000

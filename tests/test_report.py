@@ -21,8 +21,8 @@ from vbnfault.core.errors import InputError
 from vbnfault.core.html_page import number_text
 from vbnfault.output.report import MOST_READ, MOST_SHOWN, write_report
 from vbnfault.output.report.charts import bin_edges, histogram
-from vbnfault.output.report.gallery import pick
 from vbnfault.output.report.measure import Drawn, key_bounds, key_unit, read_drawn, read_pixels, read_scalars
+from vbnfault.output.report.page import pick
 from vbnfault.store import codec
 
 

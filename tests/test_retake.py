@@ -338,7 +338,7 @@ def test_of_half_a_store_the_finished_samples_are_taken(
     # once the old store is complete, the new one keeps to its samples
     half._write_done(0, {0, 1, 2, 3})
     assert retake(half.path, scene, new).finished == 6
-    assert retake(half.path, scene, new, overwrite=True).samples == 8
+    assert retake(half.path, scene, new, overwrite=True).built == 8
 
 
 # --- bad input -------------------------------------------------------------------------------------------------
@@ -364,6 +364,7 @@ def test_what_cannot_be_taken_again_is_refused_in_a_sentence(
         (changed(body={"reflectance": 0.1}), rf"other: body\.reflectance is .* in \S*source\.zarr and .*: {kept}"),
         (changed(camera={"width_px": 64}), r"camera\.width_px is 48 in \S*source\.zarr and 64 now"),
         (changed(camera={"fov_deg": 30.0}), r"fov_deg is "),
+        (changed(camera={"focus_distance_m": 7.0}), r"camera\.focus_distance_m is "),
         (changed(render={"samples_per_pixel": 16}), r"render\.samples_per_pixel is 4 .* and 16 now"),
         (changed(sun={"julian_date": 2456000.0}), r"sun\.julian_date is "),
         (changed(geometry={"height_m": [0.0, 50.0]}), r"geometry\.height_m"),

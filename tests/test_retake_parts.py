@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 from types import SimpleNamespace
 from typing import Any
 
@@ -47,17 +46,6 @@ def spec_of(**changes: Any) -> Any:
 # --- truth ------------------------------------------------------------------------------------------------
 
 
-def test_stored_truth_is_that_of_a_camera_with_the_same_pixels() -> None:
-    truth = retaken._stored_truth(spec_of(), stored_view())
-    assert truth is not None
-    assert (truth.depth_m == 1).all()
-    assert truth.emission_deg is None
-    with_angles = retaken._stored_truth(spec_of(layers=("emission_deg",)), stored_view())
-    assert with_angles is not None
-    assert with_angles.emission_deg is not None
-    assert (with_angles.emission_deg == 7).all()
-
-
 @pytest.mark.parametrize(
     ("layers", "scalars"),
     [
@@ -88,13 +76,6 @@ def _radiance(monkeypatch: pytest.MonkeyPatch, stored: StoredView, *, sees_sun: 
     monkeypatch.setattr(retaken, "add_mean", add)
     monkeypatch.setattr(retaken, "Pinhole", lambda *_: None)
     return retaken._radiance(spec_of(), scene, stored)  # type: ignore[arg-type]
-
-
-def test_the_middle_of_a_wider_render_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
-    stored = stored_view()
-    made = _radiance(monkeypatch, stored, sees_sun=False)
-    assert np.array_equal(made.array, stored.radiance[:, 1:-1, 2:-2])
-    assert made.sun is None
 
 
 @pytest.mark.parametrize(
@@ -206,84 +187,3 @@ def test_any_other_optics_make_another_aperture(finished_store: Any, key: str) -
 
 
 # --- what may differ, and what is taken -------------------------------------------------------------------
-
-
-def differing(changed: dict[str, Any]) -> list[str]:
-    """Return the keys in which a scene may not differ from a stored one, but does."""
-    camera = {"fov_deg": 60.0, "width_px": 8, "height_px": 8, "focus_distance_m": 100.0, "lens": "a"}
-    stored: dict[str, Any] = {
-        "camera": camera,
-        "dataset": {"sites": 2, "seed": 1},
-        "plan": {"mode": "per_class", "pair_strata": False},
-        "faults": {"vignetting": {}},
-        "shape_sha256": "a",
-        "lens_sha256": "a",
-    }
-    wanted = {**stored, **{table: values for table, values in changed.items() if not isinstance(values, dict)}}
-    for table, values in changed.items():
-        if isinstance(values, dict):
-            wanted[table] = {**stored.get(table, {}), **values}
-    return [difference.text("before", "now").split(" ")[0] for difference in retake._differing(stored, wanted)]
-
-
-@pytest.mark.parametrize(
-    ("changed", "keys"),
-    [
-        ({}, []),
-        ({"camera": {"lens": "b", "exposure_s": 1.0}, "lens_sha256": "b"}, []),
-        *[({"camera": {key: 7}}, [f"camera.{key}"]) for key in sorted(retake._FIXED_OF_CAMERA)],
-        ({"shape_sha256": "b"}, ["shape_sha256"]),
-        ({"dataset": {"seed": 2, "samples": 9, "licence": "x"}, "title": "other"}, []),
-        ({"dataset": {"sites": 3}, "plan": {"mode": "independent"}}, ["dataset.sites"]),
-        ({"plan": {"pair_strata": True}}, ["plan.pair_strata"]),
-        ({"faults": {"smear": {}}, "coma": {"afrho_cm": 100.0}}, ["coma.afrho_cm"]),
-    ],
-)
-def test_only_what_the_radiance_does_not_depend_on_may_differ(changed: dict[str, Any], keys: list[str]) -> None:
-    assert differing(changed) == keys
-    assert sorted(retake._FIXED_OF_CAMERA) == ["focus_distance_m", "fov_deg", "height_px", "width_px"]
-
-
-@pytest.mark.parametrize(
-    ("stored", "wanted", "repeats"),
-    [(None, 1, 1), (None, 3, 3), (2, 2, 1), (2, 4, 2), (3, 6, 2), (2, 3, 0), (4, 2, 0)],
-)
-def test_each_stored_sample_is_taken_as_often_as_the_variants_say(
-    stored: int | None, wanted: int, repeats: int
-) -> None:
-    table = {} if stored is None else {"variants_per_view": stored}
-    opened: Any = SimpleNamespace(attributes={"scene": {"dataset": table}}, path="s.zarr")
-    scene: Any = SimpleNamespace(dataset=SimpleNamespace(variants_per_view=wanted))
-    if repeats:
-        assert retake._repeats(opened, scene, "scene") == repeats
-        return
-    with pytest.raises(InputError, match=f"{wanted}: s.zarr has {stored} samples .* a multiple of {stored}"):
-        retake._repeats(opened, scene, "scene")
-
-
-def test_the_checksum_of_the_old_store_is_that_of_the_samples_taken(finished_store: Any) -> None:
-
-    opened = store.open_store(finished_store)  # shards of 4 samples
-    chosen = ([0, 1, 5], [0, 1, 6], [0, 5], [0, 1, 5, 9])
-    digests = [retake._checksums(opened, np.array(samples)) for samples in chosen]
-    assert len(set(digests)) == len(chosen)
-    rows = np.concatenate([opened.column("crc32c", number) for number in range(opened.shards)])
-    assert digests[3] == hashlib.sha256(rows[[0, 1, 5, 9]].tobytes()).hexdigest()
-
-
-@pytest.mark.parametrize(
-    ("layers", "scene", "layer"),
-    [
-        (("radiance", "scene_radiance"), {"camera": {"lens": "a"}, "sky": {"stars": "on"}}, "scene_radiance"),
-        (("radiance",), {"camera": {}}, "radiance"),
-        (("radiance",), {"camera": {}, "sky": {"stars": "off"}}, "radiance"),
-        (("radiance",), {"camera": {}, "sky": {"stars": "auto"}}, ""),
-        (("radiance",), {"camera": {"lens": "a"}}, ""),
-        (("depth_m",), {"camera": {}}, ""),
-    ],
-)
-def test_the_radiance_before_the_lens_and_without_stars_is_used(
-    layers: tuple[str, ...], scene: dict[str, Any], layer: str
-) -> None:
-    spec: Any = SimpleNamespace(layers=layers)
-    assert retake._radiance_layer(spec, {"scene": scene}) == layer

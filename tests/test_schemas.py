@@ -18,15 +18,15 @@ from vbnfault.detector.readout import ReadoutSpec
 from vbnfault.detector.sensor import Sensor, parse_sensor
 from vbnfault.faults import registry
 from vbnfault.lens import parse_lens
-from vbnfault.output.schemas import KINDS, file_schema
+from vbnfault.output.starters import SCHEMAS, file_schema
 from vbnfault.pipeline.session import configure_faults
 from vbnfault.scene.config import parse_scene
 from vbnfault.scene.instrument import OF_A_SENSOR_FILE, CameraTable
 from vbnfault.study.spec import parse_study
 
 FOLDERS = {"scene": "scenes", "lens": "scenes/lenses", "sensor": "scenes/detectors", "study": "scenes/studies"}
-PACKAGED = [(kind, name) for kind in KINDS for name in resources.packaged(FOLDERS[kind])]
-VALIDATORS = {kind: Draft202012Validator(file_schema(kind)) for kind in KINDS}
+PACKAGED = [(kind, name) for kind in SCHEMAS for name in resources.packaged(FOLDERS[kind])]
+VALIDATORS = {kind: Draft202012Validator(file_schema(kind)) for kind in SCHEMAS}
 
 
 def packaged(kind: str, name: str) -> dict[str, Any]:
@@ -42,7 +42,7 @@ def read(kind: str, table: dict[str, Any]) -> None:
         parsers[kind](table, source="x.toml")
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", SCHEMAS)
 def test_a_schema_is_one_and_plain_json(kind: str) -> None:
     schema = file_schema(kind)
     Draft202012Validator.check_schema(schema)
@@ -136,7 +136,7 @@ def keys_of(schema: dict[str, Any]) -> Iterator[tuple[str, str, dict[str, Any]]]
     return walk("", schema)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", SCHEMAS)
 def test_every_key_has_a_description(kind: str) -> None:
     schema = file_schema(kind)
     described = list(keys_of(schema))

@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 import shutil
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from conftest import small_scene
-from test_cli import run
+from conftest import Called, small_scene
 
 from vbnfault import dataset, pipeline
 from vbnfault import store as st
@@ -138,7 +138,7 @@ def test_a_build_writes_the_card_once(copy: Path, monkeypatch: pytest.MonkeyPatc
             return made[0]
 
     monkeypatch.setattr(from_scene.build, "build", lambda *_: Summary())
-    monkeypatch.setattr(from_scene.build, "planned_blocks", lambda *_, **__: (6,))
+    monkeypatch.setattr(from_scene, "planned_blocks", lambda *_, **__: (6,))
     monkeypatch.setattr(from_scene, "_prepared", lambda *_: (None, None, []))
     monkeypatch.setattr(from_scene.dataclasses, "replace", lambda thing, **_: thing)
     monkeypatch.setattr(from_scene.llvm, "find", lambda: None)
@@ -150,19 +150,15 @@ def test_a_build_writes_the_card_once(copy: Path, monkeypatch: pytest.MonkeyPatc
         assert len(written) == cards
 
 
-def test_the_commands(copy: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(monkeypatch, "stats", copy) == 0
-    text = capsys.readouterr().out
+def test_the_commands(copy: Path, call: Callable[..., Called]) -> None:
+    text = call("stats", copy).out
     for title in ("planned", "two classes occur together", "exposure_s", "drawn parameters", "samples by stratum"):
         assert title in text
-    assert run(monkeypatch, "stats", copy, "--json") == 0
-    assert json.loads(capsys.readouterr().out)["samples"] == 6
-    assert run(monkeypatch, "card", copy) == 0
-    assert capsys.readouterr().out.split() == [str(copy / "README.md"), str(copy / "croissant.json")]
+    assert json.loads(call("stats", copy, "--json").out)["samples"] == 6
+    assert call("card", copy).out.split() == [str(copy / "README.md"), str(copy / "croissant.json")]
     out = copy.with_name("out")
-    assert run(monkeypatch, "export", copy, "--format", "yolo", "--out", out, "--workers", 1) == 0
-    assert capsys.readouterr().out == f"{out}: 6 samples as yolo\n"
-    assert run(monkeypatch, "export", copy, "--format", "voc", "--out", out) == 2
-    assert "vbnfault: format 'voc': there is no such format" in capsys.readouterr().err
-    assert run(monkeypatch, "stats", copy.with_name("none")) == 2
-    assert "no such store" in capsys.readouterr().err
+    assert (
+        call("export", copy, "--format", "yolo", "--out", out, "--workers", 1).out == f"{out}: 6 samples as yolo\n"
+    )
+    refused = call("export", copy, "--format", "voc", "--out", out)
+    assert (refused.code, "format 'voc': there is no such format" in refused.said) == (2, True)

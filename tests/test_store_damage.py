@@ -10,6 +10,7 @@ import shutil
 import threading
 import warnings
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from tools.damage import SAMPLES, mend, sample, spec
 
 from vbnfault import store as st
 from vbnfault.core.errors import InputError, VbnfaultError
+from vbnfault.core.whole_files import remove
 from vbnfault.store import disk
 from vbnfault.store.metadata import metadata_problems
 
@@ -150,53 +152,41 @@ def test_the_documents_are_those_that_zarr_writes(store: Path) -> None:
 
 
 def folder(path: Path) -> None:
-    path.unlink()
     (path / "inside").mkdir(parents=True)
 
 
 def link(path: Path) -> None:
-    path.rename(path.with_name("elsewhere"))
+    path.with_name("elsewhere").write_bytes(b"x")
     path.symlink_to("elsewhere")
 
 
 def loop(path: Path) -> None:
-    path.unlink()
     path.symlink_to(path.name)
 
 
-def pipe(path: Path) -> None:
-    path.unlink()
-    os.mkfifo(path)
+def file(path: Path) -> None:
+    path.write_bytes(b"x")
 
 
-@pytest.mark.parametrize("place", [folder, link, loop, pipe])
+FILES = ("image/c/1/0/0/0", "mask/zarr.json", "done/c/1", "crc32c/c/1/0", "x/c/0", "sample/zarr.json")
+FOLDERS = ("image", "image/c", "image/c/1", "done", "x/c", "spare")
+
+
 @pytest.mark.parametrize(
-    "name",
-    ["image/c/1/0/0/0", "mask/zarr.json", "done/c/1", "tries/c/1", "crc32c/c/1/0", "x/c/0", "sample/zarr.json"],
+    ("place", "name"),
+    [*product((folder, link, loop, os.mkfifo), FILES), *product((file, loop), FOLDERS)],
 )
-def test_whatever_else_has_the_name_of_a_file_makes_way(
+def test_whatever_else_has_the_name_of_a_file_or_folder_makes_way(
     store: Path, template: tuple[Path, str], place: Callable[[Path], None], name: str
 ) -> None:
+    remove(store / name)
     place(store / name)
     assert any(name.split("/")[0] in problem for problem in st.verify(store))
     mend(store)
     assert st.verify(store) == []
     assert st.digest(store) == template[1]
-    assert (store / name).is_file()
+    assert (store / name).is_file() == (name in FILES)
     assert not (store / name).is_symlink()
-
-
-@pytest.mark.parametrize("name", ["image", "image/c", "image/c/1", "done", "x/c", "spare"])
-@pytest.mark.parametrize("how", ["file", "link"])
-def test_whatever_else_has_the_name_of_a_folder_makes_way(
-    store: Path, template: tuple[Path, str], name: str, how: str
-) -> None:
-    shutil.rmtree(store / name)
-    (store / name).write_bytes(b"x") if how == "file" else (store / name).symlink_to("nowhere")
-    assert st.verify(store)
-    mend(store)
-    assert st.verify(store) == []
-    assert st.digest(store) == template[1]
 
 
 # --- a disk that fails at its n-th operation --------------------------------------------------------------

@@ -19,8 +19,7 @@ from vbnfault.detector import MosaicDetector, load_sensor
 from vbnfault.detector.chain import Device
 from vbnfault.faults import plugins
 from vbnfault.lens import load_lens, paraxial_properties
-from vbnfault.output import template_files
-from vbnfault.output.template_files import write_template
+from vbnfault.output.starters import KINDS, write_template
 from vbnfault.pipeline import configure_faults
 from vbnfault.reflectance import radiance_factor
 from vbnfault.scene.config import load_scene
@@ -29,7 +28,7 @@ from vbnfault.world.cameras import base_camera
 
 
 def test_the_command_writes_each_kind(tmp_path: Path) -> None:
-    for kind in template_files.KINDS:
+    for kind in KINDS:
         name = f"own_{kind}"
         done = CliRunner().invoke(cli.app, ["new", kind, name, "--out", str(tmp_path)])
         assert done.exit_code == 0, done.output

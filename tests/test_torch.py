@@ -5,11 +5,8 @@ from __future__ import annotations
 import gc
 import json
 import os
-import pickle
 import re
 import signal
-import subprocess
-import sys
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -30,7 +27,6 @@ torch = pytest.importorskip("torch", reason="PyTorch is not installed: pip insta
 from torch.utils.data import DataLoader  # noqa: E402
 
 from vbnfault.torch import BatchDataset, Loader, SampleDataset, ShardSampler  # noqa: E402
-from vbnfault.train.slots import Slots  # noqa: E402
 
 TARGETS = ("masks", "classes", "pose", "depth")
 Rows = list[tuple[list[int], int, int]]
@@ -328,18 +324,6 @@ def test_an_iteration_that_is_left_drops_what_was_read_ahead_and_keeps_the_reade
     assert source.data._reader is opened  # it knows which layers it has compared with their checksums
 
 
-def test_small_tensors_need_no_shared_memory_of_their_own() -> None:
-    slots = Slots(1, 1, 1024)
-    slot = slots.take(0)
-    assert slot is not None
-    batch = {**slot.tensors({"image": ((2, 8), np.dtype(np.uint8))}), "sample": torch.tensor([3, 1])}
-    batch["image"][:] = torch.arange(8, dtype=torch.uint8)
-    packed = slot.packed(batch)
-    assert not any(isinstance(value, torch.Tensor) for value in packed.values.values())
-    back = slots.unpacked(packed)
-    assert {name: value.tolist() for name, value in back.items()} == {n: v.tolist() for n, v in batch.items()}
-
-
 # --- what goes wrong ------------------------------------------------------------------------------------
 
 
@@ -409,20 +393,3 @@ def test_an_error_of_a_transform_keeps_its_traceback(finished_store: Path) -> No
 
 
 # --- starting a worker ----------------------------------------------------------------------------------
-
-
-def test_a_spawned_worker_loads_little(finished_store: Path) -> None:
-    """PyTorch itself apart: it takes longer to load than all of this."""
-    code = """
-import pickle, sys
-import torch.utils.data
-before = set(sys.modules)
-data = pickle.loads(sys.stdin.buffer.read())
-data[0]
-new = {name.partition(".")[0] for name in set(sys.modules) - before}
-print(sorted(new & {"zarr", "xarray", "pydantic", "scipy", "cv2", "mitsuba", "drjit", "matplotlib"}))
-"""
-    given = pickle.dumps(data(finished_store))
-    assert len(given) < 100_000
-    done = subprocess.run([sys.executable, "-c", code], input=given, capture_output=True, check=True)
-    assert done.stdout.decode().strip() == "[]"

@@ -11,25 +11,22 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from browser import WHY_NOT, Page, found, opened
+from conftest import Called
 from synthetic import FAULTS, fake_sample, filled, flip, make_spec
-from test_cli import run
 
 from vbnfault import store as st
 from vbnfault.core import images
 from vbnfault.core.errors import InputError
-from vbnfault.faults import registry
 from vbnfault.output.contact_sheet import overlay
-from vbnfault.output.json_files import plain
 from vbnfault.output.viewer import Viewer, server
-from vbnfault.output.viewer.listing import NOT_KNOWN, Listing, _keys, _measure
-from vbnfault.output.viewer.server import _exact
+from vbnfault.output.viewer.server import NOT_KNOWN, Listing
 from vbnfault.scene.names import STRATA
 
 
@@ -225,25 +222,6 @@ def test_severity_is_the_rank_of_what_was_drawn(tmp_path: Path) -> None:
     assert (ranks[[1, 3]] == NOT_KNOWN).all()
 
 
-def test_a_fault_is_more_severe_by_the_number_that_its_levels_change(finished_store: Path) -> None:
-    assert [_measure({"loss": 3}, "loss", less) for less in (False, True)] == [3.0, -3.0]
-    assert _measure({"loss": True, "x_px": [1, 2], "y_px": [1]}, "loss", False) == 2.0
-    assert np.isnan(_measure({"kind": "grain"}, "loss", False))
-    store = st.open_store(finished_store)
-    for fault, models in registry().items():
-        for name, model in models.items():
-            store.attributes["fault_models"] = dict.fromkeys(store.spec.faults, "") | {fault: name}
-            key, less_is_worse = dict(zip(store.spec.faults, _keys(store), strict=True)).get(fault, ("", False))
-            severity = model.severity if fault in store.spec.faults else None
-            assert key == ("" if severity is None else severity.key)
-            assert less_is_worse == (severity is not None and severity.high < severity.low)
-
-
-def test_numbers_that_neither_json_nor_a_browser_holds_are_sent_otherwise() -> None:
-    assert plain(np.array([np.inf, -np.inf, np.nan, 1.5])) == [None, None, None, 1.5]
-    assert [_exact(str(n)) for n in (2**53 - 1, 2**53, -(2**53))] == [2**53 - 1, str(2**53), str(-(2**53))]
-
-
 def test_numbers_without_end_and_a_stratum_without_a_name_are_shown(tmp_path: Path) -> None:
     store = st.create(tmp_path / "s.zarr", make_spec(layers=()), 2)
     for i in range(2):
@@ -289,7 +267,7 @@ def test_the_command_prints_its_address_and_ends_with_ctrl_c(finished_store: Pat
 
 
 def test_a_view_that_is_ended_by_a_signal_says_nothing_of_files(
-    finished_store: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    finished_store: Path, monkeypatch: pytest.MonkeyPatch, call: Callable[..., Called]
 ) -> None:
     def ended(viewer: Viewer) -> None:
         viewer.server.server_close()
@@ -297,19 +275,19 @@ def test_a_view_that_is_ended_by_a_signal_says_nothing_of_files(
         time.sleep(60)
 
     monkeypatch.setattr(Viewer, "serve", ended)
-    assert run(monkeypatch, "view", str(finished_store), "--no-browser") == 143
-    assert capsys.readouterr().err == f"vbnfault: the view of {finished_store} was ended\n"
+    ended_view = call("view", finished_store, "--no-browser")
+    assert (ended_view.code, ended_view.said) == (143, f"the view of {finished_store} was ended")
 
 
 def test_the_command_opens_a_browser_unless_told_not_to(
-    finished_store: Path, monkeypatch: pytest.MonkeyPatch
+    finished_store: Path, monkeypatch: pytest.MonkeyPatch, call: Callable[..., Called]
 ) -> None:
     asked: list[str] = []
     monkeypatch.setattr("webbrowser.open", asked.append)
     monkeypatch.setattr(Viewer, "serve", lambda viewer: viewer.server.server_close())
-    assert run(monkeypatch, "view", str(finished_store), "--browser") == 0
+    assert call("view", finished_store, "--browser").code == 0
     assert [url[:17] for url in asked] == ["http://127.0.0.1:"]
-    assert run(monkeypatch, "view", str(finished_store), "--no-browser") == 0
+    assert call("view", finished_store, "--no-browser").code == 0
     assert len(asked) == 1
 
 

@@ -192,11 +192,8 @@ class SceneValues:
 
     def _values(self) -> dict[str, Any]:
         """Return the values of all options, by key of the scene."""
-        return overrides(self.settings) | {key: value for key, value in self._named().items() if value is not None}
-
-    def _named(self) -> dict[str, int | None]:
-        """Return the values that have options of their own, by key of the scene."""
-        return {"dataset.seed": self.seed}
+        own = {f"dataset.{name}": getattr(self, name, None) for name in ("seed", "samples")}
+        return overrides(self.settings) | {key: value for key, value in own.items() if value is not None}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -222,10 +219,6 @@ class SceneOptions(SceneValues):
         size = {f"camera.{k}": max(16, round(self.scale * getattr(camera, k))) for k in ("width_px", "height_px")}
         field = {"camera.fov_deg": camera.fov_deg, "camera.focal_length_mm": None}
         return config.load_scene(scene, self._values() | size | field)
-
-    def _named(self) -> dict[str, int | None]:
-        """Return the values that have options of their own, by key of the scene."""
-        return {**super()._named(), "dataset.samples": self.samples}
 
 
 def overrides(settings: list[str] | None) -> dict[str, Any]:

@@ -153,7 +153,7 @@ def new(
     overwrite: Annotated[bool, typer.Option(help="Replace a file of this name.")] = False,
 ) -> None:
     """Write a commented file that works as it is, to start your own from."""
-    from ..output.template_files import write_template
+    from ..output.starters import write_template
 
     typer.echo(str(write_template(kind, name, out, overwrite=overwrite)))
 
@@ -189,7 +189,7 @@ def schema(
     plugins: PluginOption = None,
 ) -> None:
     """Print the JSON Schema of a kind of TOML file, for editors that check and complete it."""
-    from ..output.schemas import file_schema
+    from ..output.starters import file_schema
 
     load_plugins(plugins)
     typer.echo(json.dumps(file_schema(kind), indent=2))

@@ -10,10 +10,13 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import json
+import math
 import os
 import shutil
 import stat
 import uuid
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -65,6 +68,26 @@ def write_whole(path: Path, content: str | bytes) -> None:
         if mode is not None:
             with contextlib.suppress(OSError):  # a file system without permissions
                 temporary.chmod(mode)
+
+
+def plain(value: Any) -> Any:
+    """Return a value as JSON can hold it.
+
+    Arrays and tuples become lists. NaN and infinity, which JSON does not have, become None: the value is undefined
+    or has no bound.
+    """
+    if isinstance(value, Mapping):
+        return {key: plain(inner) for key, inner in value.items()}
+    if hasattr(value, "tolist"):  # an array or a number of numpy, which this module does not import
+        return plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [plain(inner) for inner in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def write_json(path: Path, value: Any, *, indent: int = 2) -> None:
+    """Write a value as JSON, null where a number is not finite; see `plain`."""
+    write_whole(path, json.dumps(plain(value), indent=indent, allow_nan=False) + "\n")
 
 
 class replacing:

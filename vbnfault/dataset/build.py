@@ -24,28 +24,15 @@ from pydantic import BeforeValidator, Field, InstanceOf, Strict, WithJsonSchema
 from .. import store as store_module
 from ..core import environment, tables
 from ..core.errors import InputError, VbnfaultError, shown
-from ..core.interrupts import Interrupted, interruptible
+from ..core.interrupts import interruptible
 from ..store import FaultCounts, Location, Planned, Store, StoreSpec, Url, files_of, located
 from .dask import check_scheduler, run_on_dask
 from .lock import locked, others_at_work, prepared_by_one
 from .processes import Pool
 from .progress import Progress, duration_text, size_text
-from .resume import blocks_of, check_same_scene, known_versions, planned_blocks, with_versions_noted
-from .tasks import BuildFailed, Run, SampleMaker, SampleWorkers, SessionFactory
+from .resume import check_same_scene, known_versions, with_versions_noted
+from .tasks import Run, SampleWorkers, SessionFactory
 from .work import Job, WorkerFactory, run_here
-
-__all__ = [
-    "BuildFailed",
-    "BuildOptions",
-    "BuildPlan",
-    "Interrupted",
-    "SampleMaker",
-    "SessionFactory",
-    "Summary",
-    "blocks_of",
-    "build",
-    "planned_blocks",
-]
 
 
 def _of_python(value: Any) -> Any:

@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from .. import store as stores
+from ..core.html_page import rendered
 from ..faults import registry
 from ..scene import config
 from ..scene.bodies import named_body
@@ -59,77 +60,31 @@ def to_json(document: Mapping[str, Any]) -> str:
 
 def card(store: Store, numbers: Statistics) -> str:
     """Return the card of a store as Markdown, which says how to read the store."""
-    return "\n".join([*_head(store), "", *_reading(), "", *_arrays(store), "", *described(store, numbers)]) + "\n"
-
-
-def _head(store: Store) -> list[str]:
-    """Return title, description and size of the dataset."""
-    attributes, spec = store.attributes, store.spec
-    return [
-        f"# {attributes.get('title') or 'untitled dataset'}",
-        "",
-        *([str(attributes["description"]), ""] if attributes.get("description") else []),
-        "Labelled, fault-injected camera images for vision-based navigation near comets and other small bodies, "
-        f"made by vbnfault: {store.samples} samples of {spec.width} x {spec.height} px with the fault classes "
-        f"{', '.join(spec.faults) or '(none)'}.",
-    ]
-
-
-def _reading() -> list[str]:
-    """Return how to read a store."""
-    return [
-        "This folder is one Zarr v3 group. It opens in any Zarr reader:",
-        "",
-        "```python",
-        "import xarray",
-        "",
-        'data = xarray.open_zarr("PATH_OF_THIS_FOLDER")',
-        "```",
-        "",
-        "`vbnfault verify` checks it, `vbnfault stats` prints its statistics, `vbnfault export` "
-        "writes other formats.",
-    ]
-
-
-def _arrays(store: Store) -> list[str]:
-    """Return the table of the arrays of a store."""
     rows = [["array", "dimensions", "dtype", "unit", "meaning"]]
     rows += [
         [f"`{name}`", ", ".join(row.dims), row.dtype, row.units, row.long_name]
         for name, row in store.spec.arrays.items()
     ]
-    return ["## Arrays", "", *markdown_table(rows)]
+    return rendered("dataset/card.md", arrays=markdown_table(rows), **described(store, numbers))
 
 
-def described(store: Store, numbers: Statistics) -> list[str]:
-    """Return what the cards of a store and of its exports share, as lines of Markdown."""
+def described(store: Store, numbers: Statistics) -> dict[str, Any]:
+    """Return what the template `described.md` shows, which the cards of a store and of its exports share."""
     attributes = store.attributes
-    lines = ["## Licence and citation", ""]
-    lines += [f"- Licence of the data: {attributes.get('licence') or 'not stated'}"]
-    lines += [f"- Cite the dataset as: {attributes.get('citation') or 'not stated'}"]
-    lines += [f"- Software: {_SOFTWARE}", f"- Fault classes, masks and the paper's fault models: {_PAPER}", ""]
-    lines += ["## Fault classes", "", *markdown_table(_classes(store)), ""]
-    lines += ["## Statistics, planned and realised", "", "```text", *numbers.lines(), "```", ""]
-    lines += [
-        "## Provenance",
-        "",
-        "Every parameter of the scene, and where its value comes from. `default`: it equals the default of "
-        "vbnfault. `set`: the scene file or its command sets another one. Pairs of faults are bounds; each "
-        "sample's drawn values are in the array `parameters`. A value `sha256:...` is the digest of the contents "
-        "of a file.",
-        "",
-        *markdown_table([["parameter", "value", "from"], *_provenance(attributes)]),
-        "",
-    ]
     sources = attributes.get("detector", {}).get("sensor", {}).get("sources", {})
-    if sources:
-        rows = [["value of the sensor", "source"], *([key, str(text)] for key, text in sources.items())]
-        lines += ["Sources of the sensor's values:", "", *markdown_table(rows), ""]
-    optics = attributes.get("optics", {}).get("summary")
-    if optics:
-        lines += [f"Lens: {optics}", ""]
-    lines += ["## Versions", "", *markdown_table([["component", "version"], *_versions(store)])]
-    return lines
+    rows = [["value of the sensor", "source"], *([key, str(text)] for key, text in sources.items())]
+    return {
+        "store": store,
+        "attributes": attributes,
+        "software": _SOFTWARE,
+        "paper": _PAPER,
+        "classes": markdown_table(_classes(store)),
+        "statistics": numbers.lines(),
+        "provenance": markdown_table([["parameter", "value", "from"], *_provenance(attributes)]),
+        "sources": markdown_table(rows) if sources else [],
+        "optics": attributes.get("optics", {}).get("summary"),
+        "versions": markdown_table([["component", "version"], *_versions(store)]),
+    }
 
 
 def _classes(store: Store) -> list[list[str]]:

@@ -88,19 +88,9 @@ def croissant(
 
 def inline(name: str, description: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return a Croissant record set whose values the description itself lists."""
-    fields = [
-        {"@type": "cr:Field", "@id": f"{name}/{key}", "name": key, "description": key, "dataType": _type_of(value)}
-        for key, value in rows[0].items()
-    ]
+    fields = [_field(name, key, key, _type_of(value)) for key, value in rows[0].items()]
     data = [{f"{name}/{key}": value for key, value in row.items()} for row in rows]
-    return {
-        "@type": "cr:RecordSet",
-        "@id": name,
-        "name": name,
-        "description": description,
-        "field": fields,
-        "data": data,
-    }
+    return {**_record_set(name, description, fields), "data": data}
 
 
 def columns(name: str, description: str, file: str, rows: Mapping[str, tuple[str, Any]]) -> dict[str, Any]:
@@ -109,17 +99,10 @@ def columns(name: str, description: str, file: str, rows: Mapping[str, tuple[str
     `file`: the `@id` of the file object. `rows`: by column, its meaning and an example.
     """
     fields = [
-        {
-            "@type": "cr:Field",
-            "@id": f"{name}/{key}",
-            "name": key,
-            "description": meaning,
-            "dataType": _type_of(example),
-            "source": {"fileObject": {"@id": file}, "extract": {"column": key}},
-        }
+        _field(name, key, meaning, _type_of(example), fileObject={"@id": file}, extract={"column": key})
         for key, (meaning, example) in rows.items()
     ]
-    return {"@type": "cr:RecordSet", "@id": name, "name": name, "description": description, "field": fields}
+    return _record_set(name, description, fields)
 
 
 def image_records(files: str, image: Mapping[str, Any], sample: Mapping[str, Any]) -> dict[str, Any]:
@@ -128,23 +111,28 @@ def image_records(files: str, image: Mapping[str, Any], sample: Mapping[str, Any
     `files`: the `@id` of the file set. `image`, `sample`: how a reader finds both in a file (`extract`,
     `transform`).
     """
-    fields = {"sample": ("sc:Integer", sample), "image": ("sc:ImageObject", image)}
+    of_files = {"fileSet": {"@id": files}}
+    fields = [
+        _field("images", "sample", "index of the sample in the store", _WHOLE, **of_files, **sample),
+        _field("images", "image", "the image", "sc:ImageObject", **of_files, **image),
+    ]
+    return _record_set("images", "R, G, B of the image of each sample, 8 bits a channel", fields)
+
+
+def _record_set(name: str, description: str, fields: Sequence[Any]) -> dict[str, Any]:
+    """Return a set of records with these fields."""
+    return {"@type": "cr:RecordSet", "@id": name, "name": name, "description": description, "field": list(fields)}
+
+
+def _field(of: str, name: str, description: str, kind: str, **source: Any) -> dict[str, Any]:
+    """Return a field of the set of records `of`; `source`: where its values are, unless they are listed."""
     return {
-        "@type": "cr:RecordSet",
-        "@id": "images",
-        "name": "images",
-        "description": "R, G, B of the image of each sample, 8 bits a channel",
-        "field": [
-            {
-                "@type": "cr:Field",
-                "@id": f"images/{name}",
-                "name": name,
-                "description": "index of the sample in the store" if name == "sample" else "the image",
-                "dataType": kind,
-                "source": {"fileSet": {"@id": files}, **taken},
-            }
-            for name, (kind, taken) in fields.items()
-        ],
+        "@type": "cr:Field",
+        "@id": f"{of}/{name}",
+        "name": name,
+        "description": description,
+        "dataType": kind,
+        **({"source": source} if source else {}),
     }
 
 

@@ -20,6 +20,8 @@ from ..scene.config import Scene
 from ..scene.trajectory import with_rows
 from . import build, card, describe
 from .identity import is_exact, planned, store_spec
+from .resume import blocks_of, planned_blocks
+from .tasks import SampleMaker
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,7 +37,7 @@ class SessionFactory:
     threads: int | None = None
     contents: file_contents.Contents = dataclasses.field(default_factory=file_contents.Contents)
 
-    def __call__(self) -> build.SampleMaker:
+    def __call__(self) -> SampleMaker:
         with self.contents.in_use():
             session = pipeline.Session(self.scene, blocks=self.blocks, threads=render_threads(self.threads))
         return CheckedSession(session, self.contents)
@@ -53,7 +55,7 @@ class CheckedSession:
     `numbers`: the number in the session's plan of each sample of the store; by default its index.
     """
 
-    session: build.SampleMaker
+    session: SampleMaker
     contents: file_contents.Contents
     numbers: NDArray[np.int64] | None = None
 
@@ -139,9 +141,9 @@ def build_scene(
     if not options.dry_run:
         llvm.find()  # raises VbnfaultError: without LLVM every sample would fail
     if append and samples is None and not options.overwrite and store.is_store(out):
-        samples = build.blocks_of(store.open_store(out))[0]
+        samples = blocks_of(store.open_store(out))[0]
     scene = with_rows(_with_samples(scene, samples))
-    blocks = build.planned_blocks(out, scene.dataset.samples, append=append or 0, overwrite=options.overwrite)
+    blocks = planned_blocks(out, scene.dataset.samples, append=append or 0, overwrite=options.overwrite)
     factory, build_plan, description = _prepared(scene, blocks, source, options)
     summary = with_card(out, build.build(factory, build_plan, out, options))
     return dataclasses.replace(summary, description=tuple(description))

@@ -359,9 +359,8 @@ def stored_scene(attributes: Mapping[str, Any]) -> Scene:
     stored["body"] = {key: value for key, value in stored["body"].items() if key != "shape_sha256"}
     if stored["body"].get("photometry", {}).get("model") not in reflectance.registry():
         stored["body"].pop("photometry", None)  # the model is a plug-in's; no plan depends on the photometry
-    # `scene_identity` adds keys that are not valid in a scene
-    for name, added in (("sky", "catalogue"),):
-        stored[name] = {key: value for key, value in stored.get(name, {}).items() if key != added}
+    # `scene_identity` adds a key that is not valid in a scene
+    stored["sky"] = {key: value for key, value in stored.get("sky", {}).items() if key != "catalogue"}
     if stored["camera"].get("lens"):
         # earlier versions also stored these two keys of a thin lens here; the keys had no effect on any plan
         unused = ("f_number", "transmission")

@@ -40,6 +40,7 @@ from .identity import (
     store_spec,
 )
 from .resume import Difference, differences
+from .tasks import SampleMaker
 
 # What may differ from the scene of the store: whole tables, or these keys of a table.
 _FREE: dict[str, frozenset[str] | None] = {
@@ -346,7 +347,7 @@ class RetakeFactory:
     threads: int | None = None
     contents: file_contents.Contents = dataclasses.field(default_factory=file_contents.Contents)
 
-    def __call__(self) -> build.SampleMaker:
+    def __call__(self) -> SampleMaker:
         with self.contents.in_use():
             scene = with_rows(self.scene)
             session = RetakeSession(

@@ -239,8 +239,7 @@ def _described(values: _Parameter) -> list[str]:
 
 
 def aligned(table: list[list[str]]) -> list[str]:
-    """Return the rows of a table as lines with aligned columns: those of numbers to the right, "
-    "others to the left."""
+    """Return the rows of a table as lines; columns of numbers are aligned to the right, others to the left."""
     columns = list(zip(*table, strict=True))
     adjusted = []
     for column in columns:
@@ -314,13 +313,16 @@ def _bounds(store: Store) -> dict[str, dict[str, tuple[float, float]]]:
     """Return by class and key the pairs of numbers in the faults of the stored scene."""
     tables = store.spec.attributes.get("scene", {}).get("faults", {})
     return {
-        fault: {
-            key: (value[0], value[1])
-            for key, value in table.items()
-            if isinstance(value, list) and len(value) == 2 and all(type(v) in (int, float) for v in value)
-        }
+        fault: {key: pair for key, value in table.items() if (pair := pair_of(value)) is not None}
         for fault, table in tables.items()
     }
+
+
+def pair_of(value: Any) -> tuple[float, float] | None:
+    """Return a list of two numbers as bounds, None for anything else."""
+    if not isinstance(value, list) or len(value) != 2 or not _NUMBERS.issuperset(map(type, value)):
+        return None
+    return value[0], value[1]
 
 
 def _commanded(store: Store) -> NDArray[np.bool_] | None:
@@ -364,31 +366,35 @@ def is_seed(name: str) -> bool:
     return name.rpartition(".")[2].rpartition("_")[2] == "seed"
 
 
-def _add_parameters(known: dict[str, _Parameter], drawn: Any, name: str = "") -> None:
-    """Add the drawn parameters of one fault but seeds; entries of lists count as values of the list's name."""
+def drawn_values(drawn: Any, name: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the values of the drawn parameters of a fault but seeds, each with its dotted name.
+
+    A value is a number, a list of numbers, a text or a truth value. Entries of other lists have the list's name.
+    """
     if is_seed(name):
         return
     kind = type(drawn)
-    if kind in _NUMBERS:
-        _parameter(known, name).pending.append(drawn)
-    elif kind is dict:
+    if kind is dict:
         for key, value in drawn.items():
-            _add_parameters(known, value, f"{name}.{key}" if name else key)
-    elif kind is list:
-        if drawn and _NUMBERS.issuperset(map(type, drawn)):
-            _parameter(known, name).pending.extend(drawn)
-        else:
-            for value in drawn:
-                _add_parameters(known, value, name)
+            yield from drawn_values(value, f"{name}.{key}" if name else key)
+    elif kind is list and not (drawn and _NUMBERS.issuperset(map(type, drawn))):
+        for value in drawn:
+            yield from drawn_values(value, name)
     elif drawn is not None:
-        words = _parameter(known, name).words
-        word = str(drawn).lower() if kind is bool else drawn
-        if word in words or len(words) < _MOST_WORDS:
-            words[word] += 1
+        yield name, drawn
 
 
-def _parameter(known: dict[str, _Parameter], name: str) -> _Parameter:
-    """Return the values of a parameter, new ones if it is not known yet."""
-    if name not in known:
-        known[name] = _Parameter()
-    return known[name]
+def _add_parameters(known: dict[str, _Parameter], drawn: Any) -> None:
+    """Add the drawn parameters of one fault."""
+    for name, value in drawn_values(drawn):
+        if name not in known:
+            known[name] = _Parameter()
+        parameter, kind = known[name], type(value)
+        if kind in _NUMBERS:
+            parameter.pending.append(value)
+        elif kind is list:
+            parameter.pending.extend(value)
+        else:
+            word = str(value).lower() if kind is bool else value
+            if word in parameter.words or len(parameter.words) < _MOST_WORDS:
+                parameter.words[word] += 1

@@ -17,6 +17,7 @@ from ..core.errors import InputError, shown
 from ..core.images import srgb8, write_exr, write_png
 from ..core.quantities import Electrons
 from ..core.spectra import Bands
+from ..core.whole_files import write_json
 from ..detector import ThreeColourDetector
 from ..faults import FaultContext, registry
 from ..lens import Prescription, ThinLens, load_lens, paraxial_properties
@@ -27,7 +28,6 @@ from ..lens.straylight.scatter import Cleanliness
 from ..lens.straylight.settings import VEIL_FRACTION, GhostSettings, SensorGrid, StraylightSettings, SunSource
 from ..lens.straylight.total import SunInLens
 from ..scene import keyed_random
-from .json_files import write_json
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]

@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from scipy.optimize import isotonic_regression
 
 from ..core.path_checks import real
-from ..core.whole_files import replacing
+from ..core.whole_files import replacing, write_json
 from ..lens import Prescription, open_f_number, paraxial_properties
 from ..lens.rays import real_pupil_diameter_mm, trace
-from .json_files import write_json
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

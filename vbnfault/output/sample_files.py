@@ -12,14 +12,13 @@ from numpy.typing import NDArray
 
 from ..core.images import write_exr, write_png
 from ..core.quantities import Sample, soft_kind
-from ..core.whole_files import own, unwritable
+from ..core.whole_files import own, unwritable, write_json
 from ..pipeline import masks
 from ..pipeline.labels import strength
 from ..pipeline.record import to_sample
 from ..pipeline.spec import Frame
 from . import contact_sheet
 from .export.regions import flare_discs
-from .json_files import write_json
 
 _MARKED_GHOSTS = 10
 

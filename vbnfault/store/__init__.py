@@ -19,7 +19,7 @@ scalars (everything else). These rules protect a store against kills, power loss
 """
 
 from .arrays import EFFECT_RULE, LAYERS, MASK_RULES, REQUIRED_LAYERS, SCALARS, SEMANTIC, Array
-from .bucket import OWN, Url
+from .bucket import OWN, Files, Location, Url, files_of, located
 from .check import (
     FaultCounts,
     Planned,
@@ -38,7 +38,6 @@ from .check import (
     verify,
 )
 from .codec import Encoded, SharedChunks, encode, mask_union
-from .files import Files, Location, files_of, located
 from .group import check_free, create, is_store, open_dataset, open_store, write_samples
 from .layout import drawn_table, is_sealed, sealed
 from .metadata import append_samples, recover

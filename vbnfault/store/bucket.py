@@ -1,4 +1,4 @@
-"""Read and write a store in an object store, such as S3, by the library obstore. Only this module imports it.
+"""Say where a store is, and read and write one in an object store, such as S3; only this module imports obstore.
 
 An object is replaced as a whole or not at all, and once a write has returned it is durable. So there are no
 temporary files, nothing to flush and nothing to rename. Two habits of the disk need another form:
@@ -23,9 +23,11 @@ from datetime import datetime, timedelta
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote, urlsplit
 
 from ..core.errors import InputError, VbnfaultError, shown
-from .disk import Misplaced
+from ..core.path_checks import path_of
+from .disk import Disk, Misplaced
 
 SCHEMES = ("s3", "s3a", "gs", "az", "azure", "adl", "abfs", "abfss")
 OWN = ".vbnfault"  # what is below this name is no part of the data
@@ -358,3 +360,32 @@ def _reason(error: BaseException) -> str:
 def is_url(text: str | os.PathLike[str]) -> bool:
     """Return whether a text is a URL and no path."""
     return isinstance(text, str) and re.match(r"[A-Za-z][A-Za-z0-9+.-]+://", text) is not None
+
+
+# --- where a store is -----------------------------------------------------------------------------------------
+
+Location = Path | Url
+Files = Disk | Bucket  # both have the methods that `Disk` describes
+
+
+def located(store: str | os.PathLike[str] | Url) -> Location:
+    """Return where a store is: the path of a folder, also for a URL `file://`, or the URL of an object store.
+
+    Raises InputError for another URL, and for what is no path.
+    """
+    if isinstance(store, Url):
+        return store
+    if not is_url(store):
+        return path_of(store, "store")
+    text = str(store)
+    if not text.lower().startswith("file:"):
+        return parsed(text)
+    parts = urlsplit(text)
+    if parts.netloc not in ("", "localhost") or not parts.path.startswith("/") or parts.query or parts.fragment:
+        raise InputError(f"{shown(text)}: must be file:// and an absolute path, such as file:///data/NAME.zarr")
+    return Path(unquote(parts.path))
+
+
+def files_of(location: Location) -> Files:
+    """Return what reads and writes the files at a location; nothing is opened yet."""
+    return Bucket(location) if isinstance(location, Url) else Disk(location)

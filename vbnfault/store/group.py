@@ -13,9 +13,8 @@ from ..core.errors import InputError, VbnfaultError
 from ..core.path_checks import real
 from ..core.quantities import Sample
 from ..core.whole_files import kind_of
-from .bucket import Url
+from .bucket import Files, Location, Url, files_of, located
 from .codec import Encoded, encode
-from .files import Files, Location, files_of, located
 from .layout import (
     CHECKSUM,
     DOCUMENT,

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from ..core.errors import InputError
 from . import disk
 from .arrays import Member
-from .bucket import Url
+from .bucket import Files, Url
 from .compressors import most_compressed
-from .files import Files
 from .group import open_store, read_document, read_root
 from .layout import (
     DOCUMENT,

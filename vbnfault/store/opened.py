@@ -19,6 +19,7 @@ from ..core.quantities import Sample
 from . import disk
 from .arrays import SCALARS
 from .attributes import check_attributes, check_names, number_of_samples
+from .bucket import Files
 from .codec import (
     Encoded,
     chunk_ranges,
@@ -30,7 +31,6 @@ from .codec import (
     threads,
 )
 from .compressors import compressor, most_compressed
-from .files import Files
 from .layout import (
     DOCUMENT,
     OWN_ATTRIBUTES,

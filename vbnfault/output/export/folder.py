@@ -41,10 +41,6 @@ class Folder:
         self.path = path
         self.checksums: dict[str, str] = {}
 
-    def fresh(self) -> Folder:
-        """Return the same folder with no file in `checksums`."""
-        return Folder(self.path)
-
     def put(self, files: Iterable[tuple[str, bytes]]) -> None:
         """Write files; a file is whole or absent, also after a kill."""
         rest = iter(files)

@@ -21,13 +21,13 @@ from ...core.html_page import rendered
 from ...core.path_checks import path_of, real
 from ...core.quantities import Sample
 from ...core.tables import did_you_mean
+from ...core.whole_files import plain
 from ...dataset.card import described, to_json
 from ...dataset.croissant import columns, croissant, image_records
 from ...dataset.lock import locked
 from ...dataset.progress import Progress
 from ...dataset.statistics import Statistics, statistics
 from ...store import EFFECT_RULE, MASK_RULES, SPLITS, STRATA, Store, Url, disk, mask_union, open_store
-from ..json_files import plain
 from .contract import Closing, ExportPart, Finished, Format, formats
 from .folder import Folder
 
@@ -233,7 +233,7 @@ def _write_part(
     store: Store, kind: Format, part: ExportPart, folder: Folder, stop: threading.Event, masks: str
 ) -> ExportPart:
     """Write the files of a part, and then its record."""
-    own, rows = folder.fresh(), []
+    own, rows = Folder(folder.path), []
     layers = {*kind.layers(store.spec)} | ({MASK_RULES[masks]} if masks != "footprint" else set())
 
     def samples() -> Iterator[Sample]:
@@ -302,15 +302,13 @@ def _card(store: Store, kind: Format, closing: Closing, numbers: Statistics, mas
     """Return the card of an export as Markdown; `masks`: footprint or effect."""
     return rendered(
         "output/export/card.md",
-        store=store,
-        attributes=store.attributes,
         kind=kind,
         closing=closing,
         lines=[*kind.usage, *closing.lines],
         masks=masks,
         names_masks="mask_effect" not in kind.layers(store.spec),
         effect_rule=EFFECT_RULE,
-        described=described(store, numbers),
+        **described(store, numbers),
     )
 
 

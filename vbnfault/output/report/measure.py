@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from ...core.errors import VbnfaultError
 from ...core.quantities import Sample
-from ...dataset.statistics import is_seed, key_of
+from ...dataset.statistics import drawn_values, key_of, pair_of
 from ...faults import registry
 from ...store import SPLITS, STRATA, Store, drawn_table
 from ..contact_sheet import spread
@@ -157,8 +157,9 @@ def read_drawn(store: Store, scalars: Scalars) -> tuple[list[Drawn], int]:
             continue
         for position, index in zip(chosen[shard == number], first[shard == number], strict=True):
             for fault, parameters in parsed(texts[index]).items():
-                for name, numbers in _numbers(parameters):
-                    if not is_seed(name):
+                for name, value in drawn_values(parameters):
+                    if type(value) in (int, float, list):
+                        numbers = np.atleast_1d(np.asarray(value, dtype=np.float64))
                         found.setdefault((fault, name), []).append((numbers, int(scalars.split[position])))
     order = {fault: k for k, fault in enumerate(store.spec.faults)}
     drawn = []
@@ -175,21 +176,6 @@ def parsed(text: Any) -> dict[str, Any]:
         return drawn_table(text)
     except ValueError:
         return {}
-
-
-def _numbers(drawn: Any, name: str = "") -> Iterator[tuple[str, F64]]:
-    """Yield the numbers of nested parameters with their dotted names; entries of lists have the list's name."""
-    if isinstance(drawn, Mapping):
-        for key, value in drawn.items():
-            yield from _numbers(value, f"{name}.{key}" if name else str(key))
-    elif isinstance(drawn, list):
-        if drawn and all(type(value) in (int, float) for value in drawn):
-            yield name, np.asarray(drawn, dtype=np.float64)
-        else:
-            for value in drawn:
-                yield from _numbers(value, name)
-    elif isinstance(drawn, int | float) and not isinstance(drawn, bool):
-        yield name, np.array([drawn], dtype=np.float64)
 
 
 def key_bounds(bounds: Mapping[str, Mapping[str, tuple[float, float]]], drawn: Drawn) -> tuple[float, float] | None:
@@ -215,17 +201,11 @@ def geometry_bounds(store: Store, name: str) -> list[tuple[str, tuple[float, flo
     geometry = store.attributes.get("scene", {}).get("geometry", {})
     if not isinstance(geometry, Mapping):
         return []
-    if (pair := _pair(geometry.get(name))) is not None:
+    if (pair := pair_of(geometry.get(name))) is not None:
         return [("", pair)]
     tables = [(stratum, geometry.get(stratum.replace("-", "_"))) for stratum in STRATA]
-    found = [(stratum, _pair(t.get(name)) if isinstance(t, Mapping) else None) for stratum, t in tables]
+    found = [(stratum, pair_of(t.get(name)) if isinstance(t, Mapping) else None) for stratum, t in tables]
     return [(stratum, pair) for stratum, pair in found if pair is not None]
-
-
-def _pair(value: Any) -> tuple[float, float] | None:
-    """Return a list of two numbers as bounds, None for anything else."""
-    is_pair = isinstance(value, Sequence) and len(value) == 2 and all(type(v) in (int, float) for v in value)
-    return (float(value[0]), float(value[1])) if is_pair else None
 
 
 # --- pixels -------------------------------------------------------------------------------------------------

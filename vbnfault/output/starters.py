@@ -1,4 +1,4 @@
-"""Write commented files to start from: scene, lens, sensor, and the plug-ins (`vbnfault new`)."""
+"""Give what a user's file starts from: a commented template (`vbnfault new`), and its JSON Schema for editors."""
 
 from __future__ import annotations
 
@@ -7,12 +7,17 @@ import os
 import re
 from collections.abc import Collection
 from pathlib import Path
+from typing import Any
 
 from .. import faults, reflectance
+from ..core import tables
 from ..core.errors import InputError, shown
 from ..core.path_checks import check_folder
 from ..core.whole_files import own, unwritable, write_whole
-from ..detector import effects
+from ..detector import Sensor, effects
+from ..lens.prescription_file import PrescriptionFile
+from ..scene import config
+from ..study.spec import StudySpec
 
 _FOLDER = Path(__file__).parent / "templates"
 # Kind of file → its template. In a template, my_KIND stands for the user's name, and MyKind for that of the class.
@@ -25,6 +30,7 @@ _TEMPLATES = {
     "reflectance": "reflectance.py.txt",
 }
 KINDS = tuple(_TEMPLATES)
+SCHEMAS = ("scene", "lens", "sensor", "study")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
 # The name of a plug-in's class is a key of TOML files, and its file a Python module.
 _PLUGIN_NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
@@ -85,3 +91,20 @@ def write_template(kind: str, name: str, folder: Path, *, overwrite: bool = Fals
     except OSError as error:
         raise unwritable(path, error) from None
     return path
+
+
+def file_schema(kind: str) -> dict[str, Any]:
+    """Return the JSON Schema (draft 2020-12) of a kind of file; that of the scene includes all registered faults.
+
+    Rules that tie several keys together, such as that every number of a sensor has a source, are no part of it.
+
+    Raises
+    ------
+    InputError
+        The kind is none of `SCHEMAS`.
+    """
+    if kind not in SCHEMAS:
+        raise InputError(f"schema {shown(kind)}: must be one of {', '.join(SCHEMAS)}")
+    if kind == "scene":
+        return config.json_schema(faults.json_schema())
+    return tables.json_schema({"lens": PrescriptionFile, "sensor": Sensor, "study": StudySpec}[kind])
