@@ -10,6 +10,7 @@ import os
 import pickle
 import platform
 import re
+import resource
 import shutil
 import subprocess
 import sys
@@ -497,3 +498,14 @@ def test_the_root_of_the_file_system_has_no_held_lock(monkeypatch: pytest.Monkey
     """It has no name, so its lock is named ..lock; a random command line with `--out /` ended in a traceback."""
     monkeypatch.setattr(os, "listdir", lambda _: ["..lock", "bin"])
     assert list(lock._held_locks(Path("/"))) == []
+
+
+def test_a_store_without_room_for_its_first_file_leaves_nothing(tmp_path: Path) -> None:
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
+    try:
+        with pytest.raises(VbnfaultError, match=r"no store can be created here: File too large"):
+            run(tmp_path / "s.zarr")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert list(tmp_path.iterdir()) == []

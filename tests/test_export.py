@@ -589,3 +589,14 @@ def test_another_store_or_format_does_not_mix_into_an_export(
     with pytest.raises(InputError, match="holds another export: contents_sha256"):
         export_store(other, exported("png"), "png", progress=False)
     assert tree(exported("png")) == before
+
+
+def test_a_damaged_sample_ends_an_export_until_it_is_repaired(finished_store: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(finished_store, tmp_path / "s.zarr"))
+    file = st.open_store(copy).file("mask", 1)
+    good = file.read_bytes()
+    file.write_bytes(good[:40] + bytes([good[40] ^ 1]) + good[41:])
+    with pytest.raises(VbnfaultError, match="build command repairs it"):
+        export_store(copy, tmp_path / "out", "coco", progress=False)
+    file.write_bytes(good)
+    assert export_store(copy, tmp_path / "out", "coco", progress=False).samples == 10

@@ -298,3 +298,16 @@ def test_the_lens_is_the_one_named() -> None:
     packaged = colours(params | {"lens": "nikkor_35_f2p8"}, where)
     np.testing.assert_allclose(colours(params, where), packaged, rtol=1e-12)
     assert np.abs(colours(params | {"lens": "biotar_100_f1p4"}, where) - packaged).max() > 0.01
+
+
+def test_a_flat_field_stays_flat() -> None:
+    where = make_context(512)
+    found = (
+        applied(flat_electrons(where), NONE | {"haze": 0.2, "haze_slope": -2.5}, where)
+        / flat_electrons(where).array
+    )
+    assert np.ptp(found) < 1e-4
+    # but for what goes farther than a frame's width: of the sphere's share, (1 + ...)
+    reach = 512 / where.camera.focal_length_px
+    inside, _ = quad(lambda b: 2 * np.pi * b * float(haze_kernel(np.array(b), 0.02, -2.5)), 0, reach, points=[0.02])
+    assert 0.8 + 0.2 * inside - 1e-3 < found.mean() < 1

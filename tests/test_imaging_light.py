@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import replace
 from typing import Any
@@ -110,3 +111,17 @@ def test_a_stop_with_blades_counts_by_its_area() -> None:
     n = paraxial_properties(smaller).efl_mm / real_pupil_diameter_mm(smaller)
     assert bladed.f_number == pytest.approx(n, rel=1e-4)
     assert n > 1.05 * lens.f_number
+
+
+@pytest.mark.parametrize("name", ["nikkor_35_f2p8", "biotar_100_f1p4"])
+def test_irradiance_on_the_axis(name: str) -> None:
+    """E = π T L / (4 N²) with the f-number of real rays; T by the coatings' own function."""
+    lens = real(name)
+    n = paraxial_properties(lens.prescription).efl_mm / real_pupil_diameter_mm(lens.prescription)
+    index = lens.prescription.indices(D_NM)
+    loss = [mean_reflectance((), a, b, 1.0, D_NM) for a, b in itertools.pairwise(index) if a != b]
+    share = float(np.prod(1 - np.array(loss)))
+    assert lens.transmission == pytest.approx(share, rel=1e-9)
+    patch = Radiance(array=np.full((1, 2, 3), 7.0, np.float32), wavelength_nm=np.array([D_NM]))
+    assert lens.f_number == pytest.approx(n, rel=0.01)
+    np.testing.assert_allclose(lens.on_axis(patch).array, 7 * math.pi * share / (4 * n**2), rtol=0.01)

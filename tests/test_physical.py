@@ -308,3 +308,22 @@ def test_bad_worlds_are_told_in_a_sentence(tables: dict[str, dict[str, object]],
         whole()
     assert all(word in str(told.value) for word in words)
     assert "\n" not in str(told.value)
+
+
+def test_surface_points_reproject_onto_their_pixels(samples: tuple[Session, list[Frame]]) -> None:
+    """A surface point, carried through T and the stored pose, lands on its pixel's centre to 0.01 px."""
+    s, all_frames = samples
+    seen = 0
+    for frame in all_frames:
+        sample = to_sample(frame)
+        points = sample.layers["point_T_m"].reshape(-1, 3)
+        body = sample.layers["semantic"].ravel() == BODY
+        seen += body.sum()
+        C_from_T = rotation(sample.scalars["camera_from_T"])
+        in_C = (points[body] - sample.scalars["camera_position_T_m"]) @ C_from_T.T
+        fx, fy, cx, cy = sample.scalars["intrinsics"]
+        xy = np.column_stack([in_C[:, 0] / in_C[:, 2] * fx + cx, in_C[:, 1] / in_C[:, 2] * fy + cy])
+        rows, columns = np.divmod(np.flatnonzero(body), s.scene.camera.width_px)
+        np.testing.assert_allclose(xy, np.column_stack([columns, rows]) + 0.5, atol=0.01)
+        assert np.isnan(points[sample.layers["semantic"].ravel() == SKY]).all()
+    assert seen > 5000

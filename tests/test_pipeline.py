@@ -17,12 +17,12 @@ from conftest import ALL_FAULTS, small_scene
 from vbnfault import pipeline
 from vbnfault.core import frames
 from vbnfault.detector import ThreeColourDetector
-from vbnfault.pipeline import Session
+from vbnfault.pipeline import Session, masks
 from vbnfault.pipeline.development import Development, acting_at, without
 from vbnfault.pipeline.record import to_sample
 from vbnfault.pipeline.resolve import resolve
 from vbnfault.pipeline.spec import Frame
-from vbnfault.scene import config
+from vbnfault.scene import config, plan
 
 _SESSIONS: dict[str, Session] = {}
 
@@ -518,3 +518,54 @@ def test_an_image_takes_the_pixels_of_the_clean_one_that_do_not_differ(
             assert developed == [changed]
             few += 0 < changed < 96 * 80
     assert few > 2
+
+
+def test_clean_twin_differs_only_where_faults_are(frames_: list[Frame]) -> None:
+    local = [ALL_FAULTS.index(n) for n in ("dust_on_optics", "broken_pixels", "broken_lines")]
+    checked = 0
+    for frame in frames_:
+        if not set(frame.drawn) <= {ALL_FAULTS[k] for k in local}:
+            continue
+        changed = masks.effect(frame.images.image.array, frame.images.clean.array)
+        assert not (changed & ~frame.labels.masks[local].any(axis=0)).any()
+        checked += 1
+    assert checked >= 1
+
+
+def test_surface_points_reproject_to_their_pixels(frames_: list[Frame]) -> None:
+    """Depth, pose and intrinsics agree: the 3-D point of a pixel, seen from it, lies on the body's surface."""
+    from vbnfault import render
+
+    checked = 0
+    for frame in frames_:
+        body = frame.rendering.truth.semantic == 1
+        if body.mean() < 0.2:
+            continue
+        y, x = np.nonzero(body)
+        pick = slice(None, None, max(1, len(y) // 200))
+        depth = frame.rendering.truth.depth_m[y[pick], x[pick]].astype(float)
+        fx, fy, cx, cy = frame.camera.intrinsics
+        in_C = np.stack([(x[pick] + 0.5 - cx) / fx, (y[pick] + 0.5 - cy) / fy, np.ones_like(depth)], -1)
+        point = frame.pose.position_L_m + (in_C * depth[:, None]) @ frame.pose.L_from_C.T
+        # a probe half a millimetre-per-metre in front is in the open, and surface lies within twice that
+        away = frame.pose.position_L_m - point
+        reach = np.linalg.norm(away, axis=1)
+        probe = point + away * 5e-4
+        hits = [
+            not render.is_clear(frame.spec.terrain.surface, probe[j : j + 1], 0.02 * reach[j] + 1e-3)[0]
+            for j in range(0, len(probe), 20)
+        ]
+        assert np.mean(hits) > 0.95
+        checked += 1
+    assert checked >= 2
+
+
+def test_sun_is_whole_and_a_flare_is_in_the_frame_where_straylight_is(frames_: list[Frame]) -> None:
+    for frame in frames_:
+        if "straylight" in frame.drawn:
+            assert frame.pose.sun_visible_fraction == 1.0
+            assert frame.labels.masks[ALL_FAULTS.index("straylight")].any()
+            assert frame.spec.plan.stratum[frame.spec.index] == plan.SUN_FACING
+        else:
+            angle = np.degrees(np.arccos(frame.pose.L_from_C[:, 2] @ frame.pose.sun_L))
+            assert angle >= np.sqrt(2) * 32.5 - 1e-9

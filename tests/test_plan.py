@@ -530,3 +530,51 @@ def test_bounds_of_one_value_are_met_exactly() -> None:
 def test_every_number_is_keyed_by_its_sample() -> None:
     u = keyed_random.keyed_uniform(20, np.arange(N), "plan", "height_m/0")
     np.testing.assert_allclose(make().variables["height_m"], 100 * u, rtol=1e-15)
+
+
+@pytest.mark.parametrize(
+    "name", ["earth_observation", "interplanetary", "quickstart", "sssb_exploration", "navcam67p", "physical67p"]
+)
+def test_packaged_scenes_have_every_class_in_every_split(name: str) -> None:
+    s = config.load_scene(name)
+    p = planned(s, list(s.faults))
+    assert plan.shortcomings(s, p) == []
+    for code in range(len(plan.SPLITS)):
+        here = p.split == code
+        assert p.injected[here].any(axis=0).all()
+        assert {bool(v) for v in p.injected[here].any(axis=1)} == {True, False}  # and samples without a fault
+
+
+def test_the_plan_has_the_papers_variables(paper: plan.Plan) -> None:
+    assert tuple(paper.variables) == redraw.VARIABLES == tuple(PAPER_BOUNDS)
+    assert len(paper) == N
+    assert all(v.shape == (N,) and v.dtype == np.float64 for v in paper.variables.values())
+
+
+@pytest.mark.parametrize(
+    ("theirs", "gains"),
+    [
+        (["A", "AB"], True),  # B for A and B: the first split wins A, and B stays in both
+        (["A", "A", "B"], False),  # B for A: the first split would lose B, its only one
+        (["A", "A", "B", "B"], False),  # nor does it matter that the other one has B to spare
+        (["B", "B"], False),  # nobody has what it lacks
+        (["A", "AC", "B", "C"], False),  # C is too rare to matter, and A costs B
+    ],
+)
+def test_rows_are_exchanged_where_a_split_wins_a_class_and_loses_none(theirs: list[str], gains: bool) -> None:
+    """The first split has one sample, with class B alone; the second has those of `theirs`."""
+    rows = ["B", *theirs]
+    traits = np.array([[name in row for name in "ABC"] for row in rows])
+    split = np.array([0] + [2] * len(theirs), dtype=np.uint8)
+    present = np.unique(split)
+    enough = np.array([traits[:, k].sum() >= 2 for k in range(2)] + [False])
+    pair = fault_matrix._exchange(traits, split, present, enough)
+    assert (pair is not None) == gains
+    if pair is None:
+        return
+    one, other = pair
+    assert (split[one], split[other]) == (0, 2)
+    after = traits.copy()
+    after[[one, other]] = traits[[other, one]]
+    for s in present:
+        assert after[split == s][:, enough].any(axis=0).all()

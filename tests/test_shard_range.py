@@ -24,6 +24,7 @@ from vbnfault.core import environment
 from vbnfault.core.errors import InputError, VbnfaultError
 from vbnfault.core.interrupts import Interrupted
 from vbnfault.core.quantities import Sample
+from vbnfault.dataset import build as bd
 from vbnfault.dataset import lock
 from vbnfault.dataset.merge import MergeSummary, join_stores, merge_stores
 from vbnfault.dataset.tasks import BuildFailed
@@ -411,3 +412,20 @@ def test_the_command_merges(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, par
     shown = CliRunner().invoke(cli.app, ["merge", *map(str, parts), "--out", str(tmp_path / "m"), "--move"])
     assert shown.exit_code == 0
     assert re.search(r"18 of 18 samples, 0 of them merged before\n8 samples moved .*\n.*\ndigest ", shown.output)
+
+
+def test_samples_of_one_shard_in_two_stores_are_joined(tmp_path: Path, parts: list[Path], whole: Path) -> None:
+    lacks = [{1, 2}, {0, 3}]
+    for part, numbers in zip(parts, lacks, strict=True):
+        shutil.rmtree(part)
+        with pytest.raises(bd.BuildFailed):
+            run(part, Session(raises=frozenset(numbers)))
+    summary = merge(parts, tmp_path / "m.zarr", move=True)
+    assert summary.digest == st.digest(whole) == st.digest(tmp_path / "m.zarr")
+    assert [*summary.taken.values()] == [16, 2]
+
+
+def test_a_store_by_another_name_is_the_same_store(tmp_path: Path, parts: list[Path]) -> None:
+    (tmp_path / "link").symlink_to(parts[0])
+    with pytest.raises(InputError, match="there is nothing to merge"):
+        merge([tmp_path / "link"], parts[0])

@@ -331,3 +331,9 @@ def test_the_faintest_star_that_an_exposure_shows() -> None:
 def test_refusals(change: dict[str, Any], says: str) -> None:
     with pytest.raises(ValueError, match=says):
         star_radiance(at((1.0, 1.0)), **{"J_from_C": AXES, "sigma_px": 1.0, **FRAME, **change})
+
+
+def test_the_stars_cover_the_whole_sky() -> None:
+    mean = sky.load_catalogue().direction_J().mean(axis=0)
+    # 15544 directions at random have a mean of about 1/sqrt(15544) = 0.008; the Milky Way and Gould's belt add
+    assert np.linalg.norm(mean) < 0.08

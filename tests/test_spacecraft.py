@@ -441,3 +441,11 @@ def test_blocked_against_a_sphere() -> None:
     # tan² of asin(1/4) over that of the half field, times π/4; 96² rays, 1280 faces within the ball: 2 %
     expected = np.pi / 4 * np.tan(np.arcsin(0.25)) ** 2 / np.tan(np.radians(20)) ** 2
     assert mesh.blocked_fraction(40.0, 96) == pytest.approx(expected, rel=0.02)
+
+
+@pytest.mark.parametrize("angles", POSES)
+def test_default_keeps_clear_of_the_pupil(angles: dict[str, float]) -> None:
+    mesh = posed(**angles).merged()
+    near = np.linalg.norm(mesh.vertices_B_m, axis=1) < 0.3
+    assert (mesh.vertices_B_m[near, 2] < -0.009).all()  # the barrel alone, behind
+    assert mesh.blocked_fraction(65.0, 32) < 0.03

@@ -316,3 +316,31 @@ def test_eight_bands_are_what_each_is_alone(blades: int, rounding: float) -> Non
         alone = burst.image(frame_at((0.1, 0), nodes[k : k + 1], (101, 101), 0.08, half_width_nm=0))[0]
         lit = alone > 0
         np.testing.assert_allclose(together[k][lit], alone[lit], rtol=0.02)
+
+
+def airy(v: F64) -> F64:
+    return (2 * j1(v) / np.where(v == 0, 1, v)) ** 2 + (v == 0)
+
+
+def test_a_round_stop_gives_the_airy_pattern_to_the_third_ring() -> None:
+    stop = lens_with().surfaces[0]
+    psf, pitch = fraunhofer_psf(stop, NM, samples=1024, across=128)
+    assert psf.sum() == pytest.approx(1, abs=1e-12)
+    # area of the pupil / (λ f)² is the peak per area; of the flux 2 / πv lies beyond the frame's v = 64 π
+    peak = math.pi / 4 * DIAMETER_MM**2 / (NM * 1e-6 * 100.0) ** 2 * pitch**2
+    assert psf[512, 512] == pytest.approx(peak, rel=4e-3)
+    y, x = np.mgrid[:1024, :1024] - 512.0
+    v = math.pi * DIAMETER_MM * np.hypot(x, y) * pitch / (NM * 1e-6 * 100.0)
+    near = v < 13.3  # the fourth dark ring
+    crest = np.minimum(1, 8 / (math.pi * np.maximum(v, 1) ** 3))  # the rings' heights, cos² = 1 of J₁
+    wrong = np.abs(psf / psf[512, 512] - airy(v)) / crest
+    assert wrong[near].max() < 0.01
+    # and each ring where it belongs: J₂'s zeros
+    row = psf[512, 512:] / psf[512, 512]
+    place = v[512, 512:]
+    for zero in (5.1356, 8.4172, 11.6198):
+        around = np.flatnonzero(np.abs(place - zero) < 0.8)
+        a, b, _ = np.polyfit(place[around], row[around], 2)
+        top = around[np.argmax(row[around])]
+        assert -b / (2 * a) == pytest.approx(zero, rel=0.01)
+        assert row[top] == pytest.approx(float(airy(place[top])), rel=0.01)

@@ -14,7 +14,7 @@ import pytest
 import xarray
 import zarr
 from conftest import small_scene
-from synthetic import FAULTS, LOCALISED, fake_sample, filled, flip, make_spec
+from synthetic import FAULTS, LOCALISED, fake_sample, filled, flip, make_spec, repaired
 
 from vbnfault import store as st
 from vbnfault.core.errors import InputError, VbnfaultError
@@ -284,3 +284,24 @@ def test_a_store_of_another_format_is_refused_and_left_as_it_is(
     # --overwrite replaces it
     st.create(whole.path, whole.spec, whole.samples, overwrite=True)
     assert st.open_store(whole.path).finished() == 0
+
+
+def test_a_full_disk_is_one_sentence_and_what_was_done_stays(
+    whole: st.Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before, calls = st.digest(whole), 0
+    replace = os.replace
+
+    def full(src: str, dst: str) -> None:
+        nonlocal calls
+        calls += 1
+        if calls > 3:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        replace(src, dst)
+
+    monkeypatch.setattr(os, "replace", full)
+    with pytest.raises(VbnfaultError, match="No space left on device while writing samples 4-7; finished"):
+        st.write_samples(whole, [fake_sample(whole.spec, 6)])
+    monkeypatch.undo()
+    assert not list(whole.path.rglob("*.partial"))
+    repaired(whole, [6], before)

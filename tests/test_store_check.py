@@ -15,6 +15,7 @@ from synthetic import FAULTS, fake_sample, filled, flip, repaired
 
 from vbnfault import store as st
 from vbnfault.core.errors import InputError, VbnfaultError
+from vbnfault.core.quantities import Sample
 from vbnfault.store import codec
 from vbnfault.store.attributes import check_attributes
 
@@ -361,3 +362,29 @@ def test_a_missing_array_is_one_sentence_and_made_again(whole: st.Store, name: s
         store = st.recover(whole.path)
         lost = damage == "folder" and name in store.spec.arrays
         repaired(store, list(range(10)) if lost else [], before)
+
+
+def test_damage_that_decodes_is_found_by_the_stored_checksum(whole: st.Store) -> None:
+    """Another sample's chunk in this one's place is sound in itself."""
+    chunks = whole.chunk("depth_m", 0)
+    other = st.encode(
+        whole.spec,
+        Sample(
+            index=1,
+            layers={**fake_sample(whole.spec, 1).layers, "depth_m": np.ones((24, 32), np.float32)},
+            scalars=fake_sample(whole.spec, 1).scalars,
+        ),
+    )
+    whole.file("depth_m", 0).write_bytes(codec.join_shard({**chunks, 1: other.chunks["depth_m"]}, 4))
+    before_sentence = "sample 1: depth_m in depth_m/c/0/0/0 does not match its stored crc32c"
+    assert st.verify(whole) == [before_sentence]
+
+
+def test_a_missing_chunk_is_found_although_it_reads_as_zeros(whole: st.Store) -> None:
+    before = st.digest(whole)
+    chunks = whole.chunk("mask", 1)
+    del chunks[6]
+    whole.file("mask", 1).write_bytes(codec.join_shard({i - 4: c for i, c in chunks.items()}, 4))
+    assert not whole.read("mask", 6, 7).any()
+    assert st.verify(whole) == ["sample 6: mask has no chunk in mask/c/1/0/0/0"]
+    repaired(whole, [6], before)

@@ -231,6 +231,7 @@ def test_a_chunk_takes_no_more_memory_than_its_array(claimed: int | None, frames
         assert len(compressors.compressor(name).encode(noise)) <= compressors.most_compressed(noise.size)
 
 
+@pytest.mark.expects_warnings  # of what is too large
 @pytest.mark.parametrize(
     "file", ["image/c/1/0/0/0", "zarr.json", "spare/zarr.json", "split/c/1", "x/c/0", "done/c/1"]
 )

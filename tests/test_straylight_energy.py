@@ -15,7 +15,7 @@ from test_faults_kit import make_context
 
 from vbnfault.camera import Camera
 from vbnfault.core import resources, spectra
-from vbnfault.core.quantities import Electrons
+from vbnfault.core.quantities import Electrons, Radiance
 from vbnfault.core.spectra import Bands
 from vbnfault.detector import ThreeColourDetector
 from vbnfault.faults import FaultContext, from_dict, registry
@@ -23,6 +23,7 @@ from vbnfault.faults.straylight_lens import channel_bands
 from vbnfault.lens import (
     Prescription,
     RealLens,
+    ThinLens,
     load_lens,
     paraxial_properties,
     parse_lens,
@@ -347,3 +348,49 @@ def test_every_packaged_lens_has_the_veil_of_real_ones() -> None:
         parts = veil_table.index_of(load_lens(name).coated("mgf2"), veil_fraction=0.01, cleanliness_level=0.0)
         assert 0.005 < sum(parts.values()) < 0.05, name
         assert parts["veil"] == pytest.approx(0.01, rel=0.02)
+
+
+def disc(camera: Camera, sun_deg: float, radius_rad: float) -> tuple[Radiance, float]:
+    """Radiance of a disc of radiance 1 on the camera's pixels, each the mean over 32² points; its solid angle."""
+    fine = 32
+    place = (np.arange(SIZE * fine) + 0.5) / fine
+    x, y = ((place - SIZE / 2) / camera.focal_length_px for _ in range(2))
+    sun = np.array([np.sin(np.radians(sun_deg)), 0.0, np.cos(np.radians(sun_deg))])
+    length = np.sqrt(1 + x[None, :] ** 2 + y[:, None] ** 2)
+    cosine = (x[None, :] * sun[0] + sun[2]) / length
+    seen = (cosine > np.cos(radius_rad)).astype(np.float32)
+    mean = seen.reshape(SIZE, fine, SIZE, fine).mean(axis=(1, 3))
+    array = np.broadcast_to(mean, (len(NODES), SIZE, SIZE)).astype(np.float32)
+    solid = 2 * np.pi * (1 - np.cos(radius_rad))
+    return Radiance(array=array, wavelength_nm=NODES, sun=array.copy()), float(solid)
+
+
+@pytest.mark.parametrize("sun_deg", [0.0, 20.0, 38.0])
+def test_a_thin_lens_images_what_its_pupil_admits_of_the_sun(sun_deg: float) -> None:
+    detector = ThreeColourDetector(width_px=SIZE, height_px=SIZE, pixel_pitch_um=20.0)
+    lens = ThinLens(focal_length_mm=1.4, f_number=2.0, transmission=0.8)
+    camera = Camera(lens=lens, detector=detector)
+    radiance, solid = disc(camera, sun_deg, 0.04)
+    light = lens.image_of_sun(radiance, 20.0)
+    power = flux(light.array, 20e-3)
+    pupil = np.pi / 4 * (1.4 / 2.0) ** 2
+    # cos over the disc of 2.3°: its mean is cos θ · (1 - σ²/4); edges by 32² points a pixel: 2e-3 of 100 pixels
+    np.testing.assert_allclose(power, 0.8 * pupil * solid * np.cos(np.radians(sun_deg)), rtol=3e-3)
+    # an extended scene keeps the paper's rule, and the camera holds the two apart
+    np.testing.assert_allclose(lens.image(radiance).array, radiance.array * np.float32(np.pi * 0.8 / 16), rtol=1e-6)
+    found = camera.expose(replace(radiance, array=radiance.array + np.float32(1e-3)), 1.0)
+    scene = camera.expose(replace(radiance, array=np.full_like(radiance.array, 1e-3), sun=None), 1.0)
+    assert found.past_rims is not None
+    np.testing.assert_allclose(found.array, scene.array, rtol=1e-3)
+    np.testing.assert_allclose(found.past_rims, detector.electrons_expected(light, 1.0).array, rtol=1e-6)
+
+
+def test_a_hood_in_front_of_the_sun_leaves_none_of_its_light() -> None:
+    where = thin_context(12.0)
+    stray = from_dict("straylight", {"model": "paraxial"}, source="test")
+    before, _ = direct_sun(where, 12.0)
+    lit = stray.on_light(before, stray.draw(where, np.random.default_rng(1)), where)
+    rims = from_dict("vignetting", {"model": "lens", "hood_offset": 10.0}, source="test")
+    after = rims.on_light(lit, rims.draw(where, np.random.default_rng(2)), where).past_rims
+    assert after is not None
+    np.testing.assert_array_equal(after, 0)

@@ -184,7 +184,7 @@ def test_on_a_trajectory_the_sun_alone_decides(is_flown: bool) -> None:
     view: Any = SimpleNamespace(
         index=0, scene=SimpleNamespace(is_flown=is_flown), plan=SimpleNamespace(stratum=[plan.SUN_AVERTED])
     )
-    pose: Any = SimpleNamespace(sun_visible_fraction=1.0, L_from_C=np.eye(3), sun_L=np.array([0.0, 0.0, 1.0]))
+    pose: Any = SimpleNamespace(sees_sun=True)
     faults: Any = {"straylight": SimpleNamespace(needs_sun=True), "vignetting": SimpleNamespace(needs_sun=False)}
     assert factors.acting_faults(faults, view, pose) == (["straylight"] if is_flown else []) + ["vignetting"]
 

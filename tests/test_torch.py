@@ -354,6 +354,7 @@ def test_a_worker_that_dies_loses_nothing(
     assert signal.getsignal(signal.SIGCHLD) is handler
 
 
+@pytest.mark.expects_warnings  # of the workers that die
 def test_workers_that_keep_dying_end_in_one_sentence(finished_store: Path, tmp_path: Path) -> None:
     third = expected(finished_store)[2][0]
     dataset = data(finished_store, transform=DiesOnce(tmp_path / "died", third, again=True))

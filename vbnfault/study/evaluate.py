@@ -3,7 +3,7 @@
     render ▶ metered light ▶ ghosts, starburst, glare, veil ▶ metrics
 
 A view is rendered once; optics, Sun and detector act on its radiance. The results of each stage are kept with all
-that the stage depends on (`_Kept`), a few of them at a time, so that the result of an evaluation does not depend on
+that the stage depends on (`kept`), a few of them at a time, so that the result of an evaluation does not depend on
 those before it. In a Sobol design the points AB differ from their point A in one factor, so most of their stages
 are found there.
 
@@ -17,11 +17,8 @@ of field of the render are those of the nominal lens.
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
-import time
-from collections import Counter, OrderedDict
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, lru_cache, partial
 from typing import Any, TypeVar
@@ -32,7 +29,6 @@ from numpy.typing import NDArray
 from ..camera import Camera
 from ..core import spectra
 from ..core.errors import InputError, in_file, shown
-from ..core.shared_results import SharedResults
 from ..core.spectra import Bands
 from ..core.tables import did_you_mean
 from ..faults import Fault, FaultContext
@@ -62,6 +58,7 @@ from .factors import (
     fault_choices,
 )
 from .image_metrics import LitImage
+from .kept import Kept
 from .spec import Evaluation, Metric, StudySpec
 from .views import (
     CleanView,
@@ -79,8 +76,6 @@ F64 = NDArray[np.float64]
 
 T = TypeVar("T")
 
-# How many results of each stage are kept beside those of the base row A of a Sobol design; default: two.
-_KEPT = {"render": 1}
 _NAVIGATION: Mapping[str, Metric] = {metric.name: metric for metric in nav.METRICS}
 
 
@@ -100,7 +95,7 @@ class SceneEvaluator:
 
     def __init__(self, spec: StudySpec) -> None:
         self.spec = spec
-        self.kept = _Kept()
+        self.kept = Kept()
         self._source = f"study {shown(spec.title)}"
         self._session: tuple[Hashable, Session] | None = None
         with in_file(self._source):
@@ -525,85 +520,3 @@ def _added_by(fault: Fault, exposed: Exposed, params: Any) -> dict[str, Any]:
     added = np.ascontiguousarray(np.moveaxis(image, -1, 0)) - exposed.clean
     light = {"kept": exposed.clean, "direct": exposed.direct_e, "added": np.maximum(added, 0)}
     return {**light, "parts_e": {}, "ghosts_e": ()}
-
-
-# --- results of stages -------------------------------------------------------------------------------------------
-
-
-class _Kept:
-    """Keep the last results of each stage, and count and time the computations.
-
-    Attributes
-    ----------
-    events
-        How often each stage was computed.
-    seconds
-        How long that took.
-    """
-
-    def __init__(self) -> None:
-        self.events: Counter[str] = Counter()
-        self.seconds: dict[str, float] = {}
-        self._results: dict[str, OrderedDict[Hashable, Any]] = {}
-        self._held: dict[str, set[tuple[str, Hashable]]] = {}
-        self._holder: str | None = None
-
-    @contextlib.contextmanager
-    def holding(self, holder: str) -> Iterator[None]:
-        """Hold what a block uses until the next block of the same holder, in place of what that one used."""
-        self._held[holder], self._holder = set(), holder
-        try:
-            yield
-        finally:
-            self._holder = None
-
-    def once(self, stage: str, key: Hashable, make: Callable[[], T], part: str = "") -> T:
-        """Return `make()` for a key, from the last results of the stage where it was computed before.
-
-        `part` separates results of one stage that have keys of their own.
-        """
-        name = f"{stage}/{part}"
-        results = self._results.setdefault(name, OrderedDict())
-        if self._holder is not None:
-            self._held[self._holder].add((name, key))
-        if key not in results:
-            with self.timed(stage):
-                results[key] = make()
-            if not part:
-                self.events[stage] += 1
-        value: T = results[key]
-        results.move_to_end(key)
-        held = set().union(*self._held.values())
-        loose = [other for other in results if (name, other) not in held]
-        for other in loose[: max(len(loose) - _KEPT.get(stage, 2), 0)]:
-            del results[other]
-        return value
-
-    def release(self, holder: str) -> None:
-        """Stop holding what a block used."""
-        self._held.pop(holder, None)
-
-    @contextlib.contextmanager
-    def timed(self, stage: str) -> Iterator[None]:
-        """Add the duration of a block to a stage."""
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
-
-    def of_view(self, view: Hashable) -> SharedResults:
-        """Return results of the pipeline's stages that evaluations with an equal `view` share."""
-        return _OfView(self, view)
-
-
-class _OfView(SharedResults):
-    """Keep the results of one view among those of all views."""
-
-    def __init__(self, kept: _Kept, view: Hashable) -> None:
-        super().__init__(kept=True)
-        self._all, self._view = kept, view
-
-    def once(self, name: str, key: Hashable, make: Callable[[], T]) -> T:
-        """Return `make()` for a name and a key, from the last results where it was computed before."""
-        return self._all.once(name, (self._view, key), make, "view")
