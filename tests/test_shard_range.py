@@ -24,7 +24,6 @@ from vbnfault.core import environment
 from vbnfault.core.errors import InputError, VbnfaultError
 from vbnfault.core.interrupts import Interrupted
 from vbnfault.core.quantities import Sample
-from vbnfault.dataset import build as bd
 from vbnfault.dataset import lock
 from vbnfault.dataset.merge import MergeSummary, join_stores, merge_stores
 from vbnfault.dataset.tasks import BuildFailed
@@ -418,7 +417,7 @@ def test_samples_of_one_shard_in_two_stores_are_joined(tmp_path: Path, parts: li
     lacks = [{1, 2}, {0, 3}]
     for part, numbers in zip(parts, lacks, strict=True):
         shutil.rmtree(part)
-        with pytest.raises(bd.BuildFailed):
+        with pytest.raises(BuildFailed):
             run(part, Session(raises=frozenset(numbers)))
     summary = merge(parts, tmp_path / "m.zarr", move=True)
     assert summary.digest == st.digest(whole) == st.digest(tmp_path / "m.zarr")
