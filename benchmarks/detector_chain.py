@@ -48,11 +48,11 @@ def busy_sensor(architecture: str, demosaic: str) -> Sensor:
         dark_nonuniformity=0.2,
         years=5.0,
         dose_TeV_g=0.05,
-        hot_clustered_share=0.1,
-        dead_share=1e-5,
-        stuck_share=1e-5,
-        rts_share=1e-3,
-        trap_share=1e-4,
+        hot_clustered_fraction=0.1,
+        dead_fraction=1e-5,
+        stuck_fraction=1e-5,
+        rts_fraction=1e-3,
+        trap_fraction=1e-4,
     )
     readout = replace(
         sensor.readout,

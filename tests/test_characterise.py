@@ -40,7 +40,7 @@ def sensor(**more: Any) -> Sensor:
             dark_nonuniformity=0.0,
             reference_K=293.0,
             hot_growth=None,
-            dead_share=0.0,
+            dead_fraction=0.0,
         ),
         "readout": ReadoutSpec(bits=12, full_well_e=15_000.0, bias_dn=80, read_noise_e_rms=11.0),
     }
@@ -153,7 +153,7 @@ def test_colours_come_back_from_the_mosaic() -> None:
 
 
 def test_a_sensor_that_corrects_its_defects_hides_them() -> None:
-    stuck = replace(sensor().individual, stuck_share=2e-3)
+    stuck = replace(sensor().individual, stuck_fraction=2e-3)
     light = np.full(SHAPE, 3000.0, dtype=np.float32)
     worst = []
     for corrects in (False, True):
@@ -271,7 +271,7 @@ def test_the_chain_is_in_physical_order() -> None:
 
 
 def test_telegraph_signals_of_a_device_are_in_its_charge() -> None:
-    spec = replace(sensor().individual, rts_share=0.05, dark_current_e_s=0.0)
+    spec = replace(sensor().individual, rts_fraction=0.05, dark_current_e_s=0.0)
     device = Device(sensor(individual=spec), 1, shape=(64, 64))
     signals = device.individual.rts.at(293.0)
     dark = device.collected_e(np.zeros((64, 64), np.float32), 10.0)
@@ -299,7 +299,7 @@ def test_intensity_is_what_pixels_without_a_filter_see() -> None:
 
 def test_a_device_has_traps_for_life() -> None:
     made = ccd("full_frame_ccd")
-    spec = replace(made.individual, trap_share=3e-3, trap_depth_e=400.0, dark_current_e_s=0.0)
+    spec = replace(made.individual, trap_fraction=3e-3, trap_depth_e=400.0, dark_current_e_s=0.0)
     device = Device(replace(made, individual=spec), 5, shape=(64, 64))
     traps = device.individual.traps
     assert 4 < len(traps) < 25

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 from pathlib import Path
@@ -14,10 +15,11 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from vbnfault import faults
-from vbnfault.core import resources, tables
+from vbnfault.core import resources, tables, toml_files
 from vbnfault.core.errors import InputError
 from vbnfault.dataset.identity import content_hash
 from vbnfault.detector import ThreeColourDetector
+from vbnfault.detector.sensor import load_sensor, parse_sensor
 from vbnfault.scene import config, keyed_random
 from vbnfault.scene.config import Scene, load_scene, parse_scene
 
@@ -561,3 +563,27 @@ def test_keyed_uniform_is_the_published_finaliser() -> None:
             x = ((x ^ (x >> 27)) * 0x94D049BB133111EB) & u64
             x ^= x >> 31
         assert keyed_random.keyed_uniform(7, np.array([sample]), "plan", "x")[0] == (x >> 11) / 2**53
+
+
+@pytest.mark.expects_warnings
+def test_shares_of_version_0_2_are_fractions_now(caplog: pytest.LogCaptureFixture) -> None:
+    old = parse_scene({"title": "t", "faults": {"adc": {"missing_share": [0.1, 0.2]}}}, source="old.toml")
+    assert old.faults == {"adc": {"missing_fraction": [0.1, 0.2]}}
+    assert caplog.messages == [
+        "old.toml: faults.adc.missing_share: is called missing_fraction now; the old name still works"
+    ]
+    both = {"title": "t", "faults": {"adc": {"missing_share": [0.1, 0.2], "missing_fraction": [0.1, 0.2]}}}
+    with pytest.raises(InputError, match=r"missing_share: is the old name of missing_fraction, which is given"):
+        parse_scene(both, source="both.toml")
+    with pytest.raises(InputError, match=r"dust_on_optics\.my_share: unknown key"):
+        config.load_scene("quickstart", {"faults.dust_on_optics.my_share": 1})
+
+
+def test_shares_of_a_sensor_file_are_fractions_now(caplog: pytest.LogCaptureFixture) -> None:
+    table = toml_files.read_toml(resources.find("scenes/detectors", "generic_cmos"), "detector")
+    individual = {**table["individual"], "rts_share": table["individual"]["rts_fraction"]}
+    sources = {**table["sources"], "individual.rts_share": "assumed"}
+    del individual["rts_fraction"], sources["individual.rts_fraction"]
+    made = parse_sensor({**table, "individual": individual, "sources": sources}, source="old.toml")
+    assert made == dataclasses.replace(load_sensor("generic_cmos"), name="old")
+    assert len(caplog.messages) == 2

@@ -76,7 +76,7 @@ def test_bad_curves_are_refused_in_a_sentence(row: dict[str, Any], message: str)
 def test_grey_ground_in_sunlight_is_grey(name: str) -> None:
     """R = G = B = I to a DN of rounding, where the signal is below the full well, whatever the filters."""
     sensor = replace(load_sensor("generic_cmos"), pattern=pattern(name))
-    still = {"prnu": 0.0, "dsnu_e": 0.0, "years": 0.0, "rts_share": 0.0, "dead_share": 0.0}
+    still = {"prnu": 0.0, "dsnu_e": 0.0, "years": 0.0, "rts_fraction": 0.0, "dead_fraction": 0.0}
     clean = {"inl_quadratic_dn": 0.0, "dnl_lsb_rms": 0.0, "column_pattern_e_rms": 0.0}
     sensor = replace(
         sensor,

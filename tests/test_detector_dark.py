@@ -44,14 +44,14 @@ BUSY = IndividualSpec(
     years=5.0,
     iso=1e6,
     hot_growth=replace(APS_GROWTH, log10_scale=0.5),
-    hot_clustered_share=0.3,
-    dead_share=1e-3,
-    dead_share_yr=1e-3,
-    stuck_share=1e-3,
-    stuck_share_yr=1e-3,
-    rts_share=1e-3,
-    trap_share=1e-3,
-    trap_share_TeV_g=1e-4,
+    hot_clustered_fraction=0.3,
+    dead_fraction=1e-3,
+    dead_fraction_yr=1e-3,
+    stuck_fraction=1e-3,
+    stuck_fraction_yr=1e-3,
+    rts_fraction=1e-3,
+    trap_fraction=1e-3,
+    trap_fraction_TeV_g=1e-4,
 )
 KINDS = ("hot", "dead", "stuck", "rts", "traps")
 
@@ -232,7 +232,7 @@ def test_clusters() -> None:
             near |= present[row + dy, column + dx]
         return float(near.mean())
 
-    lone, paired = many_hot(), many_hot(hot_clustered_share=0.3)
+    lone, paired = many_hot(), many_hot(hot_clustered_fraction=0.3)
     n = len(lone.hot)
     chance = 1 - math.exp(-8 * n / lone.gain.size)
     # neighbours come in pairs, which doubles the variance
@@ -249,7 +249,7 @@ def test_clusters() -> None:
     for child in np.flatnonzero(~same)[:500]:
         apart = np.maximum(abs(row[:child] - row[child]), abs(column[:child] - column[child]))
         assert (same[:child] & (apart == 1)).any()
-    tiny = sensor(replace(BUSY, hot_clustered_share=1.0, years=100.0), shape=(3, 7), pitch=30.0).hot
+    tiny = sensor(replace(BUSY, hot_clustered_fraction=1.0, years=100.0), shape=(3, 7), pitch=30.0).hot
     assert len(tiny) == 0 or (tiny.row.max() < 3 and tiny.column.max() < 7 and tiny.row.min() >= 0)
 
 
@@ -314,7 +314,7 @@ def test_telegraph_signals_at_their_limits() -> None:
 
 def test_telegraph_pixels() -> None:
     """One in 1000 has more than 0.4 nA/cm² at 21 °C; the mean times are log-uniform; all follow temperature."""
-    rts = sensor(IndividualSpec(rts_share=0.3, reference_K=294.15)).rts
+    rts = sensor(IndividualSpec(rts_fraction=0.3, reference_K=294.15)).rts
     n = len(rts)
     assert abs(n - 0.3 * PIXELS) < 4 * math.sqrt(0.3 * PIXELS)
     limit = 0.4 * 6.241509e9 * (PITCH_UM * 1e-4) ** 2
@@ -326,7 +326,7 @@ def test_telegraph_pixels() -> None:
     np.testing.assert_allclose(cold.high_s, rts.high_s * arrhenius_factor(294.15, 274.15, 0.9))
     np.testing.assert_allclose(cold.low_s * rts.high_s, cold.high_s * rts.low_s)
     # quoted at 294.15 K, whatever the reference temperature
-    warm = sensor(IndividualSpec(rts_share=0.3, reference_K=310.0)).rts
+    warm = sensor(IndividualSpec(rts_fraction=0.3, reference_K=310.0)).rts
     np.testing.assert_allclose(warm.at(294.15).amplitude_e_s, rts.amplitude_e_s)
 
 
@@ -404,10 +404,10 @@ def test_one_property_leaves_the_others_alone() -> None:
         "iso": {"damage_e_s", "hot"},
         "hot_offset_e": {"hot"},
         "depletion_depth_um": {"damage_e_s", "rts"},
-        "dead_share": {"dead"},
-        "stuck_share": {"stuck"},
-        "rts_share": {"rts"},
-        "trap_share": {"traps"},
+        "dead_fraction": {"dead"},
+        "stuck_fraction": {"stuck"},
+        "rts_fraction": {"rts"},
+        "trap_fraction": {"traps"},
     }
     for key, touched in changes.items():
         other = sensor(replace(BUSY, **{key: getattr(BUSY, key) * 1.5 + 0.001}))
@@ -444,7 +444,7 @@ def test_ageing_keeps_every_earlier_defect() -> None:
         for name in one:
             np.testing.assert_array_equal(one[name], two[name])
     # clustering from now on moves none of those there were
-    apart = aged(young, years=20.0, hot_clustered_share=0.0)
+    apart = aged(young, years=20.0, hot_clustered_fraction=0.0)
     np.testing.assert_array_equal(apart.hot.row[: len(young.hot)], young.hot.row)
     assert (apart.hot.row[len(young.hot) :] != old.hot.row[len(young.hot) : len(apart.hot)]).any()
 
@@ -484,7 +484,7 @@ def test_a_data_sheets_doubling_temperature() -> None:
 
 def test_dead_pixels_and_axes() -> None:
     shape = (40, 900)
-    made = sensor(replace(BUSY, dead_share=0.02), shape=shape)
+    made = sensor(replace(BUSY, dead_fraction=0.02), shape=shape)
     assert made.shape == shape
     for kind in KINDS:
         defects = getattr(made, kind)

@@ -49,7 +49,7 @@ SENSOR = Sensor(
         dark_nonuniformity=0.0,
         reference_K=293.0,
         hot_growth=None,
-        dead_share=0.0,
+        dead_fraction=0.0,
     ),
     # a saturated pixel and its read noise stay below the top code, so that the well alone limits
     readout=ReadoutSpec(bits=12, full_well_e=20_000.0, gain_dn_per_e=0.19, bias_dn=100, read_noise_e_rms=14.0),

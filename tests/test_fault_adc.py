@@ -65,7 +65,9 @@ def test_it_adds_to_what_the_sensor_has() -> None:
 @pytest.mark.parametrize("bits", [1, 8, 12, 16])
 def test_draws_fit_every_converter(bits: int) -> None:
     where = context(bits=bits, bias_dn=0, inl_quadratic_dn=0.0)
-    fault = make("adc", stuck_count=2, stuck_place=[0, 15], inl_share=0.2, inl_cubic_share=0.1, missing_share=0.5)
+    fault = make(
+        "adc", stuck_count=2, stuck_place=[0, 15], inl_fraction=0.2, inl_cubic_fraction=0.1, missing_fraction=0.5
+    )
     range_dn = 2**bits - 1
     signs, values = set(), set()
     for seed in range(30):

@@ -25,7 +25,7 @@ def context(architecture: str = "full_frame_ccd", drain: float = 0.0) -> FaultCo
 
 def test_a_column_by_hand() -> None:
     c = context()
-    fault = make("blooming", full_well_share=0.5)
+    fault = make("blooming", full_well_fraction=0.5)
     params = fault.draw(c, rng())
     assert params == {"full_well_e": 20_000.0, "antiblooming": 0.0, "direction": "up"}
     charge = np.full(c.shape, 19_000, np.float32)
@@ -54,7 +54,7 @@ def test_nothing_exceeds_the_full_well_and_charge_is_kept() -> None:
 def test_a_lost_drain() -> None:
     c = context(drain=1.0)
     detector: Any = c.camera.detector
-    fault = make("blooming", full_well_share=1)
+    fault = make("blooming", full_well_fraction=1)
     params = fault.draw(c, rng())
     assert (params["full_well_e"], params["antiblooming"]) == (FULL_WELL_E, 0.0)
     light = np.zeros(c.shape, np.float32)
@@ -81,7 +81,7 @@ def test_nothing_on_cmos() -> None:
 def test_it_shows_in_a_picture() -> None:
     c = context("interline_ccd")
     detector: Any = c.camera.detector
-    fault = make("blooming", full_well_share=0.5)
+    fault = make("blooming", full_well_fraction=0.5)
     params = fault.draw(c, rng())
     dark, white = flat_electrons(c, 0.02), detector.white_e
     light = dark.array.copy()

@@ -24,7 +24,7 @@ KEYS: dict[str, Any] = {
     "growth_factor": 2e4,
     "dose_TeV_g": 0.0,
     "anneal_days": 7.0,
-    "clustered_share": 0.0,
+    "clustered_fraction": 0.0,
     "stuck_per_year": 0.0,
 }
 
@@ -197,12 +197,12 @@ def test_a_scene_without_a_mosaic_refuses_it() -> None:
 
 def test_the_years_that_a_device_has_do_not_grow_by_the_faults_factor() -> None:
     """Nor do its own defects move where the fault clusters: no years and no dose are no fault."""
-    old = replace(context().camera.detector.sensor.individual, years=20.0, hot_clustered_share=0.0)  # type: ignore[union-attr]
-    old = replace(old, hot_growth=replace(old.hot_growth, log10_scale=3.0), dead_share_yr=1e-5)
+    old = replace(context().camera.detector.sensor.individual, years=20.0, hot_clustered_fraction=0.0)  # type: ignore[union-attr]
+    old = replace(old, hot_growth=replace(old.hot_growth, log10_scale=3.0), dead_fraction_yr=1e-5)
     where = context(0.1, individual=old)
     device: Any = where.camera.detector.device  # type: ignore[union-attr]
     assert len(device.individual.hot) > 100
-    keys = {"growth_factor": 50.0, "clustered_share": 0.5, "stuck_per_year": 1e-6, "least_dn": 0.01}
+    keys = {"growth_factor": 50.0, "clustered_fraction": 0.5, "stuck_per_year": 1e-6, "least_dn": 0.01}
     none = drawn(where, years=0.0, **keys)
     assert none["count"] == 0
     # one year that counts for fifty: what a device of 70 years has more
@@ -216,7 +216,7 @@ def test_the_years_that_a_device_has_do_not_grow_by_the_faults_factor() -> None:
 
 def test_the_mask_holds_what_the_camera_mends_with_a_defect() -> None:
     """A pixel that the camera corrects takes its value from neighbours two pixels away."""
-    own = replace(context().camera.detector.sensor.individual, stuck_share=0.05, years=0.0)  # type: ignore[union-attr]
+    own = replace(context().camera.detector.sensor.individual, stuck_fraction=0.05, years=0.0)  # type: ignore[union-attr]
     where = context(0.1, individual=own, correct_defects=True)
     fault = make("broken_pixels", model="hot_pixels", **(KEYS | {"least_dn": 1.0}))
     params = fault.draw(where, rng(2))
@@ -249,9 +249,9 @@ def test_a_defect_is_the_same_whether_the_devices_own_or_the_faults(architecture
         hot_growth=replace(growth, log10_scale=2.6),  # type: ignore[type-var]
         hot_rate_e_s=(1e3, 1e5),
         hot_offset_e=1500.0,
-        dead_share_yr=1e-3,
-        stuck_share_yr=1e-3,
-        rts_share=0.0,
+        dead_fraction_yr=1e-3,
+        stuck_fraction_yr=1e-3,
+        rts_fraction=0.0,
         rts_per_interaction=0.2,
     )
     # the fault's rates hold for its own years only
@@ -259,8 +259,8 @@ def test_a_defect_is_the_same_whether_the_devices_own_or_the_faults(architecture
         own,
         years=2.0 + years,
         dose_TeV_g=20.0,
-        dead_share_yr=1e-3 + 1e-3 * years / (2.0 + years),
-        stuck_share_yr=1e-3 + 1e-3 * years / (2.0 + years),
+        dead_fraction_yr=1e-3 + 1e-3 * years / (2.0 + years),
+        stuck_fraction_yr=1e-3 + 1e-3 * years / (2.0 + years),
     )
     # a well that does not reach the top code: offsets show above it
     readout = replace(young.readout, gain_dn_per_e=0.6 * young.readout.system_gain_dn_per_e)
@@ -268,7 +268,7 @@ def test_a_defect_is_the_same_whether_the_devices_own_or_the_faults(architecture
         replace(c, camera=replace(c.camera, exposure_s=exposure_s))
         for c in (with_mosaic(made, individual=spec, readout=readout) for spec in (own, older))
     )
-    keys = {"years": years, "growth_factor": 1.0, "dose_TeV_g": 20.0, "anneal_days": 7.0, "clustered_share": 0.0}
+    keys = {"years": years, "growth_factor": 1.0, "dose_TeV_g": 20.0, "anneal_days": 7.0, "clustered_fraction": 0.0}
     fault = make(
         "broken_pixels", model="hot_pixels", dead_per_year=1e-3, stuck_per_year=1e-3, least_dn=0.001, **keys
     )

@@ -34,7 +34,7 @@ COMPANIONS: dict[tuple[str, str], dict[str, Any]] = {
     ("straylight", "scene_diffraction"): {"sources": "scene"},
     ("dust_on_optics", "window_height_mm"): {"surface": -2},
     ("dust_on_optics", "mask_loss"): {"diameter_um": 20.0},
-    ("broken_pixels", "clustered_share"): {"years": 20.0},
+    ("broken_pixels", "clustered_fraction"): {"years": 20.0},
     ("optics_degradation", "filter_size_px"): {"scale_with_resolution": False},
     ("broken_lines", "saturated_weight"): {"count": 20},
     ("broken_lines", "duplicated_weight"): {"count": 20},
@@ -49,7 +49,7 @@ CLASS_KEYS: dict[str, dict[str, Any]] = {
 }
 ARCHITECTURES = {
     "leak": "interline_ccd",
-    "shutter_share": "full_frame_ccd",
+    "shutter_fraction": "full_frame_ccd",
     "lines_at_once": "cmos",
     "saturated_weight": "cmos",
     "duplicated_weight": "cmos",

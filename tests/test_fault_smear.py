@@ -72,7 +72,7 @@ def test_a_shield_that_leaks() -> None:
 
 def test_a_shutter_ajar() -> None:
     c = context("full_frame_ccd")
-    params = make("smear", shutter_share=0.01).draw(c, rng())
+    params = make("smear", shutter_fraction=0.01).draw(c, rng())
     assert params["cause"] == "shutter"
     before, after = smeared(c, params)
     assert before[21:, 30] == pytest.approx(0, abs=1e-3)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import itertools
+import json
 import math
 import shlex
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -524,3 +526,13 @@ def test_the_command_makes_a_table_that_a_scene_reads(tmp_path: Path) -> None:
     assert table.commands == (f"{start}--lens thin {' '.join(options)}",)
     scene = vbnfault.load_scene("quickstart", {"severity.file": str(out), "faults.vignetting.severity": 4})
     assert scene.faults["vignetting"]["frame_illuminance_dn"] == levels.values[3]
+
+
+def test_views_that_fail_do_not_stop_the_others(tmp_path: Path) -> None:
+    """Half of the views are enough, whichever they are: a whole group may fail."""
+    group: Any = SimpleNamespace(first=0, count=64)
+    job = SeverityJob(tmp_path, [group], Progress(64, shown=False))
+    for view in range(60):
+        job.tick(view, "failed", "its process ended")
+    job.tick(60, "built", json.dumps({"a": [[1.0, 0.5]]}))
+    assert (len(job.failures), len(job.errors)) == (60, 1)

@@ -166,9 +166,9 @@ def look(path: str) -> None:
 
 
 def _content(path: Path) -> bytes:
-    """Return the content of a file, which an earlier way may have made too large to be read."""
-    if path.stat().st_size > 1 << 27:
-        raise ValueError("too large")
+    """Return the content of a file, which an earlier way may have made too large, or a link to a device."""
+    if not path.is_file() or path.stat().st_size > 1 << 27:
+        raise ValueError("no file, or too large")
     return path.read_bytes()
 
 

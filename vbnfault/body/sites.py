@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -58,8 +59,14 @@ class Sites(Sequence[Site]):
     def __len__(self) -> int:
         return self._count
 
-    def __getitem__(self, index: int) -> Site:  # type: ignore[override]  # no slices
+    @overload
+    def __getitem__(self, index: int) -> Site: ...
+    @overload
+    def __getitem__(self, index: slice) -> tuple[Site, ...]: ...
+    def __getitem__(self, index: int | slice) -> Site | tuple[Site, ...]:
         number = range(self._count)[index]
+        if isinstance(number, range):
+            return tuple(self[k] for k in number)
         if number not in self._made:
             self._made[number] = self._make(number)
         return self._made[number]

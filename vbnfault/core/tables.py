@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import logging
 import operator
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import lru_cache, wraps
 from typing import Annotated, Any, TypeVar, dataclass_transform
 
@@ -173,6 +174,32 @@ def _as_plain(value: Any) -> Any:
         return os.fspath(value)
     as_list = getattr(value, "tolist", None)
     return value if as_list is None else as_list()
+
+
+def new_name(key: str) -> str:
+    """Return today's name of a key: until version 0.2 some fractions were called shares, such as `dead_share`."""
+    return key.replace("_share", "_fraction")
+
+
+def with_new_names(
+    table: Mapping[str, Any], known: Collection[str], where: str, prefix: str = ""
+) -> dict[str, Any]:
+    """Return a table with today's names of its keys, and warn of old ones.
+
+    `known` are the keys of today; each may stand behind `prefix`. Raises InputError, whose message begins with
+    `where`, where a key is given by both names.
+    """
+    renamed: dict[str, Any] = {}
+    for key, value in table.items():
+        name = new_name(key)
+        if name == key or key.removeprefix(prefix) in known or name.removeprefix(prefix) not in known:
+            renamed[key] = value
+            continue
+        if name in table:
+            raise InputError(f"{where}.{key}: is the old name of {name}, which is given, too; leave one out")
+        logging.getLogger("vbnfault").warning(f"{where}.{key}: is called {name} now; the old name still works")
+        renamed[name] = value
+    return renamed
 
 
 def whole(value: object) -> int | None:

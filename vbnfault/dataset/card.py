@@ -71,7 +71,7 @@ def card(store: Store, numbers: Statistics) -> str:
 def described(store: Store, numbers: Statistics) -> dict[str, Any]:
     """Return what the template `described.md` shows, which the cards of a store and of its exports share."""
     attributes = store.attributes
-    sources = attributes.get("detector", {}).get("sensor", {}).get("sources", {})
+    sources = attributes.get("detector", {}).get("sensor", {}).get("sources") or {}
     rows = [["value of the sensor", "source"], *([key, str(text)] for key, text in sources.items())]
     return {
         "store": store,

@@ -175,8 +175,15 @@ def _part(text: str, start: int) -> str:
 
 def _compared(spec: StoreSpec) -> dict[str, Any]:
     """Return what a store and a scene must have in common, as plain data."""
-    everything = json.loads(json.dumps({**spec.attributes, **spec.data}))
+    everything = _with_new_names(json.loads(json.dumps({**spec.attributes, **spec.data})))
     return _without_texts({key: value for key, value in everything.items() if key not in _NOT_COMPARED})
+
+
+def _with_new_names(plain: Any) -> Any:
+    """Return plain data with today's names of all keys."""
+    if isinstance(plain, dict):
+        return {tables.new_name(key): _with_new_names(value) for key, value in plain.items()}
+    return [_with_new_names(value) for value in plain] if isinstance(plain, list) else plain
 
 
 def _without_texts(attributes: dict[str, Any]) -> dict[str, Any]:

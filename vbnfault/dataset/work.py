@@ -81,6 +81,7 @@ class Job:
     item_noun: str
     error: type[ItemsFailed] = ItemsFailed  # what `raise_failures` raises
     successes: Collection[str] = ("built",)  # events after which further failures do not stop the job
+    most_failures: int | None = _HOPELESS  # before the first success; None: failures do not stop the job
 
     def __init__(
         self, path: Any, progress: Progress, leads: Mapping[int, int], later: Collection[int] = frozenset()
@@ -143,7 +144,8 @@ class Job:
             self.keep(item, text)
         if before is None:
             self.progress.advance(what == "built")
-        if len(self.failures) >= _HOPELESS and not any(self._counts[success] for success in self.successes):
+        most = self.most_failures or len(self.failures) + 1
+        if len(self.failures) >= most and not any(self._counts[success] for success in self.successes):
             self.raise_failures(f" before any succeeded, so the {self.noun} was stopped")
 
     def raise_failures(self, why: str = "", kept: str = "", **more: Any) -> None:

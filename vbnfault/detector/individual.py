@@ -109,20 +109,20 @@ class IndividualSpec:
         description=f"smallest, at ISO {_RATES_ISO:g}, and largest rate* of a hot pixel; the smallest falls as "
         "1/iso, and the number above a rate R as R^-iso_power",
     )
-    hot_offset_share: Fraction = Field(
+    hot_offset_fraction: Fraction = Field(
         default=0.45, description="fraction of hot pixels with an offset; over 0.4: Chapman et al. 2013"
     )
     hot_offset_e: float = Field(
         default=500.0, ge=0, le=1e6, description="mean* of the exponentially distributed offset"
     )
-    hot_clustered_share: Fraction = Field(
+    hot_clustered_fraction: Fraction = Field(
         default=0.0, description="fraction of hot pixels that are born next to an earlier one"
     )
-    dead_share: float = Field(default=1e-6, ge=0, le=0.1, description="fraction* of dead pixels at delivery")
-    dead_share_yr: float = Field(default=0.0, ge=0, le=0.1, description="its growth per year")
-    stuck_share: float = Field(default=0.0, ge=0, le=0.1, description="fraction of stuck pixels at delivery")
-    stuck_share_yr: float = Field(default=0.0, ge=0, le=0.1, description="its growth per year")
-    rts_share: Fraction = Field(default=0.0, description="fraction of pixels with telegraph signals at delivery")
+    dead_fraction: float = Field(default=1e-6, ge=0, le=0.1, description="fraction* of dead pixels at delivery")
+    dead_fraction_yr: float = Field(default=0.0, ge=0, le=0.1, description="its growth per year")
+    stuck_fraction: float = Field(default=0.0, ge=0, le=0.1, description="fraction of stuck pixels at delivery")
+    stuck_fraction_yr: float = Field(default=0.0, ge=0, le=0.1, description="its growth per year")
+    rts_fraction: Fraction = Field(default=0.0, description="fraction of pixels with telegraph signals at delivery")
     rts_per_interaction: Fraction = Field(default=0.05, description="more of them per radiation interaction*")
     # In proton-irradiated CCDs at 21 °C many pixels have up to 0.1 nA/cm² and one in 1000 up to 0.4 (Hopkins &
     # Hopkinson 1993, doi 10.1109/23.273552).
@@ -136,10 +136,10 @@ class IndividualSpec:
         default=(1.0, 1e4),
         description="shortest and longest mean time* in a level at reference_K; log-uniform",
     )
-    trap_share: float = Field(
+    trap_fraction: float = Field(
         default=0.0, ge=0, le=0.1, description="fraction of pixels with CCD traps at delivery"
     )
-    trap_share_TeV_g: float = Field(default=0.0, ge=0, le=0.1, description="its growth per TeV/g")
+    trap_fraction_TeV_g: float = Field(default=0.0, ge=0, le=0.1, description="its growth per TeV/g")
     trap_depth_e: float = Field(
         default=200.0, ge=0, le=1e6, description="mean* of their exponentially distributed depth"
     )
@@ -312,11 +312,11 @@ def aged(individual: Individual, **changes: Any) -> Individual:
     `changes` may set a later age (`years`), a higher dose (`dose_TeV_g`), another time since the irradiation
     (`anneal_s`) or another growth of defects. Defects keep their positions; annealing lowers the rates of radiation
     damage. The result equals `make_individual` with such a spec, bit for bit. The exception is
-    `hot_clustered_share`, which applies to new hot pixels only.
+    `hot_clustered_fraction`, which applies to new hot pixels only.
     """
     spec = individual.spec
     new = replace(spec, **changes)
-    earlier = len(individual.hot), spec.hot_clustered_share
+    earlier = len(individual.hot), spec.hot_clustered_fraction
     changed = _defects(new, individual.shape, individual.pixel_pitch_um, individual.seed, earlier)
     return replace(individual, spec=new, **changed)
 
@@ -471,7 +471,7 @@ def _hot(
     per_yr = 0.0 if growth is None else growth.expected(1.0, shape, pixel_pitch_um, spec.iso)
     born = _births(seed, "hot", per_yr * spec.years)
     count = len(born)
-    fraction = np.where(np.arange(count) < earlier[0], earlier[1], spec.hot_clustered_share)
+    fraction = np.where(np.arange(count) < earlier[0], earlier[1], spec.hot_clustered_fraction)
     row, column = _clustered(*_places(seed, "hot", count, shape), fraction, shape, seed)
     # inverse distribution function of a power law between two limits
     seen, most = spec.hot_rate_e_s
@@ -479,7 +479,7 @@ def _hot(
     power = 1.0 if growth is None else growth.iso_power
     rate = least * (1 - _uniform(seed, "hot rate", count) * (1 - (least / most) ** power)) ** (-1 / power)
     # those that only a higher ISO shows are faint, so they have no offset either
-    sticks = (_uniform(seed, "hot sticks", count) < spec.hot_offset_share) & (rate >= min(seen, most))
+    sticks = (_uniform(seed, "hot sticks", count) < spec.hot_offset_fraction) & (rate >= min(seen, most))
     offset = -np.log1p(-_uniform(seed, "hot offset", count)) * spec.hot_offset_e
     return HotPixelTable(
         row=row,
@@ -516,20 +516,20 @@ def _expected(spec: IndividualSpec, shape: tuple[int, int], fraction: float, fra
 
 
 def _dead(spec: IndividualSpec, shape: tuple[int, int], seed: int) -> DeadPixels:
-    count = len(_births(seed, "dead", _expected(spec, shape, spec.dead_share, spec.dead_share_yr)))
+    count = len(_births(seed, "dead", _expected(spec, shape, spec.dead_fraction, spec.dead_fraction_yr)))
     row, column = _places(seed, "dead", count, shape)
     return DeadPixels(row=row, column=column, response=_uniform(seed, "dead response", count))
 
 
 def _stuck(spec: IndividualSpec, shape: tuple[int, int], seed: int) -> StuckPixels:
-    count = len(_births(seed, "stuck", _expected(spec, shape, spec.stuck_share, spec.stuck_share_yr)))
+    count = len(_births(seed, "stuck", _expected(spec, shape, spec.stuck_fraction, spec.stuck_fraction_yr)))
     row, column = _places(seed, "stuck", count, shape)
     return StuckPixels(row=row, column=column, level=_uniform(seed, "stuck level", count))
 
 
 def _rts(spec: IndividualSpec, shape: tuple[int, int], pixel_pitch_um: float, seed: int) -> RtsPixels:
     interactions = spec.radiation(pixel_pitch_um).interactions
-    expected = (spec.rts_share + spec.rts_per_interaction * interactions) * shape[0] * shape[1]
+    expected = (spec.rts_fraction + spec.rts_per_interaction * interactions) * shape[0] * shape[1]
     count = len(_births(seed, "rts", expected))
     row, column = _places(seed, "rts", count, shape)
     mean = rate_e_s(spec.rts_amplitude_nA_cm2, pixel_pitch_um) * arrhenius_factor(
@@ -547,7 +547,7 @@ def _rts(spec: IndividualSpec, shape: tuple[int, int], pixel_pitch_um: float, se
 
 
 def _traps(spec: IndividualSpec, shape: tuple[int, int], seed: int) -> Traps:
-    expected = (spec.trap_share + spec.trap_share_TeV_g * spec.dose_TeV_g) * shape[0] * shape[1]
+    expected = (spec.trap_fraction + spec.trap_fraction_TeV_g * spec.dose_TeV_g) * shape[0] * shape[1]
     count = len(_births(seed, "trap", expected))
     row, column = _places(seed, "trap", count, shape)
     return Traps(

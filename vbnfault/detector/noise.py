@@ -178,7 +178,10 @@ def poisson_quantile(mean: F32, normal: F32) -> F32:
     out = np.maximum(np.floor(out), 0)
     few = mean < EXACT_POISSON_BELOW_E
     u = np.minimum(ndtr(z[few].astype(np.float64)), SUM_COMPLETE)
-    out[few] = np.where(mean[few] > 0, poisson_least_count(u, mean[few].astype(np.float64)), 0)
+    exact = np.zeros(len(u))
+    some = u > np.exp(-mean[few].astype(np.float64))  # above the probability of no count
+    exact[some] = poisson_least_count(u[some], mean[few][some].astype(np.float64))
+    out[few] = exact
     return out
 
 

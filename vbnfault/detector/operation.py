@@ -51,7 +51,14 @@ def binned(sensor: Sensor, pixels: int) -> Sensor:
 
 def _individual(spec: IndividualSpec, n: int) -> IndividualSpec:
     """Return how devices with binned pixels differ."""
-    shares = ("dead_share", "dead_share_yr", "stuck_share", "stuck_share_yr", "trap_share", "trap_share_TeV_g")
+    shares = (
+        "dead_fraction",
+        "dead_fraction_yr",
+        "stuck_fraction",
+        "stuck_fraction_yr",
+        "trap_fraction",
+        "trap_fraction_TeV_g",
+    )
     growth = spec.hot_growth
     if growth is not None:  # the law is one of the single pixel's pitch
         growth = replace(growth, log10_scale=growth.log10_scale - growth.size_power * math.log10(n))
@@ -67,7 +74,7 @@ def _individual(spec: IndividualSpec, n: int) -> IndividualSpec:
         dark_current_e_s=spec.dark_current_e_s * n**2,
         dark_nonuniformity=spec.dark_nonuniformity / n,
         hot_growth=growth,
-        rts_share=1 - (1 - spec.rts_share) ** n**2,
+        rts_fraction=1 - (1 - spec.rts_fraction) ** n**2,
         **{key: min(getattr(spec, key) * n**2, 0.1) for key in shares},
     )
 

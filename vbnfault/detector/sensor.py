@@ -196,6 +196,12 @@ def parse_sensor(table: Mapping[str, Any], *, source: str) -> Sensor:
     For a CCD without `individual.hot_growth` the growth law of CCDs (`CCD_GROWTH`) is used. Raises InputError
     that names `source`, the key and the value.
     """
+    own = {f.name for f in dataclasses.fields(IndividualSpec)}
+    changed = {key: table[key] for key in ("individual", "sources") if isinstance(table.get(key), Mapping)}
+    for key, prefix in (("individual", ""), ("sources", "individual.")):
+        if key in changed:
+            changed[key] = tables.with_new_names(changed[key], own, f"{source}: {key}", prefix)
+    table = {**table, **changed}
     sensor = tables.parse(Sensor, {"name": Path(source).stem, "sources": {}, **table}, source=source)
     _check_sources(
         _numbers({key: value for key, value in table.items() if key != "sources"}), sensor.sources, source

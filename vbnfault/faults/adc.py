@@ -36,7 +36,7 @@ class ConverterFault(Fault):
     default = True
     after = "banding"
     step = "raw"
-    severity = Severity(key="missing_share", low=1e-3, high=0.5)
+    severity = Severity(key="missing_fraction", low=1e-3, high=0.5)
     needs_mosaic = True
     localised = False
     effect_mask = True
@@ -47,13 +47,15 @@ class ConverterFault(Fault):
     stuck_place: Interval = bounds(
         1, 5, limits=(0, 15), integer=True, doc="which bits: 0 is the most significant, the next 1, …; assumed"
     )
-    missing_share: Interval = bounds(
+    missing_fraction: Interval = bounds(
         0.0, 0.05, limits=(0, 0.5), doc="fraction of the codes that are missing, in one run; assumed"
     )
-    inl_share: Interval = bounds(
+    inl_fraction: Interval = bounds(
         0.005, 0.03, limits=(0, 0.2), doc="height of the arc of integral non-linearity, of either sign; assumed"
     )
-    inl_cubic_share: Interval = bounds(0.0, 0.01, limits=(0, 0.1), doc="height of its S, of either sign; assumed")
+    inl_cubic_fraction: Interval = bounds(
+        0.0, 0.01, limits=(0, 0.1), doc="height of its S, of either sign; assumed"
+    )
     dnl_lsb_rms: Interval = bounds(
         0.0, 0.5, limits=(0, 10), unit="LSB", doc="differential non-linearity beside the device's; assumed"
     )
@@ -70,10 +72,12 @@ class ConverterFault(Fault):
         bits = rng.permutation(np.arange(low, high + 1))[: self.stuck_count.integer(rng)]
         values = rng.integers(0, 2, len(bits))
         codes = readout.top_dn + 1
-        missing = min(round(self.missing_share.uniform(rng) * codes), codes // 2)
+        missing = min(round(self.missing_fraction.uniform(rng) * codes), codes // 2)
         range_dn = readout.top_dn - readout.bias_dn
         signs = np.where(rng.random(2) < 0.5, -1.0, 1.0)
-        heights = np.array([self.inl_share.uniform(rng), self.inl_cubic_share.uniform(rng)]) * range_dn * signs
+        heights = (
+            np.array([self.inl_fraction.uniform(rng), self.inl_cubic_fraction.uniform(rng)]) * range_dn * signs
+        )
         before = _steepness(readout.inl_quadratic_dn, readout.inl_cubic_dn)
         room = max(_STEEPEST * range_dn - before, 0.0)
         heights *= min(1.0, room / max(_steepness(*heights), 1e-9))

@@ -31,12 +31,12 @@ class Overflow(Fault):
     default = True
     after = "cosmic_rays"
     step = "charge"
-    severity = Severity(key="full_well_share", low=1.0, high=0.01)
+    severity = Severity(key="full_well_fraction", low=1.0, high=0.01)
     needs_mosaic = True
     needs_ccd = True
     effect_mask = True
 
-    full_well_share: Interval = bounds(
+    full_well_fraction: Interval = bounds(
         0.7, 0.95, limits=(0.01, 1), doc="full well over the sensor's own; 1: only the drain is lost; assumed"
     )
     antiblooming: Interval = bounds(
@@ -46,7 +46,7 @@ class Overflow(Fault):
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
         """Return full well in electrons, drained fraction and direction of the charge; {} on CMOS."""
         detector = context.camera.mosaic
-        fraction, drained = self.full_well_share.uniform(rng), self.antiblooming.uniform(rng)
+        fraction, drained = self.full_well_fraction.uniform(rng), self.antiblooming.uniform(rng)
         if detector.sensor.architecture == "cmos":
             return {}
         return {

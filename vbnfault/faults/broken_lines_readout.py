@@ -60,7 +60,7 @@ class ReadoutBrokenLines(Fault):
     group: Interval = bounds(
         1, 2, limits=(1, 64), integer=True, unit="px", doc="neighbouring lines that fail together; assumed"
     )
-    row_share: float = number(
+    row_fraction: float = number(
         0.5,
         limits=(0, 1),
         doc="fraction of rows; of samples where a sensor has only rows or only columns; assumed",
@@ -94,9 +94,9 @@ class ReadoutBrokenLines(Fault):
         nodes = sensor.readout.nodes
         ccd = sensor.architecture != "cmos"
         count, group = self.count.integer(rng), self.group.integer(rng)
-        is_row = rng.random(count) < self.row_share
+        is_row = rng.random(count) < self.row_fraction
         if sensor.architecture in ONE_WAY:
-            is_row[:] = rng.random() < self.row_share
+            is_row[:] = rng.random() < self.row_fraction
         half, steps = _from_register(context)
         lines = []
         for axis, length, wanted in zip(

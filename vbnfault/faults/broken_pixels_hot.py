@@ -71,7 +71,7 @@ class HotPixels(Fault):
     anneal_days: Interval = bounds(
         7.0, 58.0, limits=(0, 1e4), unit="d", doc="since that dose; beyond 58 days damage stays as it is"
     )
-    clustered_share: float = number(0.1, limits=(0, 1), doc="fraction of hot pixels born beside another")
+    clustered_fraction: float = number(0.1, limits=(0, 1), doc="fraction of hot pixels born beside another")
     dead_per_year: float = number(
         5e-8, limits=(0, 1e-3), unit="1/yr", doc="fraction of pixels that die in a year on the ground; assumed"
     )
@@ -95,7 +95,7 @@ class HotPixels(Fault):
             "growth_factor": self.growth_factor.uniform(rng),
             "dose_TeV_g": self.dose_TeV_g.uniform(rng),
             "anneal_days": self.anneal_days.uniform(rng),
-            "clustered_share": float(self.clustered_share),
+            "clustered_share": float(self.clustered_fraction),
             "dead_per_year": float(self.dead_per_year),
             "stuck_per_year": float(self.stuck_per_year),
             "least_dn": float(self.least_dn),
@@ -274,7 +274,7 @@ def _ageing(own: IndividualSpec, params: Params) -> tuple[tuple[str, Any], ...]:
         ("dose_TeV_g", own.dose_TeV_g + params["dose_TeV_g"]),
         ("anneal_s", params["anneal_days"] * 86400.0),
         ("hot_growth", growth),
-        ("hot_clustered_share", params["clustered_share"]),
-        ("dead_share_yr", min(own.dead_share_yr + params["dead_per_year"] * added, _MOST_A_YEAR)),
-        ("stuck_share_yr", min(own.stuck_share_yr + params["stuck_per_year"] * added, _MOST_A_YEAR)),
+        ("hot_clustered_fraction", params["clustered_share"]),
+        ("dead_fraction_yr", min(own.dead_fraction_yr + params["dead_per_year"] * added, _MOST_A_YEAR)),
+        ("stuck_fraction_yr", min(own.stuck_fraction_yr + params["stuck_per_year"] * added, _MOST_A_YEAR)),
     )

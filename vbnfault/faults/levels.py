@@ -128,7 +128,7 @@ def _value(levels: Levels, model: type[Fault], severity: Severity, level: int, w
         raise InputError(
             f"{where}: {source} has no levels of {model.fault}/{model.model}; vbnfault severity computes them"
         )
-    if of_model.key != severity.key:
+    if tables.new_name(of_model.key) != tables.new_name(severity.key):
         raise InputError(
             f"{where}: {levels.path or 'the packaged table'} has levels of {of_model.key}, but the model "
             f"{model.model} becomes more severe by {severity.key}; compute the table again with vbnfault severity"

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..core.errors import InputError, shown
 from ..core.registry import DeclarationError, Registry, chained, is_name
-from ..core.tables import did_you_mean
+from ..core.tables import did_you_mean, with_new_names
 from .fields import Severity, field_schema, parse_field
 from .levels import Levels, severity_schema, with_severity
 
@@ -191,16 +191,18 @@ def from_dict(fault_class: str, table: Mapping[str, Any], *, source: str) -> Fau
 def without_severity(faults: Mapping[str, Any], *, source: str, levels: Levels | None = None) -> dict[str, Any]:
     """Return the tables of a scene's faults with the values that their keys `severity` stand for.
 
-    What is no known model stays as it is. `levels`: default: those of the package for frames of 1024 px. Raises
-    InputError where a level is wrong.
+    Keys have today's names. What is no known model stays as it is. `levels`: default: those of the package for
+    frames of 1024 px. Raises InputError where a level is wrong.
     """
     out = dict(faults)
     for fault_class, table in faults.items():
-        if isinstance(table, Mapping) and "severity" in table:
+        if isinstance(table, Mapping):
             models = registry().get(fault_class, {})
             name = table.get("model", next(iter(models), None))
             if isinstance(name, str) and name in models:
-                out[fault_class] = with_severity(models[name], table, f"{source}: faults.{fault_class}", levels)
+                where = f"{source}: faults.{fault_class}"
+                known = {f.name for f in dataclasses.fields(models[name])}
+                out[fault_class] = with_severity(models[name], with_new_names(table, known, where), where, levels)
     return out
 
 

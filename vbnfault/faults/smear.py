@@ -64,7 +64,7 @@ class FrameTransferSmear(Fault):
     leak: Interval = bounds(
         1e-3, 1e-2, limits=(0, 1), doc="fraction of light through the shield of an interline CCD; assumed"
     )
-    shutter_share: Interval = bounds(
+    shutter_fraction: Interval = bounds(
         2e-3,
         2e-2,
         limits=(0, 1),
@@ -76,7 +76,7 @@ class FrameTransferSmear(Fault):
         sensor = context.camera.mosaic.sensor
         move = sensor.transfer
         # the number of variates must not depend on the sensor
-        row_s, leak, passed = (v.uniform(rng) for v in (self.row_transfer_s, self.leak, self.shutter_share))
+        row_s, leak, passed = (v.uniform(rng) for v in (self.row_transfer_s, self.leak, self.shutter_fraction))
         which = rng.random()
         causes = [c for c in CAUSES[sensor.architecture] if self.cause in ("any", c)]
         if not causes:

@@ -553,7 +553,7 @@ class RealLens:
 
 
 # The lenses of a camera. Code above this package asks a lens what it does and never which class it has, so that
-# another kind of lens only has to answer the same questions. Lenses are immutable and hashable.
+# another kind of lens answers the same questions and joins this union. Lenses are immutable and hashable.
 Lens = ThinLens | RealLens
 
 

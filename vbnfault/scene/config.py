@@ -234,9 +234,9 @@ def parse_scene(table: Mapping[str, Any], *, source: str, overrides: Sequence[st
             )
     faults = table.get("faults")
     table = with_named_body(table, source=source)
-    if "severity" in table or (
-        isinstance(faults, Mapping) and any(isinstance(f, Mapping) and "severity" in f for f in faults.values())
-    ):
+    of_faults = [f for f in faults.values() if isinstance(f, Mapping)] if isinstance(faults, Mapping) else []
+    keys = {key for f in of_faults for key in f}
+    if "severity" in {*table, *keys} or any(tables.new_name(key) != key for key in keys if isinstance(key, str)):
         table = _without_levels(table, source, overrides)
     return tables.parse(Scene, table, source=source, overrides=overrides)
 

@@ -21,7 +21,7 @@ import hashlib
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, lru_cache, partial
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,7 +74,6 @@ from .views import (
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-T = TypeVar("T")
 
 _NAVIGATION: Mapping[str, Metric] = {metric.name: metric for metric in nav.METRICS}
 

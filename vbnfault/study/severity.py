@@ -11,7 +11,7 @@ from __future__ import annotations
 import shlex
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -310,7 +310,7 @@ def evaluate_models(
     job = SeverityJob(path or Path(views.scene), groups, Progress(planned, shown=options.progress, noun="views"))
     workers = partial(ViewWorker, metric)
     with interruptible(lambda: f"{job.path}: interrupted; nothing was written"), job.progress:
-        do_tasks(workers, job, options)
+        do_tasks(workers, job, replace(options, scheduler=None))
     if 2 * len(job.errors) < planned:
         raise VbnfaultError(
             f"{views.scene}: only {len(job.errors)} of {planned} views have {metric} without faults; take another "

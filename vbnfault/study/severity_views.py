@@ -245,6 +245,7 @@ class SeverityJob(Job):
     """Hand out groups of views, and collect the errors of each model on each view."""
 
     noun, task_noun, item_noun = "command", "group of views", "view"
+    most_failures = None  # the views of other groups may still be enough
 
     def __init__(self, path: Path, groups: Sequence[ViewGroup], progress: Progress) -> None:
         super().__init__(path, progress, dict.fromkeys(range(len(groups)), 0))

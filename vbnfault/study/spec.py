@@ -165,8 +165,10 @@ class SceneTable(Table):
     def _differ(self) -> SceneTable:
         if not self.views:
             raise ValueError("samples = []: must name at least one sample")
-        if len(set(self.views)) < len(self.views):
-            raise ValueError(f"samples = {shown(list(self.views))}: a sample is given twice")
+        try:
+            each_once(self.views)
+        except ValueError as error:
+            raise ValueError(f"samples = {shown(list(self.views))}: {error}") from None
         return self
 
     @property

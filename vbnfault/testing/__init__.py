@@ -12,3 +12,13 @@ def test_my_effect():
 from .effects import check_effect
 from .examples import draw_context, make_context, random_quantity, with_mosaic
 from .faults import check_fault, draw_table
+
+__all__ = [
+    "check_effect",
+    "check_fault",
+    "draw_context",
+    "draw_table",
+    "make_context",
+    "random_quantity",
+    "with_mosaic",
+]

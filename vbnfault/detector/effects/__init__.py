@@ -1,3 +1,15 @@
 """Define the effects of a detector with a mosaic, in their order: one class each, which registers itself."""
 
 from .contract import STEPS, Acts, Effect, Effects, Exposure, chain_of, is_packaged, order, registry
+
+__all__ = [
+    "STEPS",
+    "Acts",
+    "Effect",
+    "Effects",
+    "Exposure",
+    "chain_of",
+    "is_packaged",
+    "order",
+    "registry",
+]

@@ -108,7 +108,7 @@ class Exposure:
 
     @property
     def output_node(self) -> NDArray[np.uint8]:
-        """Return the number of the output node that reads each pixel, uint8[y, x], as `nodes.node_of`."""
+        """Return the number of the output node that reads each pixel, uint8[y, x], as `readout.node_of`."""
         return node_of(self.device.shape, self.sensor.readout.nodes)
 
     def acted(self, step: str, array: Any) -> Any:

@@ -5,11 +5,9 @@ Modules:
 - `settings` describes the Sun, the sensor, the state of the lens, and the path of the direct image.
 - `bundles` traces bundles of rays along reflection paths, and `steps` advances the rays by one surface. These two
   modules clip rays at rims.
-- `ghosts` computes the box of the rays that pass the lens, for each ghost, and the table of ghosts (flux, position
-  and size) from exact rays.
-- `paraxial` computes the same table from paraxial rays, and the transmittance along the axis.
+- `ghosts` computes the box of the rays that pass the lens, for each ghost, and the spectra of ghosts.
 - `raster` draws bundles of rays on the sensor, and `pyramid` adds up the levels on which they are drawn.
-- `irradiance` renders the image of all ghosts with these modules.
+- `irradiance` renders the image of all ghosts with these modules, and lists them (flux, position and size).
 - `starburst` computes the light that the stop diffracts.
 - `scatter` computes the glare, which surfaces and dust scatter, and the transmission of a baffle; `particles`
   computes how dust scatters.

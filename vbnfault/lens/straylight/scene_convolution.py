@@ -24,6 +24,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.errors import InputError
 from ...core.spectra import Bands
 from ..paraxial import paraxial_properties
 from ..point_spread import REACH_PX
@@ -193,6 +194,7 @@ class DirectionGrid:
 # The wings begin here; over a pixel on either side of it they fade in.
 POINT_SPREAD_PX = float(REACH_PX)
 _RADIUS_OF_SQUARE = np.pi**-0.5  # of the disc that stands for a source, in widths of the source
+_WIDEST_RAD = 0.5  # of the disc
 _LEAST_AIRY = 3.0  # smallest radius of a disc that `Starburst` allows, in wavelengths over the entrance pupil
 # Sources and pixels lie between the nodes of the grid. Both interpolations together blur the kernel by this
 # variance along each axis, in steps squared: a position that is uniform between two nodes adds a sixth.
@@ -201,8 +203,14 @@ _BLUR = 1 / 3
 
 def starburst_of_source(lens: Prescription, bands: Bands, width_rad: float) -> Starburst:
     """Return the starburst of a source as wide as a pixel of a render."""
-    airy_rad = bands.nm[-1] * 1e-6 / paraxial_properties(lens).entrance_pupil_diameter_mm
-    return starburst(lens, sun_radius_rad=max(_RADIUS_OF_SQUARE * width_rad, _LEAST_AIRY * airy_rad))
+    pupil_mm = paraxial_properties(lens).entrance_pupil_diameter_mm
+    radius_rad = max(_RADIUS_OF_SQUARE * width_rad, _LEAST_AIRY * bands.nm[-1] * 1e-6 / pupil_mm)
+    if not 0 < radius_rad < _WIDEST_RAD:
+        raise InputError(
+            f"scene_diffraction: a pixel, or the diffraction of an entrance pupil of {pupil_mm:.2g} mm, spreads "
+            f"light over {radius_rad:.2g} rad; must be below {_WIDEST_RAD:g} rad"
+        )
+    return starburst(lens, sun_radius_rad=radius_rad)
 
 
 def wing_spectra(
