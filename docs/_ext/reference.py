@@ -61,7 +61,7 @@ _UNITS = {
     "_mag_deg": "mag/°",
     "_deg_day2": "°/d²",
     "_years": "a",
-    "_share_yr": "1/a",
+    "_fraction_yr": "1/a",
 }
 
 

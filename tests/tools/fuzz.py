@@ -40,7 +40,7 @@ from tools import fuzz_stores
 from tools.fuzz_cases import CASES, dry, whole_scene
 from tools.fuzz_inputs import ROOT, Seeds, toml
 
-CPU_S = 20
+CPU_S = 60
 MEMORY_BYTES = 2 << 30
 # Limit for a case that waits without using the processor, for example for a pipe. It is far longer than any wait
 # on a busy machine.
