@@ -24,7 +24,7 @@ ROOT = Path(vbnfault.__file__).parent
 
 def documented_imports() -> dict[str, set[str]]:
     """Return the packages that each row of CONTRIBUTING's table lets its package import, `core` included."""
-    text = (ROOT.parent / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    text = (Path(__file__).parents[1] / "CONTRIBUTING.md").read_text(encoding="utf-8")
     table = text.partition("| package |")[2].partition("\n\n")[0]
     rows = [line.strip("|").split("|") for line in table.splitlines() if line.startswith("| `")]
     assert all(len(cells) == 4 for cells in rows)
