@@ -329,7 +329,7 @@ class Failing(kit.Function):
 def test_evaluations_that_fail_are_marked_and_the_rest_goes_on(tmp_path: Path) -> None:
     spec = kit.spec(design={"n": 64, "resamples": 100})
     with pytest.raises(
-        vbnfault.study.StudyFailed, match=r"3 evaluations \(7, 8, 50\) failed, .*no image at 7"
+        vbnfault.study.StudyFailed, match=r"3 evaluations \(7, 8, 50\) of 320 failed, .*no image at 7"
     ) as error:
         run.run_study(spec, tmp_path / "s", QUIET, report=False, evaluator=Failing)
     table = results.read_table(tmp_path / "s").to_pylist()
@@ -343,7 +343,7 @@ def test_evaluations_that_fail_are_marked_and_the_rest_goes_on(tmp_path: Path) -
     assert abs(data["ST"] - whole["ST"]).max() < 0.1
     # the same study tries the failed ones again
     function = functools.partial(Failing, wrong=(50,))
-    with pytest.raises(vbnfault.study.StudyFailed, match=r"evaluation 50 failed"):
+    with pytest.raises(vbnfault.study.StudyFailed, match=r"evaluation 50 of 320 failed"):
         run.run_study(spec, tmp_path / "s", QUIET, report=False, evaluator=function)
 
 

@@ -30,7 +30,7 @@ SMALL = Plan(factors=FEW, metrics=TWO, n=32)
 
 @pytest.fixture(autouse=True)
 def _fast_delta(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leave out most resamples of delta, which take seconds and which no test looks at."""
+    """Leave out most resamples of delta, whose estimates cost much and which no test looks at."""
     monkeypatch.setattr(indices, "_MOST_RESAMPLES_OF_DELTA", 2)
 
 

@@ -177,16 +177,16 @@ def _as_plain(value: Any) -> Any:
 
 
 def new_name(key: str) -> str:
-    """Return today's name of a key: until version 0.2 some fractions were called shares, such as `dead_share`."""
+    """Return the current name of a key: until version 0.2 fractions were called shares, such as `dead_share`."""
     return key.replace("_share", "_fraction")
 
 
 def with_new_names(
     table: Mapping[str, Any], known: Collection[str], where: str, prefix: str = ""
 ) -> dict[str, Any]:
-    """Return a table with today's names of its keys, and warn of old ones.
+    """Return a table whose keys have their current names, and warn of old ones.
 
-    `known` are the keys of today; each may stand behind `prefix`. Raises InputError, whose message begins with
+    `known` are the current keys; each may stand behind `prefix`. Raises InputError, whose message begins with
     `where`, where a key is given by both names.
     """
     renamed: dict[str, Any] = {}

@@ -180,7 +180,7 @@ def _compared(spec: StoreSpec) -> dict[str, Any]:
 
 
 def _with_new_names(plain: Any) -> Any:
-    """Return plain data with today's names of all keys."""
+    """Return plain data in which all keys have their current names."""
     if isinstance(plain, dict):
         return {tables.new_name(key): _with_new_names(value) for key, value in plain.items()}
     return [_with_new_names(value) for value in plain] if isinstance(plain, list) else plain

@@ -148,15 +148,18 @@ class Job:
         if len(self.failures) >= most and not any(self._counts[success] for success in self.successes):
             self.raise_failures(f" before any succeeded, so the {self.noun} was stopped")
 
-    def raise_failures(self, why: str = "", kept: str = "", **more: Any) -> None:
-        """Raise an error that names the failed items, if there are any; `kept` says what is kept of the others."""
+    def raise_failures(self, why: str = "", kept: str = "", of: str = "", **more: Any) -> None:
+        """Raise an error that names the failed items, if there are any.
+
+        `kept` says what is kept of the others, and `of` how many there are in all, such as " of 320".
+        """
         if not self.failures:
             return
         failed, noun = sorted(self.failures), self.item_noun
         names = ", ".join(map(str, failed[:8])) + (", ..." if len(failed) > 8 else "")
         listed = f"{noun} {names}" if len(failed) == 1 else f"{len(failed)} {noun}s ({names})"
         raise self.error(
-            f"{self.path}: {listed} failed{why}, the first with: {self.failures[failed[0]].splitlines()[0]}; "
+            f"{self.path}: {listed}{of} failed{why}, the first with: {self.failures[failed[0]].splitlines()[0]}; "
             f"{kept or f'all other {noun}s are kept'}; the same command tries the failed ones again",
             self.failures,
             **more,

@@ -191,7 +191,7 @@ def from_dict(fault_class: str, table: Mapping[str, Any], *, source: str) -> Fau
 def without_severity(faults: Mapping[str, Any], *, source: str, levels: Levels | None = None) -> dict[str, Any]:
     """Return the tables of a scene's faults with the values that their keys `severity` stand for.
 
-    Keys have today's names. What is no known model stays as it is. `levels`: default: those of the package for
+    Keys get their current names. What is no known model stays as it is. `levels`: default: those of the package for
     frames of 1024 px. Raises InputError where a level is wrong.
     """
     out = dict(faults)

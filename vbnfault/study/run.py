@@ -186,7 +186,9 @@ def run_study(
         missed = _missed_half_widths(spec, data)
         _warn(missed)
         job.raise_failures(
-            kept="all others are in the table, and the indices leave out incomplete base samples", indices=data
+            of=f" of {len(design)}",
+            kept="all others are in the table, and the indices leave out incomplete base samples",
+            indices=data,
         )
     return StudySummary(
         path=path,

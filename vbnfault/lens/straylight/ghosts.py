@@ -36,9 +36,8 @@ _LEAST_SPREAD = 0.25  # fraction of a ghost's image that is magnified less than 
 # because their reflectances vary faster with the angle.
 _SPECTRUM, _SPECTRUM_OF_FILMS, _FILMS_NM = 13, 16, 800.0
 _SPECTRUM_AT_ONCE = 1 << 20
-_DARK = (
-    1e-6  # of the most light at any wavelength: with less, behind a filter, rays cannot stand for those beside it
-)
+# of the most light at any wavelength: with less, behind a filter, rays cannot stand for those beside it
+_DARK = 1e-6
 _LEAST_SHARE = 1e-2  # of a ghost's light in a band that a wavelength must have to be drawn in it
 _UNEVEN = 2.0  # ratio of the areas of neighbouring cells above which the image is uneven
 
