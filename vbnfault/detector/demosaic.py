@@ -161,8 +161,11 @@ def _bound(
     inner = np.s_[halo:-halo, halo:-halo]
     top = cv2.dilate(brightest, _support(method))[inner]
     lowest = cv2.erode(measured, np.ones((3, 3), np.uint8))[inner]
-    # the few pixels where an edge may be hard for one of the colours
-    y, x = np.nonzero((top - lowest > HARD_NOISE * noise) & (top - lowest > lowest - black))
+    # the few pixels where an edge may be hard for one of the colours, whose own darkest pixel is no darker
+    span, ratio = top - lowest, 1 if block.min() < black else HARD_RATIO - 1
+    y, x = np.nonzero((span > HARD_NOISE * noise) & (span > ratio * (lowest - black)))
+    if not y.size:
+        return
     least, greatest = (
         _malvar(measured, pattern, filtered=extreme) for extreme in (_least_beside, _greatest_beside)
     )

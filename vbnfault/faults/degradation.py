@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from .context import FaultContext, Params
 from .contract import Fault
 from .fields import Interval, Severity, bounds, flag
+from .planes import by_channel
 
 _LEAST_SIGMA_PX = 0.4
 
@@ -69,7 +70,7 @@ class GaussianDegradation(Fault):
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
         """Return the expected electrons, first clipped to white, then filtered."""
         taps = cv2.getGaussianKernel(params["kernel_px"], params["sigma_px"], cv2.CV_32F)
-        clipped = np.minimum(quantity.array, quantity.white_e)
+        clipped = by_channel(np.minimum, quantity.array, quantity.white_e)
         blurred = cv2.sepFilter2D(clipped, -1, taps, taps, borderType=cv2.BORDER_REFLECT_101)
         return quantity.with_array(blurred.reshape(clipped.shape))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import cv2
@@ -16,7 +17,15 @@ F32 = NDArray[np.float32]
 
 def times(array: F32, factor: NDArray[Any]) -> F32:
     """Return planes float32[y, x, channel] times a factor for each channel [channel] or for each pixel [y, x]."""
-    return array * (factor if factor.ndim == 1 else factor[..., None]).astype(np.float32)
+    if factor.ndim == 1:
+        return by_channel(np.multiply, array, factor.astype(np.float32))
+    return array * cv2.merge([factor.astype(np.float32)] * array.shape[2]).reshape(array.shape)
+
+
+def by_channel(function: Callable[[F32, F32], F32], array: F32, values: F32) -> F32:
+    """Return a ufunc of float32[y, x, channel] and a value of each channel, in rows: 5 times as fast as pixels."""
+    height, width, _ = array.shape
+    return function(array.reshape(height, -1), np.tile(values, width)).reshape(array.shape)
 
 
 def sums(array: F32) -> NDArray[np.float64]:
