@@ -21,7 +21,7 @@ from scipy.interpolate import CubicSpline
 
 from vbnfault.camera import Camera
 from vbnfault.core import spectra
-from vbnfault.core.resources import packaged
+from vbnfault.core.files.resources import packaged
 from vbnfault.core.spectra import Bands
 from vbnfault.detector import ThreeColourDetector
 from vbnfault.faults import FaultContext, registry

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vbnfault.core.images import write_png
+from vbnfault.core.files.images import write_png
 from vbnfault.faults import registry
 from vbnfault.pipeline import Session, masks
 from vbnfault.pipeline.development import Development

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from vbnfault.body.geometry import Float64, Int32, vertex_normals
 from vbnfault.body.noise import fractal_noise, gradient_noise
 from vbnfault.body.shape import check_mesh
-from vbnfault.core.resources import data_dir
+from vbnfault.core.files.resources import data_dir
 
 _SEED = 67
 _SPACING_KM = 0.066

@@ -17,8 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
-from vbnfault.core import resources
-from vbnfault.core.images import write_png
+from vbnfault.core.files import resources
+from vbnfault.core.files.images import write_png
 from vbnfault.lens import load_lens
 from vbnfault.output import flare_images
 

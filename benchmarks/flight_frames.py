@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy import ndimage, stats
 
 import vbnfault
-from vbnfault.core import user_files
+from vbnfault.core.files import user_files
 
 F32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]

@@ -124,7 +124,7 @@ from scipy.spatial.transform import Rotation
 import vbnfault
 from vbnfault.body import load_body
 from vbnfault.cli import options
-from vbnfault.core import resources
+from vbnfault.core.files import resources
 from vbnfault.detector.sensor import load_sensor
 from vbnfault.scene.trajectory import FlownPose, Trajectory, load_trajectory
 

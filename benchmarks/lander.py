@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from vbnfault.core.resources import data_dir
+from vbnfault.core.files.resources import data_dir
 
 Part = tuple[str, trimesh.Trimesh, str]  # name, mesh, material
 

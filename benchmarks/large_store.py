@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 from vbnfault import dataset, pipeline, store
-from vbnfault.core import interrupts
+from vbnfault.core.process import interrupts
 from vbnfault.core.quantities import Sample
 from vbnfault.dataset import build
 from vbnfault.dataset.identity import stored_plan

@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 
 from vbnfault import dataset, store
-from vbnfault.core import resources
+from vbnfault.core.files import resources
 from vbnfault.output import contact_sheet
 from vbnfault.scene import config
 

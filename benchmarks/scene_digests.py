@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from vbnfault import store
-from vbnfault.core import resources
+from vbnfault.core.files import resources
 
 _PIXELS = ("image", "clean", "mask")
 

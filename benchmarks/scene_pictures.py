@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vbnfault import dataset
-from vbnfault.core.images import decoded_image, write_png
+from vbnfault.core.files.images import decoded_image, write_png
 from vbnfault.output import contact_sheet
 from vbnfault.output.sample_files import annotated
 from vbnfault.pipeline import Session

@@ -26,7 +26,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from vbnfault.core.array_files import FOLDER_VARIABLE
+from vbnfault.core.files.array_files import FOLDER_VARIABLE
 from vbnfault.core.spectra import Bands
 from vbnfault.lens import ThinLens, load_lens, paraxial_properties
 from vbnfault.lens.straylight import ghost_response

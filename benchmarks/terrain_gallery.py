@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from vbnfault import render
 from vbnfault.body import EMBEDDED
 from vbnfault.core import frames
-from vbnfault.core.images import write_png
+from vbnfault.core.files.images import write_png
 from vbnfault.pipeline import Session
 from vbnfault.pipeline.exposure import meter
 from vbnfault.pipeline.rendering import render_view

@@ -18,7 +18,7 @@ import psutil
 from vbnfault import render
 from vbnfault.body import EMBEDDED, PatchSpec, choose_sites, load_body
 from vbnfault.body.patch import cached_patch
-from vbnfault.core.array_files import FOLDER_VARIABLE
+from vbnfault.core.files.array_files import FOLDER_VARIABLE
 
 
 def peak_gib() -> float:

@@ -14,7 +14,7 @@ import pytest
 from workload import clock
 
 from vbnfault.core import spectra
-from vbnfault.core.resources import packaged
+from vbnfault.core.files.resources import packaged
 from vbnfault.core.spectra import Bands
 from vbnfault.detector import ThreeColourDetector
 from vbnfault.lens import load_lens, scaled_to_focal_length

@@ -21,7 +21,7 @@ from blender_cycles import Cycles, Unavailable, interpreter
 from report import SAMPLE, targets
 from workload import Workload, clock, medians
 
-from vbnfault.core.images import write_png
+from vbnfault.core.files.images import write_png
 from vbnfault.pipeline.spec import Frame
 
 

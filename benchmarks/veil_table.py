@@ -22,7 +22,7 @@ import argparse
 
 import numpy as np
 
-from vbnfault.core import resources
+from vbnfault.core.files import resources
 from vbnfault.core.spectra import Bands
 from vbnfault.lens import Prescription, load_lens, paraxial_properties
 from vbnfault.lens.glass import D_NM

@@ -141,7 +141,7 @@ def no_unexpected_warning(request: pytest.FixtureRequest) -> Iterator[None]:
 def render_threads(count: int) -> Iterator[None]:
     """Render with as many threads in a `with` block."""
     from vbnfault import render
-    from vbnfault.core.llvm import backend
+    from vbnfault.core.process.llvm import backend
 
     before = backend().dr.thread_count()
     render.set_threads(count)
@@ -267,8 +267,8 @@ def deny(monkeypatch: pytest.MonkeyPatch, *paths: Path) -> None:
 
 def needs_llvm() -> None:
     """Skip a test, or a file whose first lines call this, where no LLVM can be used."""
-    from vbnfault.core import llvm
     from vbnfault.core.errors import VbnfaultError
+    from vbnfault.core.process import llvm
 
     try:
         llvm.find()

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from vbnfault import store as st
-from vbnfault.core import activity
 from vbnfault.core.errors import InputError, VbnfaultError
+from vbnfault.core.process import activity
 from vbnfault.core.quantities import Sample
 from vbnfault.dataset import build as bd
 

@@ -16,8 +16,9 @@ from typer.testing import CliRunner
 
 from vbnfault import dataset
 from vbnfault.cli import app
-from vbnfault.core import resources, spectra
+from vbnfault.core import spectra
 from vbnfault.core.errors import InputError
+from vbnfault.core.files import resources
 from vbnfault.core.spectra import Bands
 from vbnfault.faults import FaultContext, from_dict
 from vbnfault.lens import (

@@ -47,7 +47,7 @@ MAY_IMPORT = documented_imports()
 
 ONLY = {  # distribution → the packages or modules that import it
     "mitsuba": {"render"},
-    "drjit": {"core.llvm", "render"},
+    "drjit": {"core.process.llvm", "render"},
     "zarr": {"store"},
     "numcodecs": {"store"},
     "obstore": {"store.bucket"},
@@ -57,9 +57,9 @@ ONLY = {  # distribution → the packages or modules that import it
     "typer": {"cli"},
     "pyarrow": {"output.export.formats.huggingface", "scene.trajectory", "study"},
     "SALib": {"study"},
-    "spiceypy": {"core.spice"},
-    "OpenEXR": {"core.images"},
-    "tifffile": {"core.tiff"},
+    "spiceypy": {"core.files.spice"},
+    "OpenEXR": {"core.files.images"},
+    "tifffile": {"core.files.tiff"},
 }
 
 

@@ -10,8 +10,9 @@ import pytest
 from conftest import small_scene
 from test_scene_straylight import SINGLET, behind, disc
 
-from vbnfault.core import frames, llvm
+from vbnfault.core import frames
 from vbnfault.core.errors import VbnfaultError
+from vbnfault.core.process import llvm
 from vbnfault.lens import load_lens
 from vbnfault.lens.straylight.scatter import Cleanliness
 from vbnfault.lens.straylight.scene import PointSources, surrounding_grids

@@ -28,9 +28,9 @@ from dask import config as dask_config
 from synthetic import SAMPLES, Broken, Session, fake_sample, make_spec, run, site_of
 
 from vbnfault import store as st
-from vbnfault.core import toml_files
 from vbnfault.core.errors import InputError, VbnfaultError
-from vbnfault.core.interrupts import Interrupted
+from vbnfault.core.files import toml_files
+from vbnfault.core.process.interrupts import Interrupted
 from vbnfault.core.quantities import Sample
 from vbnfault.core.registry import undoing_registrations
 from vbnfault.dataset import BuildOptions, build_scene, dask

@@ -14,8 +14,8 @@ from typer.testing import CliRunner
 
 from vbnfault.camera.characterise import Settings, VirtualCamera, characterise
 from vbnfault.cli import app
-from vbnfault.core import resources
 from vbnfault.core.errors import InputError
+from vbnfault.core.files import resources
 from vbnfault.core.quantities import TRAP
 from vbnfault.detector import MosaicDetector
 from vbnfault.detector.chain import Device, MosaicNoise, by_channel

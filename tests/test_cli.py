@@ -245,7 +245,7 @@ def test_another_scene_is_refused_and_named(built: Path, scene: Path, call: Call
 def test_no_usable_llvm_is_one_sentence_and_no_abort(scene: Path, tmp_path: Path) -> None:
     """Only LLVM 14 in sight: a sentence, whatever the machine has."""
     program = (
-        "import sys; from pathlib import Path; from vbnfault import cli; from vbnfault.core import llvm\n"
+        "import sys; from pathlib import Path; from vbnfault import cli; from vbnfault.core.process import llvm\n"
         f"old = Path({str(tmp_path / 'libLLVM-14.so.1')!r}); old.write_bytes(b'')\n"
         "llvm._paths = lambda: iter([('system', old)])\n"
         f"sys.argv = ['vbnfault', 'build', {str(scene)!r}, '--out', {str(tmp_path / 'x.zarr')!r}]\n"

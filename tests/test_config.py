@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from vbnfault import faults
-from vbnfault.core import resources, tables, toml_files
+from vbnfault.core import tables
 from vbnfault.core.errors import InputError
+from vbnfault.core.files import resources, toml_files
 from vbnfault.dataset.identity import content_hash
 from vbnfault.detector import ThreeColourDetector
 from vbnfault.detector.sensor import load_sensor, parse_sensor

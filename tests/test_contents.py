@@ -14,8 +14,8 @@ import trimesh
 from conftest import small_scene
 
 from vbnfault import dataset, pipeline, store
-from vbnfault.core import file_contents, resources, spice, user_files
 from vbnfault.core.errors import InputChanged, InputError
+from vbnfault.core.files import file_contents, resources, spice, user_files
 from vbnfault.dataset import build
 from vbnfault.scene import config
 

@@ -166,7 +166,7 @@ def with_pattern(tmp_path: Any, name: str) -> str:
 
 
 def load_text(name: str) -> str:
-    from vbnfault.core import resources
+    from vbnfault.core.files import resources
 
     return resources.find("scenes/detectors", name).read_text()
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from vbnfault.core.llvm import backend
+from vbnfault.core.process.llvm import backend
 from vbnfault.core.quantities import RGBI, Electrons
 from vbnfault.detector import Noise, ThreeColourDetector
 from vbnfault.detector.noise import NormalField, draw_normals, variates_by_code

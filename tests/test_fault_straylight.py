@@ -13,9 +13,9 @@ import tifffile
 from test_faults_kit import flat_electrons, make, make_context, rng
 
 from vbnfault.core.errors import InputError
-from vbnfault.core.images import write_png
-from vbnfault.core.resources import data_dir
-from vbnfault.core.user_files import sha256
+from vbnfault.core.files.images import write_png
+from vbnfault.core.files.resources import data_dir
+from vbnfault.core.files.user_files import sha256
 from vbnfault.dataset.identity import _contents_of_fault
 from vbnfault.faults import from_dict
 from vbnfault.faults.straylight import CLOSE, FAR, flare_centres_px, texture

@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 
 from vbnfault.body import formats, load_shape
 from vbnfault.body.geometry import signed_volume
-from vbnfault.core import spice
 from vbnfault.core.errors import InputError
+from vbnfault.core.files import spice
 
 Arrays = tuple[np.ndarray, np.ndarray]
 

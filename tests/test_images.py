@@ -17,7 +17,7 @@ import pytest
 import tifffile
 
 from vbnfault.core.errors import InputError
-from vbnfault.core.images import decoded_image, srgb8, write_png
+from vbnfault.core.files.images import decoded_image, srgb8, write_png
 
 
 @pytest.mark.parametrize("channels", [0, 3, 4])
@@ -221,7 +221,7 @@ def test_a_small_tiff_of_much_data_takes_no_memory(monkeypatch: pytest.MonkeyPat
             return zlib.decompressobj().decompress(data, size)
 
     block = zlib.compress(bytes(10_000_000))
-    monkeypatch.setattr("vbnfault.core.tiff.zlib", SimpleNamespace(decompressobj=Counted))
+    monkeypatch.setattr("vbnfault.core.files.tiff.zlib", SimpleNamespace(decompressobj=Counted))
     decoded_image(tiff(iter([block]), shape=(50, 70), dtype="u1", compression=8), 3500)
     assert sizes == [3500]
 

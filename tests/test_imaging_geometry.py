@@ -11,8 +11,8 @@ from conftest import small_scene
 from lens_kit import LENSES, PITCH_UM, SIDE_PX, camera, chief_px, real
 
 from vbnfault import navigation, pipeline
-from vbnfault.core import resources
 from vbnfault.core.errors import InputError
+from vbnfault.core.files import resources
 from vbnfault.lens import (
     RealLens,
     imaging,

@@ -16,8 +16,8 @@ from lens_kit import bundle
 
 from vbnfault import dataset, pipeline
 from vbnfault.camera import Camera
-from vbnfault.core import resources
 from vbnfault.core.errors import InputError
+from vbnfault.core.files import resources
 from vbnfault.core.quantities import BODY, SUN, Radiance
 from vbnfault.lens import (
     RealLens,

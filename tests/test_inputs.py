@@ -25,10 +25,10 @@ from conftest import deny
 from vbnfault import cli
 from vbnfault.body import load_shape
 from vbnfault.body.geometry import signed_volume
-from vbnfault.core import images, path_checks, resources, spice, user_files
 from vbnfault.core.errors import InputError, VbnfaultError, shown
-from vbnfault.core.toml_files import read_toml
-from vbnfault.core.whole_files import write_json, write_whole
+from vbnfault.core.files import images, path_checks, resources, spice, user_files
+from vbnfault.core.files.toml_files import read_toml
+from vbnfault.core.files.whole_files import write_json, write_whole
 from vbnfault.dataset.lock import locked
 from vbnfault.detector.sensor import load_sensor
 from vbnfault.faults import from_dict, registry

@@ -17,9 +17,10 @@ from synthetic import run as build
 from test_cli import run
 
 from vbnfault import store
-from vbnfault.core import interrupts, resources
 from vbnfault.core.errors import InputError
-from vbnfault.core.interrupts import Interrupted
+from vbnfault.core.files import resources
+from vbnfault.core.process import interrupts
+from vbnfault.core.process.interrupts import Interrupted
 from vbnfault.core.quantities import Sample
 
 SENTENCE = "vbnfault: interrupted; the files written so far stay, and the same command continues the work\n"

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vbnfault.core import resources, toml_files
 from vbnfault.core.errors import InputError
+from vbnfault.core.files import resources, toml_files
 from vbnfault.lens import load_lens, paraxial_properties, parse_lens, scaled_to_field, scaled_to_focal_length
 from vbnfault.lens import rays as trace_module
 from vbnfault.lens.coating import NAMES, Layer, design, mean_reflectance, reflect_transmit

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy._core._multiarray_umath as some_library
 import pytest
 
-from vbnfault.core import llvm
 from vbnfault.core.errors import InputError, VbnfaultError
+from vbnfault.core.process import llvm
 
 NOT_LLVM = Path(some_library.__file__)  # a shared library of every system these tests run on
 
@@ -275,7 +275,9 @@ def test_a_damaged_library_never_ends_the_process(kind: str, tmp_path: Path) -> 
         "elf_header": lambda: b"\x7fELF\x02\x01\x01" + bytes(4096),
     }[kind]()
     path.write_bytes(data)
-    script = "from vbnfault.core import llvm; c = next(llvm.candidates()); assert not c.usable; print(c.problem)"
+    script = (
+        "from vbnfault.core.process import llvm; c = next(llvm.candidates()); assert not c.usable; print(c.problem)"
+    )
     done = subprocess.run(
         [sys.executable, "-W", "error", "-c", script],
         env={**os.environ, llvm.VARIABLE: str(path)},
@@ -289,7 +291,7 @@ def test_a_damaged_library_never_ends_the_process(kind: str, tmp_path: Path) -> 
 
 def test_looking_does_not_load_mitsuba() -> None:
     script = (
-        "import sys; from vbnfault.core import llvm; list(llvm.candidates());"
+        "import sys; from vbnfault.core.process import llvm; list(llvm.candidates());"
         "assert not {'mitsuba', 'drjit'} & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-W", "error", "-c", script], check=True)

@@ -94,7 +94,7 @@ def test_samples_leave_nothing_behind(session: Session) -> None:
 
 ARENAS = """
 import ctypes, sys, threading
-from vbnfault.core import environment
+from vbnfault.core.process import environment
 if sys.argv[1] == "shared":
     environment.share_arenas()
 libc = ctypes.CDLL(None)

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from matplotlib.transforms import Bbox
 
-from vbnfault.core import resources
 from vbnfault.core.errors import InputError
-from vbnfault.core.whole_files import write_json
+from vbnfault.core.files import resources
+from vbnfault.core.files.whole_files import write_json
 from vbnfault.lens import load_lens
 from vbnfault.lens.adapt import LensRequest, adapted_lens
 from vbnfault.output import flare_images, lens_sheet

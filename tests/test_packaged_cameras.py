@@ -12,8 +12,10 @@ import pytest
 from conftest import small_scene
 
 from vbnfault import dataset, pipeline, store
-from vbnfault.core import llvm, resources, spectra
+from vbnfault.core import spectra
 from vbnfault.core.errors import VbnfaultError
+from vbnfault.core.files import resources
+from vbnfault.core.process import llvm
 from vbnfault.core.quantities import Electrons, Irradiance
 from vbnfault.detector import MosaicDetector
 from vbnfault.detector.mosaic import sample

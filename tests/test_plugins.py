@@ -253,8 +253,8 @@ def test_a_plug_in_through_the_store_and_back(tmp_path: Path, monkeypatch: pytes
 def test_a_plug_in_edited_during_a_build_stops_it(tmp_path: Path) -> None:
     plugin(tmp_path)
     scene = small(scene_file(tmp_path, "my_glint.py"), plan=EVERY)
-    from vbnfault.core import file_contents
     from vbnfault.core.errors import InputChanged
+    from vbnfault.core.files import file_contents
 
     contents = file_contents.Contents()
     with contents.in_use():

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.integrate import quad
 from scipy.special import j1
 
-from vbnfault.core import resources
+from vbnfault.core.files import resources
 from vbnfault.core.spectra import Bands
 from vbnfault.lens import Prescription, load_lens, paraxial_properties, parse_lens
 from vbnfault.lens.paraxial import gap, mirrors, refraction, system

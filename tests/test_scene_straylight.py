@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from test_faults_kit import flat_electrons, make_context
 
 import vbnfault
-from vbnfault.core import array_files, spectra
+from vbnfault.core import spectra
 from vbnfault.core.errors import InputError
+from vbnfault.core.files import array_files
 from vbnfault.core.quantities import Electrons, Radiance
 from vbnfault.core.spectra import Bands
 from vbnfault.faults import FaultContext, from_dict

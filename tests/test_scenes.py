@@ -12,7 +12,7 @@ import xarray
 
 from vbnfault import dataset, pipeline, store
 from vbnfault.cli.options import SceneOptions
-from vbnfault.core import resources
+from vbnfault.core.files import resources
 from vbnfault.scene import config
 
 # Small images over coarse ground: the scene's own camera, faults and bounds of geometry stay.

@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 from jsonschema import Draft202012Validator
 
-from vbnfault.core import resources
 from vbnfault.core.errors import InputError
+from vbnfault.core.files import resources
 from vbnfault.detector.readout import ReadoutSpec
 from vbnfault.detector.sensor import Sensor, parse_sensor
 from vbnfault.faults import registry

@@ -16,8 +16,8 @@ import pytest
 
 from vbnfault import cli
 from vbnfault.body.download import LOCK, Fetched, fetch_shape
-from vbnfault.core import user_files
 from vbnfault.core.errors import InputError, VbnfaultError
+from vbnfault.core.files import user_files
 from vbnfault.scene import bodies
 
 TETRAHEDRON = b"v 1 1 1\nv 1 -1 -1\nv -1 1 -1\nv -1 -1 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"

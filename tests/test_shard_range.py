@@ -20,9 +20,9 @@ from typer.testing import CliRunner
 
 from vbnfault import cli
 from vbnfault import store as st
-from vbnfault.core import environment
 from vbnfault.core.errors import InputError, VbnfaultError
-from vbnfault.core.interrupts import Interrupted
+from vbnfault.core.process import environment
+from vbnfault.core.process.interrupts import Interrupted
 from vbnfault.core.quantities import Sample
 from vbnfault.dataset import lock
 from vbnfault.dataset.merge import MergeSummary, join_stores, merge_stores

@@ -17,8 +17,9 @@ from poses_kit import columns_of, row
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
-from vbnfault.core import meshes, spectra
+from vbnfault.core import spectra
 from vbnfault.core.errors import InputError
+from vbnfault.core.files import meshes
 from vbnfault.pipeline import Session
 from vbnfault.scene.config import parse_scene
 from vbnfault.world import assemble, spacecraft

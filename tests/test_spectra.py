@@ -11,7 +11,8 @@ from colour.plotting.datasets.astm_g_173 import DATA_ASTMG173_ETR
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vbnfault.core import resources, spectra
+from vbnfault.core import spectra
+from vbnfault.core.files import resources
 from vbnfault.core.quantities import LUMINANCE, Irradiance
 from vbnfault.detector import ThreeColourDetector
 

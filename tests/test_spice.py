@@ -14,8 +14,9 @@ from conftest import small_scene
 from test_cli import run
 
 import vbnfault
-from vbnfault.core import frames, spice
+from vbnfault.core import frames
 from vbnfault.core.errors import InputError
+from vbnfault.core.files import spice
 from vbnfault.pipeline import Session
 from vbnfault.scene import config
 from vbnfault.world import ephemeris

@@ -22,7 +22,7 @@ from tools.damage import SAMPLES, mend, sample, spec
 
 from vbnfault import store as st
 from vbnfault.core.errors import InputError, VbnfaultError
-from vbnfault.core.whole_files import remove
+from vbnfault.core.files.whole_files import remove
 from vbnfault.store import disk
 from vbnfault.store.metadata import metadata_problems
 

@@ -29,7 +29,7 @@ from tools import fuzz, fuzz_cases, fuzz_stores
 
 from vbnfault import store as st
 from vbnfault.core.errors import InputError, VbnfaultError
-from vbnfault.core.whole_files import own_folder, remove, replacing, write_whole
+from vbnfault.core.files.whole_files import own_folder, remove, replacing, write_whole
 from vbnfault.store import codec, compressors, disk, layout
 
 

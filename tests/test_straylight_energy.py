@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from test_faults_kit import make_context
 
 from vbnfault.camera import Camera
-from vbnfault.core import resources, spectra
+from vbnfault.core import spectra
+from vbnfault.core.files import resources
 from vbnfault.core.quantities import Electrons, Radiance
 from vbnfault.core.spectra import Bands
 from vbnfault.detector import ThreeColourDetector

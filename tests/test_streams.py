@@ -17,7 +17,7 @@ from synthetic import run as build
 from test_cli import run
 
 from vbnfault import store
-from vbnfault.core import streams
+from vbnfault.core.process import streams
 
 
 def test_the_library_warns_in_sentences_each_of_them_once(
@@ -143,7 +143,7 @@ def test_no_file_takes_the_number_of_a_closed_stream(closed: tuple[int, ...]) ->
     program = (
         "import os, sys, stat\n"
         "from vbnfault import cli\n"
-        "from vbnfault.core import resources\n"
+        "from vbnfault.core.files import resources\n"
         "was, kinds = resources.packaged, []\n"
         "def looked_at(kind):\n"
         "    kinds.extend(stat.S_ISREG(os.fstat(n).st_mode) for n in range(3))\n"

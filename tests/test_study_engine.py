@@ -20,7 +20,7 @@ import xarray
 
 import vbnfault
 from vbnfault.core.errors import InputError, VbnfaultError
-from vbnfault.core.interrupts import Interrupted
+from vbnfault.core.process.interrupts import Interrupted
 from vbnfault.dataset import BuildOptions
 from vbnfault.study import indices, results, run
 from vbnfault.study.designs import make_design

@@ -14,9 +14,10 @@ from conftest import small_scene
 from PIL import Image
 
 from vbnfault.camera import Camera
-from vbnfault.core import llvm, resources
 from vbnfault.core.errors import InputError, VbnfaultError
-from vbnfault.core.llvm import backend
+from vbnfault.core.files import resources
+from vbnfault.core.process import llvm
+from vbnfault.core.process.llvm import backend
 from vbnfault.core.spectra import solar_irradiance_W_m2_nm
 from vbnfault.lens import load_lens
 from vbnfault.lens.adapt import Change, changed

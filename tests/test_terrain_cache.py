@@ -15,9 +15,10 @@ import trimesh
 from vbnfault.body import Body, PatchSpec, Site, choose_sites
 from vbnfault.body import patch as patch_module
 from vbnfault.body.patch import arrays_of, build_patch, cached_patch, patch_key
-from vbnfault.core import activity, array_files
-from vbnfault.core.array_files import ArrayFiles, Arrays, cache_folder
 from vbnfault.core.errors import InputError
+from vbnfault.core.files import array_files
+from vbnfault.core.files.array_files import ArrayFiles, Arrays, cache_folder
+from vbnfault.core.process import activity
 
 COARSE = {"seed": 3, "facet_m": 20.0, "radius_m": 60.0, "min_boulder_m": 8.0, "max_triangles": 60_000}
 FILES = ArrayFiles(kind="patch", content="terrain")

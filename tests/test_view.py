@@ -22,8 +22,8 @@ from conftest import Called
 from synthetic import FAULTS, fake_sample, filled, flip, make_spec
 
 from vbnfault import store as st
-from vbnfault.core import images
 from vbnfault.core.errors import InputError
+from vbnfault.core.files import images
 from vbnfault.output.contact_sheet import overlay
 from vbnfault.output.viewer import Viewer, server
 from vbnfault.output.viewer.server import NOT_KNOWN, Listing

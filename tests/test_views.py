@@ -352,7 +352,7 @@ def test_a_flown_pose_is_kept_with_its_sun_hidden_and_refused_within_the_ground(
     terrain: Terrain, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Poses of SPICE are what was flown: straylight without a Sun is not injected, and the sample says so."""
-    from vbnfault.core import spice
+    from vbnfault.core.files import spice
     from vbnfault.world import ephemeris
 
     s = session({"straylight": {}}, plan=EVERY)

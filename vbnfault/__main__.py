@@ -1,6 +1,6 @@
 """Run the command line: `python -m vbnfault` is the command `vbnfault`."""
 
-from .core import interrupts
+from .core.process import interrupts
 
 
 def main() -> None:

@@ -540,7 +540,7 @@ def _module(name: str) -> str:
 
 def catalogue() -> str:
     """Return the packaged scenes, bodies, lenses and detectors with descriptions, and the figures of the scenes."""
-    from vbnfault.core import resources
+    from vbnfault.core.files import resources
 
     parts = []
     kinds = [("Scenes", "scenes")]

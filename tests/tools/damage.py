@@ -48,8 +48,8 @@ from vbnfault.body import Body, choose_sites
 from vbnfault.body import patch as cache
 from vbnfault.body.patch import build_patch
 from vbnfault.body.spec import PatchSpec
-from vbnfault.core import whole_files
 from vbnfault.core.errors import VbnfaultError
+from vbnfault.core.files import whole_files
 from vbnfault.core.quantities import Sample
 from vbnfault.dataset import build as bd
 from vbnfault.store import disk

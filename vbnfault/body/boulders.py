@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from ..core.llvm import backend
+from ..core.process.llvm import backend
 from .fields import GRADIENT_STD, Points
 from .geometry import Float64, Int32, face_centres, face_normals_areas
 from .noise import noise_key

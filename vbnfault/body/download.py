@@ -18,10 +18,10 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote, unquote, urlsplit, urlunsplit
 
-from ..core import path_checks
 from ..core.errors import InputError, VbnfaultError, shown
-from ..core.user_files import LIMIT_BYTES, MIB, head_of_input, read_input, sha256_of_input
-from ..core.whole_files import own, unwritable, write_whole
+from ..core.files import path_checks
+from ..core.files.user_files import LIMIT_BYTES, MIB, head_of_input, read_input, sha256_of_input
+from ..core.files.whole_files import own, unwritable, write_whole
 from .shape import FILE_TYPES, load_shape
 
 LOCK = "shapes.lock"

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.llvm import backend
+from ..core.process.llvm import backend
 from .geometry import Float64
 from .noise import Float32, noise_key, seed_word
 from .roughness import Roughness, deviogram

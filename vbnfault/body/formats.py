@@ -1,9 +1,9 @@
 """Read the shape formats of small-body science: plate tables, v/f lines, Gaskell's ICQ, VRML and NAIF's DSK.
 
-Each reader here takes a file's bytes and the name for messages (`core.spice` reads DSKs). It returns the mesh as
-stored: vertices float64[n, 3] in the file's unit, and faces int64[m, 3], counted from 0, with all indices in range.
-`shape.check_mesh` then checks whether the mesh bounds a solid. A malformed file raises InputError with the line
-number.
+Each reader here takes a file's bytes and the name for messages (`core.files.spice` reads DSKs). It returns the mesh
+as stored: vertices float64[n, 3] in the file's unit, and faces int64[m, 3], counted from 0, with all indices in
+range. `shape.check_mesh` then checks whether the mesh bounds a solid. A malformed file raises InputError with the
+line number.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import spice
 from ..core.errors import InputError
-from ..core.meshes import fans, joined, numbers_of, read_obj
+from ..core.files import spice
+from ..core.files.meshes import fans, joined, numbers_of, read_obj
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]

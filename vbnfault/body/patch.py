@@ -9,7 +9,7 @@ down to its pixels. Three steps provide it:
 3. `boulders` sets boulders, which are closed meshes of their own, partly into the ground.
 
 The fields of the relief are functions of body-fixed position and seed, so that neighbouring sites see the same
-ground. Built patches are kept on disk (`core.array_files`), because to build one takes many seconds.
+ground. Built patches are kept on disk (`core.files.array_files`), because to build one takes many seconds.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import activity
-from ..core.array_files import ArrayFiles, code_hash
 from ..core.errors import InputError
+from ..core.files.array_files import ArrayFiles, code_hash
+from ..core.process import activity
 from . import scarps
 from .body import Body
 from .boulders import GroundMesh, add_boulders

@@ -14,8 +14,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import meshes, resources, user_files
 from ..core.errors import InputError
+from ..core.files import meshes, resources, user_files
 from . import formats
 from .geometry import Float64, Int32, face_normals_areas, signed_volume
 

@@ -13,8 +13,8 @@ from typing import Annotated
 import typer
 
 from .. import __version__
-from ..core import interrupts, streams
 from ..core.errors import InputError, VbnfaultError
+from ..core.process import interrupts, streams
 
 app = typer.Typer(
     name="vbnfault",

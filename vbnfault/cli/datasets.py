@@ -146,7 +146,7 @@ def render(
     ] = None,
 ) -> None:
     """Render one sample of a scene as EXR, PNG and JSON, equal to the stored sample bit for bit."""
-    from ..core import llvm
+    from ..core.process import llvm
 
     source = options.load(scene)
     blocks = (source.dataset.samples, *(append or ()))
@@ -302,7 +302,7 @@ def view(
     import signal
     import webbrowser
 
-    from ..core.interrupts import interruptible
+    from ..core.process.interrupts import interruptible
     from ..output.viewer import Viewer
     from ..store import open_store
 

@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
-from ..core.environment import MOST_SAMPLES, MOST_THREADS
 from ..core.errors import InputError, shown
-from ..core.path_checks import real
-from ..core.whole_files import unwritable
+from ..core.files.path_checks import real
+from ..core.files.whole_files import unwritable
+from ..core.process.environment import MOST_SAMPLES, MOST_THREADS
 
 if TYPE_CHECKING:
     from ..scene.config import Scene
@@ -240,7 +240,7 @@ def overrides(settings: list[str] | None) -> dict[str, Any]:
 def load_plugins(names: list[str] | None) -> None:
     """Load the plug-ins of `--plugin`; their paths start from the working folder. Raises InputError."""
     from .. import faults
-    from ..core import path_checks
+    from ..core.files import path_checks
 
     faults.load_plugins([path_checks.absolute(n, "--plugin") if n.endswith(".py") else n for n in names or ()])
 

@@ -34,7 +34,7 @@ def list_(
     plugins: PluginOption = None,
 ) -> None:
     """List packaged files, such as scenes and lenses, or faults, effects and reflectances with their keys."""
-    from ..core import resources, toml_files
+    from ..core.files import resources, toml_files
 
     registered = {
         "faults": _list_faults,
@@ -201,7 +201,8 @@ def doctor() -> None:
     import importlib.metadata
     import platform
 
-    from ..core import llvm, resources
+    from ..core.files import resources
+    from ..core.process import llvm
 
     typer.echo(f"{'vbnfault':<15}{__version__}")
     typer.echo(f"{'python':<15}{platform.python_version()} on {platform.platform()}, {os.cpu_count()} cores")

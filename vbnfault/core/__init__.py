@@ -1,1 +1,1 @@
-"""Define what every other package shares: errors, physical quantities, frames, spectra, files."""
+"""Define what every other package shares: errors, physical quantities, frames, spectra, tables, pages."""

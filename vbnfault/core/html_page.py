@@ -16,8 +16,8 @@ import jinja2
 import numpy as np
 from numpy.typing import NDArray
 
-from .images import encoded
-from .whole_files import write_whole
+from .files.images import encoded
+from .files.whole_files import write_whole
 
 _PACKAGE = Path(__file__).parents[1]
 _LOSSLESS_PX, _QUALITY = 160, 88  # smaller images are PNG, others WebP

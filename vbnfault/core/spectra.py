@@ -21,7 +21,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from .resources import data_dir
+from .files.resources import data_dir
 
 PLANCK_J_S = 6.62607015e-34  # SI, exact
 LIGHT_SPEED_M_S = 299792458.0  # SI, exact

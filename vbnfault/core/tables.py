@@ -20,8 +20,8 @@ from typing import Annotated, Any, TypeVar, dataclass_transform
 import pydantic.dataclasses
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from . import path_checks, toml_files
 from .errors import InputError, shown, suggestion
+from .files import path_checks, toml_files
 
 T = TypeVar("T")
 

@@ -22,9 +22,10 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, InstanceOf, Strict, WithJsonSchema
 
 from .. import store as store_module
-from ..core import environment, tables
+from ..core import tables
 from ..core.errors import InputError, VbnfaultError, shown
-from ..core.interrupts import interruptible
+from ..core.process import environment
+from ..core.process.interrupts import interruptible
 from ..store import FaultCounts, Location, Planned, Store, StoreSpec, Url, files_of, located
 from .dask import check_scheduler, run_on_dask
 from .lock import locked, others_at_work, prepared_by_one

@@ -22,8 +22,8 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from ..core.errors import VbnfaultError
-from ..core.whole_files import kind_of as kind_of_error
-from ..core.whole_files import own_folder
+from ..core.files.whole_files import kind_of as kind_of_error
+from ..core.files.whole_files import own_folder
 from ..store import OWN, Files, Location, Url, files_of
 
 _MOST_BYTES = 65536  # of a claim

@@ -23,7 +23,7 @@ from concurrent.futures import CancelledError, ThreadPoolExecutor
 from typing import Any
 
 from ..core.errors import InputError, VbnfaultError
-from ..core.interrupts import Stopped
+from ..core.process.interrupts import Stopped
 from .work import Fatal, Job, Worker, WorkerFactory, describe
 
 # Time limits for addresses where nothing listens, or no scheduler. They are long because the scheduler of a busy

@@ -12,8 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import pipeline, store
-from ..core import environment, file_contents, llvm, tables
+from ..core import tables
 from ..core.errors import InputError, shown
+from ..core.files import file_contents
+from ..core.process import environment, llvm
 from ..core.quantities import Sample
 from ..scene import config, plan
 from ..scene.config import Scene

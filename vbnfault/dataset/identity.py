@@ -24,8 +24,9 @@ from numpy.typing import NDArray
 
 from .. import __version__, pipeline, reflectance, store
 from ..camera import Camera
-from ..core import file_contents, llvm, resources, user_files
 from ..core.errors import InputError, VbnfaultError, in_file
+from ..core.files import file_contents, resources, user_files
+from ..core.process import llvm
 from ..detector import Detector
 from ..faults import Fault, belongs_here, is_packaged, loaded_plugin, plugins_of, registry
 from ..lens import load_lens

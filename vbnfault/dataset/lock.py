@@ -24,7 +24,7 @@ from types import ModuleType
 from typing import Any
 
 from ..core.errors import InputError, VbnfaultError
-from ..core.whole_files import kind_of
+from ..core.files.whole_files import kind_of
 from ..store import Location, Url
 from . import claims
 from .claims import overlap, still_writing, this_process

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from .. import store as store_module
 from ..core.errors import InputError, VbnfaultError, shown
-from ..core.interrupts import check, finishing, interruptible
-from ..core.path_checks import real
+from ..core.files.path_checks import real
+from ..core.process.interrupts import check, finishing, interruptible
 from ..store import Location, SampleDigests, Store, StoreSpec, Url, located, spans
 from . import card
 from .lock import locked

@@ -35,9 +35,9 @@ from collections.abc import Callable, Iterator
 from multiprocessing import connection, resource_tracker
 from typing import Any
 
-from ..core import interrupts, streams
-from ..core.environment import import_path
 from ..core.errors import VbnfaultError
+from ..core.process import interrupts, streams
+from ..core.process.environment import import_path
 from .work import Fatal, Job, WorkerFactory
 
 _SECONDS_TO_STOP = 60.0  # for a worker to write its finished items; a second Ctrl-C ends the wait

@@ -18,8 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import pipeline, store
-from ..core import file_contents, llvm
 from ..core.errors import InputError
+from ..core.files import file_contents
+from ..core.process import llvm
 from ..faults import Fault
 from ..pipeline.rendering import ANGLE_LAYERS
 from ..pipeline.retaken import TRUTH_LAYERS, RetakeSession, StoredView

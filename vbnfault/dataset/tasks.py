@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import store as store_module
-from ..core.environment import release_unused
 from ..core.errors import VbnfaultError
-from ..core.interrupts import check, finishing
+from ..core.process.environment import release_unused
+from ..core.process.interrupts import check, finishing
 from ..core.quantities import Sample
 from ..store import Encoded, Location, Planned, SampleDigests, Store
 from .progress import Progress

@@ -14,9 +14,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
-from ..core import activity
 from ..core.errors import InputChanged, VbnfaultError
-from ..core.interrupts import check
+from ..core.process import activity
+from ..core.process.interrupts import check
 from .progress import Progress
 
 T = TypeVar("T")

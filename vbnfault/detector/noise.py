@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtr, ndtri, pdtr, pdtrik
 
-from ..core.llvm import backend, evaluated, flat
+from ..core.process.llvm import backend, evaluated, flat
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]

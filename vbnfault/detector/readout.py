@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from ..core.errors import InputError
-from ..core.llvm import backend, evaluated, on_device
+from ..core.process.llvm import backend, evaluated, on_device
 from ..core.tables import table_class
 from .noise import normal_field
 

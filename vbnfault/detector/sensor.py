@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field
 
-from ..core import resources, spectra, tables, toml_files
+from ..core import spectra, tables
 from ..core.errors import InputError, shown
+from ..core.files import resources, toml_files
 from ..core.quantities import Architecture
 from ..core.tables import Fraction, table_class
 from .charge import ChargeCloud, TrapSpecies

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import InputError
-from ..core.llvm import backend, evaluated, flat
+from ..core.process.llvm import backend, evaluated, flat
 from ..core.quantities import RGBI, Electrons
 from .efficiency import QuantumEfficiency
 from .interface import LUMINANCE_WEIGHTS, U8, Detector, with_luminance

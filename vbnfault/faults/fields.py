@@ -155,12 +155,12 @@ def path(*, content: str = "data", packaged: str = "", doc: str) -> Any:
 
     A relative path in a scene file starts from the scene file's folder, or from the working folder if nothing lies
     there. The contents of the file, not its path, belong to the identity of a store. Read the file with
-    `core.user_files.read_input`, so that a change during a build is noticed.
+    `core.files.user_files.read_input`, so that a change during a build is noticed.
 
     Parameters
     ----------
     content
-        Kind of file in error messages, a key of `core.user_files.LIMIT_BYTES`.
+        Kind of file in error messages, a key of `core.files.user_files.LIMIT_BYTES`.
     packaged
         Folder of packaged files, such as `scenes/lenses`. A value without a suffix is then the name of one of them.
     """

@@ -14,10 +14,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field
 
-from ..core import resources, tables
+from ..core import tables
 from ..core.errors import InputError, shown
+from ..core.files import resources
+from ..core.files.toml_files import read_toml
 from ..core.tables import Table
-from ..core.toml_files import read_toml
 from .fields import REFERENCE_WIDTH_PX, Severity
 
 if TYPE_CHECKING:

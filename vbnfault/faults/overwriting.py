@@ -25,9 +25,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import user_files
 from ..core.errors import InputError, shown
-from ..core.images import decoded_image
+from ..core.files import user_files
+from ..core.files.images import decoded_image
 from ..core.quantities import CHANNELS, LUMINANCE
 from .context import FaultContext, Params
 from .contract import Fault

@@ -37,10 +37,12 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from ..core import environment, registry, user_files
+from ..core import registry
 from ..core.errors import InputError, VbnfaultError, shown
-from ..core.interrupts import check
-from ..core.resources import PACKAGE
+from ..core.files import user_files
+from ..core.files.resources import PACKAGE
+from ..core.process import environment
+from ..core.process.interrupts import check
 from ..detector import effects
 from . import models
 

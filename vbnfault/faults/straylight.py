@@ -41,11 +41,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import InputError, VbnfaultError
-from ..core.file_contents import cached_with_contents
-from ..core.images import decoded_image
+from ..core.files.file_contents import cached_with_contents
+from ..core.files.images import decoded_image
+from ..core.files.resources import data_dir
+from ..core.files.user_files import read_input
 from ..core.quantities import LUMINANCE
-from ..core.resources import data_dir
-from ..core.user_files import read_input
 from .context import FaultContext, Params
 from .contract import Fault
 from .fields import Interval, Severity, bounds, number, paths, rows

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import file_contents
+from ..core.files import file_contents
 from .adapt import OF_COATINGS, Change, changed, stopped_down
 from .beams import Beams, beams
 from .imaging import Lens, RealLens

@@ -16,10 +16,11 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Discriminator, Field, Tag, model_validator
 
-from ..core import resources, tables, toml_files
+from ..core import tables
 from ..core.errors import InputError, in_file
+from ..core.files import resources, toml_files
+from ..core.files.whole_files import write_whole
 from ..core.tables import Fraction, Table
-from ..core.whole_files import write_whole
 from .coating import Layer
 from .glass import (
     AIR,

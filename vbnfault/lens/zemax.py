@@ -55,8 +55,8 @@ from typing import Any
 
 import numpy as np
 
-from ..core import user_files
 from ..core.errors import InputError, shown
+from ..core.files import user_files
 from ..core.tables import is_number
 from .glass import CLEAR, D_NM, GLASSES, Glass, Transmittance, registered
 from .paraxial import gap, refraction

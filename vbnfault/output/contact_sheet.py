@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import InputError
-from ..core.images import write_png
-from ..core.whole_files import unwritable
+from ..core.files.images import write_png
+from ..core.files.whole_files import unwritable
 from ..store import STRATA, Store, open_store
 
 U8 = NDArray[np.uint8]

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from ..camera import Camera
 from ..core import spectra, tables
 from ..core.errors import InputError, shown
-from ..core.images import srgb8, write_exr, write_png
+from ..core.files.images import srgb8, write_exr, write_png
+from ..core.files.whole_files import write_json
 from ..core.quantities import Electrons
 from ..core.spectra import Bands
-from ..core.whole_files import write_json
 from ..detector import ThreeColourDetector
 from ..faults import FaultContext, registry
 from ..lens import Prescription, ThinLens, load_lens, paraxial_properties

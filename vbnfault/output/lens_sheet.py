@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import isotonic_regression
 
-from ..core.path_checks import real
-from ..core.whole_files import replacing, write_json
+from ..core.files.path_checks import real
+from ..core.files.whole_files import replacing, write_json
 from ..lens import Prescription, open_f_number, paraxial_properties
 from ..lens.rays import real_pupil_diameter_mm, trace
 

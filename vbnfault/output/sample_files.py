@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.images import write_exr, write_png
+from ..core.files.images import write_exr, write_png
+from ..core.files.whole_files import own, unwritable, write_json
 from ..core.quantities import Sample, soft_kind
-from ..core.whole_files import own, unwritable, write_json
 from ..pipeline import masks
 from ..pipeline.labels import strength
 from ..pipeline.record import to_sample

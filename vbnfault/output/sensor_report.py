@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..camera.characterise import Characterisation, Result, Settings, VirtualCamera, characterise, pictures
 from ..core.errors import InputError
-from ..core.whole_files import own, write_json, write_whole
+from ..core.files.whole_files import own, write_json, write_whole
 from ..detector.chain import Device
 from ..detector.sensor import load_sensor
 

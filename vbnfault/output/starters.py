@@ -12,8 +12,8 @@ from typing import Any
 from .. import faults, reflectance
 from ..core import tables
 from ..core.errors import InputError, shown
-from ..core.path_checks import check_folder
-from ..core.whole_files import own, unwritable, write_whole
+from ..core.files.path_checks import check_folder
+from ..core.files.whole_files import own, unwritable, write_whole
 from ..detector import Sensor, effects
 from ..lens.prescription_file import PrescriptionFile
 from ..scene import config

@@ -14,9 +14,10 @@ import numpy as np
 from ..body import Body, Fractured, Patch, PatchSpec, Site, Sites, cached_patch, choose_sites
 from ..body.refine import GROWTH_POWER
 from ..camera import Camera
-from ..core import activity, tables
-from ..core.environment import MOST_THREADS, share_arenas
+from ..core import tables
 from ..core.errors import InputError, in_file, shown, under_key
+from ..core.process import activity
+from ..core.process.environment import MOST_THREADS, share_arenas
 from ..core.quantities import Sample
 from ..scene import config, plan
 from ..scene.config import Scene, configure_faults

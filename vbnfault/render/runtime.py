@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import llvm
+from ..core.process import llvm
 
 llvm.prepare()
 

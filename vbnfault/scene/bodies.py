@@ -10,8 +10,9 @@ from typing import Any
 
 from pydantic import Field
 
-from ..core import resources, tables, toml_files
+from ..core import tables
 from ..core.errors import InputError, shown
+from ..core.files import resources, toml_files
 from ..core.tables import Table
 
 # A scene that leaves out `body.name` has this body's values, but Lambert's photometry.

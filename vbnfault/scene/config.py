@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field, model_validator
 
-from ..core import path_checks, resources, tables, toml_files
+from ..core import tables
 from ..core.errors import InputError, in_file, shown, under_key
+from ..core.files import path_checks, resources, toml_files
 from ..core.quantities import SOFT_KINDS
 from ..core.tables import Table
 from ..reflectance import is_packaged

@@ -19,8 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from ..core import file_contents, tables, user_files
+from ..core import tables
 from ..core.errors import InputError, shown, under_key
+from ..core.files import file_contents, user_files
 from ..core.tables import Table
 
 if TYPE_CHECKING:

@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields
 from typing import Any
 
-from ..core.environment import MOST_SAMPLES
 from ..core.errors import InputError, shown, without_middle
+from ..core.process.environment import MOST_SAMPLES
 
 # Dotted keys of the root attributes that are tables wherever they are present; * stands for every key of a table.
 _TABLES = (

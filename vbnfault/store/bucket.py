@@ -26,7 +26,7 @@ from typing import Any
 from urllib.parse import unquote, urlsplit
 
 from ..core.errors import InputError, VbnfaultError, shown
-from ..core.path_checks import path_of
+from ..core.files.path_checks import path_of
 from .disk import Disk, Misplaced
 
 SCHEMES = ("s3", "s3a", "gs", "az", "azure", "adl", "abfs", "abfss")

@@ -15,7 +15,7 @@ import google_crc32c
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import environment
+from ..core.process import environment
 from ..core.quantities import Sample
 from .arrays import SCALARS
 from .compressors import compressor

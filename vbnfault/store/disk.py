@@ -23,8 +23,8 @@ from pathlib import Path
 from typing import TypeVar
 
 from ..core.errors import InputError, VbnfaultError
-from ..core.whole_files import flush, flush_folder, kind_of, rename
-from ..core.whole_files import remove as remove_whole
+from ..core.files.whole_files import flush, flush_folder, kind_of, rename
+from ..core.files.whole_files import remove as remove_whole
 
 PARTIAL = ".partial"
 # Number of parallel flushes. Measured on ext4, the 42 files and 90 folders of a shard take 45-600 ms one after the

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..core.errors import InputError, VbnfaultError
-from ..core.path_checks import real
+from ..core.files.path_checks import real
+from ..core.files.whole_files import kind_of
 from ..core.quantities import Sample
-from ..core.whole_files import kind_of
 from .bucket import Files, Location, Url, files_of, located
 from .codec import Encoded, encode
 from .layout import (

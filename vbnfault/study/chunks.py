@@ -14,10 +14,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..core import file_contents
 from ..core.errors import InputError
-from ..core.interrupts import finishing
-from ..core.whole_files import kind_of
+from ..core.files import file_contents
+from ..core.files.whole_files import kind_of
+from ..core.process.interrupts import finishing
 from ..dataset.progress import Progress
 from ..dataset.work import ItemsFailed, Job, Lazy, Tick, attempt
 from . import results

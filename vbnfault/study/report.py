@@ -17,9 +17,9 @@ from markupsafe import Markup, escape
 from numpy.typing import NDArray
 
 from ..core.figures import formula, inline_svg, png_bytes, svg_text
+from ..core.files.images import write_png
+from ..core.files.whole_files import own, own_folder, write_whole
 from ..core.html_page import image_url, number_text, with_minus, write_page
-from ..core.images import write_png
-from ..core.whole_files import own, own_folder, write_whole
 from .plots import drawings, ranking_rows
 from .spec import Evaluation
 from .summaries import DUMMY, StudyResults

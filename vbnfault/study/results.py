@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..core.errors import InputError
-from ..core.whole_files import replacing
+from ..core.files.whole_files import replacing
 from ..store import is_sealed, sealed
 from .designs import Design
 from .distributions import Categorical

@@ -23,10 +23,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .. import __version__
-from ..core import file_contents, tables, toml_files, whole_files
+from ..core import tables
 from ..core.errors import InputError, VbnfaultError, shown
-from ..core.interrupts import interruptible
-from ..core.path_checks import check_folder, path_of
+from ..core.files import file_contents, toml_files, whole_files
+from ..core.files.path_checks import check_folder, path_of
+from ..core.process.interrupts import interruptible
 from ..dataset import BuildOptions
 from ..dataset.build import do_tasks
 from ..dataset.dask import check_scheduler

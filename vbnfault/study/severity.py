@@ -20,11 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import isotonic_regression
 
-from ..core import toml_files
 from ..core.errors import InputError, VbnfaultError, shown
-from ..core.interrupts import interruptible
+from ..core.files import toml_files
+from ..core.files.whole_files import write_whole
+from ..core.process.interrupts import interruptible
 from ..core.tables import did_you_mean
-from ..core.whole_files import write_whole
 from ..dataset import BuildOptions
 from ..dataset.build import do_tasks
 from ..dataset.progress import Progress

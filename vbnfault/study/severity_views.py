@@ -16,7 +16,7 @@ import numpy as np
 
 from .. import navigation
 from ..core.errors import VbnfaultError
-from ..core.interrupts import check
+from ..core.process.interrupts import check
 from ..dataset.progress import Progress
 from ..dataset.work import Fatal, Job, Tick
 from ..faults import Fault, Severity, from_dict, registry

@@ -13,8 +13,9 @@ from typing import Annotated, Any, Literal, Protocol
 
 from pydantic import AfterValidator, ConfigDict, Field, model_validator
 
-from ..core import path_checks, resources, tables, toml_files
+from ..core import tables
 from ..core.errors import shown
+from ..core.files import path_checks, resources, toml_files
 from ..core.tables import Table, each_once
 from .distributions import Factor
 

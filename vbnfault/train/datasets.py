@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import Dataset, IterableDataset, Sampler, default_collate, get_worker_info
 
-from ..core import environment
 from ..core.errors import InputError, shown
+from ..core.process import environment
 from ..store import open_store
 from .order import Order, checked_epoch
 from .reader import SampleReader

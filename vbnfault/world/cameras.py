@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from ..camera import Camera, focal_length_mm
-from ..core import file_contents
 from ..core.errors import InputError, under_key
+from ..core.files import file_contents
 from ..detector import Detector, MosaicDetector, Sensor, ThreeColourDetector, amplified, binned, load_sensor
 from ..lens import (
     Halo,

@@ -6,8 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..body import Body, Site, Sites, site_at
-from ..core import file_contents, frames, spectra, spice
+from ..core import frames, spectra
 from ..core.errors import under_key
+from ..core.files import file_contents, spice
 from ..render.description import Sunlight
 from ..scene.config import Scene
 from ..scene.surroundings import OrbitTable, SpiceTable, SunTable

@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 from scipy.special import ndtr
 
-from ..core import file_contents, resources, spectra, user_files
+from ..core import spectra
+from ..core.files import file_contents, resources, user_files
 from ..core.frames import J2000_JD
 from ..core.quantities import Radiance
 

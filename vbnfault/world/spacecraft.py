@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ..core import meshes, resources, user_files
 from ..core.errors import InputError
-from ..core.meshes import MeshPart
+from ..core.files import meshes, resources, user_files
+from ..core.files.meshes import MeshPart
 
 F64 = NDArray[np.float64]
 Unit = Literal["m", "cm", "mm"]

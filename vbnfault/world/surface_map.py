@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core import file_contents, user_files
 from ..core.errors import InputError, under_key
-from ..core.images import decoded_image
+from ..core.files import file_contents, user_files
+from ..core.files.images import decoded_image
 from ..scene.target import AlbedoMapTable
 
 Float32 = NDArray[np.float32]

@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.llvm import backend
+from ...core.process.llvm import backend
 from ...core.spectra import Bands
 from ..coating import Layer, reflect_transmit
 from ..paraxial import along, mirrors, paraxial_properties

@@ -29,9 +29,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core import activity
-from ...core.array_files import ArrayFiles, code_hash
-from ...core.llvm import backend
+from ...core.files.array_files import ArrayFiles, code_hash
+from ...core.process import activity
+from ...core.process.llvm import backend
 from ...core.spectra import Bands
 from ..prescription import Prescription
 from .bundles import Rays, Spots

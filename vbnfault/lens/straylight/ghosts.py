@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from ...core.llvm import backend
+from ...core.process.llvm import backend
 from ...core.spectra import Bands, hat_weights
 from ..paraxial import paraxial_properties
 from .bundles import Rays, Spots, Tracer, name_of

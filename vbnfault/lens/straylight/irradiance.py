@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.llvm import backend
+from ...core.process.llvm import backend
 from ...core.spectra import Bands
 from ..glass import D_NM
 from ..paraxial import along

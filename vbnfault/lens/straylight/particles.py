@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import j1
 
-from ...core.array_files import ArrayFiles, code_hash
+from ...core.files.array_files import ArrayFiles, code_hash
 from ..coating import reflect_transmit
 from ..glass import D_NM, RANGE_NM
 

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.llvm import backend
+from ...core.process.llvm import backend
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.llvm import backend
+from ...core.process.llvm import backend
 from .bundles import Spots, lattice_places, rounded
 from .pyramid import LEVELS, MARGIN, Canvas, summed
 

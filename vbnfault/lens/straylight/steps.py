@@ -33,7 +33,7 @@ from typing import Any
 
 import numpy as np
 
-from ...core.llvm import backend
+from ...core.process.llvm import backend
 from ..prescription import Surface
 
 _LOST, _FAR = -1e6, -1e4  # margin of rays that do not reach the sensor, and the smallest margin of other rays

@@ -21,8 +21,8 @@ from pathlib import Path
 from typing import Any
 
 from ...core.errors import InputError
-from ...core.path_checks import check_folder
-from ...core.whole_files import remove, replacing
+from ...core.files.path_checks import check_folder
+from ...core.files.whole_files import remove, replacing
 from ...store import disk, is_sealed, sealed
 
 STATE = "export.json"

@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 
 from ... import __version__
 from ...core.errors import InputError, VbnfaultError, shown
+from ...core.files.path_checks import path_of, real
+from ...core.files.whole_files import plain
 from ...core.html_page import rendered
-from ...core.path_checks import path_of, real
 from ...core.quantities import Sample
 from ...core.tables import did_you_mean
-from ...core.whole_files import plain
 from ...dataset.card import described, to_json
 from ...dataset.croissant import columns, croissant, image_records
 from ...dataset.lock import locked

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from ...core import tables
 from ...core.errors import InputError, VbnfaultError, shown
+from ...core.files.path_checks import path_of
+from ...core.files.whole_files import unwritable
 from ...core.html_page import data_url, image_url, write_page
-from ...core.path_checks import path_of
 from ...core.quantities import Sample
-from ...core.whole_files import unwritable
 from ...dataset.statistics import Statistics, statistics
 from ...store import STRATA, Store, open_store
 from ..contact_sheet import COLOURS, abbreviations, resized_mask, spread

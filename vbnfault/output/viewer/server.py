@@ -23,9 +23,9 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core import images
 from ...core.errors import InputError, VbnfaultError
-from ...core.whole_files import plain
+from ...core.files import images
+from ...core.files.whole_files import plain
 from ...store import SCALARS, SEMANTIC, SPLITS, STRATA, ShardReader, Store, drawn_table
 from ..contact_sheet import COLOURS, abbreviations, overlay, resized, resized_mask
 

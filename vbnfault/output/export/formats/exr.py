@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ....core.images import write_exr
+from ....core.files.images import write_exr
 from ....core.quantities import CHANNELS, Sample
 from ....store import Store, StoreSpec
 from ..contract import Entry, ExportPart, Format, number_text

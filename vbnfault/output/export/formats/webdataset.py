@@ -11,8 +11,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from ....core.files.whole_files import plain
 from ....core.quantities import Sample
-from ....core.whole_files import plain
 from ....store import Store, StoreSpec
 from ..contract import Entry, ExportPart, Format, number_text, png_files
 from ..folder import Folder

@@ -6,7 +6,7 @@ import os
 import stat
 from pathlib import Path
 
-from .errors import InputError, shown
+from ..errors import InputError, shown
 
 _LONGEST_NAME_BYTES = 255
 _LONGEST_PATH_BYTES = 4095

@@ -10,7 +10,7 @@ from typing import Any
 
 import tomli_w
 
-from .errors import InputError, shown
+from ..errors import InputError, shown
 from .path_checks import shown_path
 from .user_files import read_input
 

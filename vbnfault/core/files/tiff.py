@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import InputError
+from ..errors import InputError
 
 if TYPE_CHECKING:
     from tifffile import TiffFile, TiffPage

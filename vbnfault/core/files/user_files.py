@@ -14,8 +14,8 @@ from collections.abc import Sequence
 from io import BufferedReader
 from pathlib import Path
 
+from ..errors import InputError
 from . import path_checks
-from .errors import InputError
 from .file_contents import changed, check_contents, was_read
 
 MIB = 1 << 20

@@ -13,7 +13,7 @@ from functools import lru_cache, wraps
 from pathlib import Path
 from typing import Any, TypeVar
 
-from .errors import InputChanged
+from ..errors import InputChanged
 from .resources import PACKAGE
 
 _R = TypeVar("_R")

@@ -8,8 +8,8 @@ import os
 import sys
 from pathlib import Path
 
-from .errors import InputError, shown
-from .resources import PACKAGE
+from ..errors import InputError, shown
+from ..files.resources import PACKAGE
 
 # The most threads or processes that an environment variable or option may ask for: more than any machine has.
 MOST_THREADS = 1024

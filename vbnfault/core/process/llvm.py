@@ -25,7 +25,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import VbnfaultError
+from ..errors import VbnfaultError
 
 T = TypeVar("T", bound=np.generic)
 

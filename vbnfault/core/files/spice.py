@@ -38,9 +38,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from . import environment, path_checks, user_files
-from .errors import InputError
-from .frames import J2000_JD
+from ..errors import InputError
+from ..frames import J2000_JD
+from ..process import environment
+from . import path_checks, user_files
 
 F64 = NDArray[np.float64]
 
@@ -336,7 +337,7 @@ class _Reader:
             [
                 sys.executable,
                 "-c",
-                f"import sys; sys.path[:] = {paths!r}; from vbnfault.core import spice; spice.serve()",
+                f"import sys; sys.path[:] = {paths!r}; from vbnfault.core.files import spice; spice.serve()",
             ],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,

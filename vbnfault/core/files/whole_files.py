@@ -20,7 +20,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from .errors import InputError, VbnfaultError
+from ..errors import InputError, VbnfaultError
 from .path_checks import real
 
 # What ends a run although its path is right; every other error of the system means that the path cannot be used.

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .errors import InputError, VbnfaultError
+from ..errors import InputError, VbnfaultError
 from .path_checks import real
 from .tiff import HEADS as TIFF_HEADS
 from .tiff import check_values, tiff_pixels

@@ -21,8 +21,8 @@ from urllib.parse import unquote
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import InputError, shown
 from . import path_checks, user_files
-from .errors import InputError, shown
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]

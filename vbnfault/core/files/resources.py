@@ -5,11 +5,11 @@ from __future__ import annotations
 import stat
 from pathlib import Path
 
-from .errors import InputError, suggestion
+from ..errors import InputError, suggestion
 from .path_checks import check_path, file_status, kind_of, path_of, shown_path, why_absent
 
 # Folder of the package vbnfault.
-PACKAGE = Path(__file__).resolve().parents[1]
+PACKAGE = Path(__file__).resolve().parents[2]
 _SINGULAR = {"scenes": "scene", "lenses": "lens", "detectors": "detector", "studies": "study"}
 
 

@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 import platformdirs
 
-from .errors import InputError
+from ..errors import InputError
 
 Arrays = dict[str, Any]
 
