@@ -68,7 +68,10 @@ def test_a_shape_is_scaled_about_its_origin_to_the_volume_that_is_asked_for() ->
 
 
 def test_a_shape_file_is_needed() -> None:
-    with pytest.raises(vbnfault.InputError, match=r"sharpen = 'auto': needs a shape file"):
-        vbnfault.load_scene("paper67p", {"body.sharpen": "auto"})
+    with pytest.raises(vbnfault.InputError, match=r"sharpen = 1.5: needs a shape file"):
+        vbnfault.load_scene("paper67p", {"body.sharpen": 1.5})
+    plain = vbnfault.Session(vbnfault.load_scene("paper67p")).body
+    auto = vbnfault.Session(vbnfault.load_scene("paper67p", {"body.sharpen": "auto"})).body
+    assert auto.content_hash == plain.content_hash
     with pytest.raises(vbnfault.InputError, match=r"sharpen"):
         vbnfault.load_scene("paper67p", {"body.sharpen": 5.0, "body.shape": "x.obj"})

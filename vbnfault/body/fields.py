@@ -266,6 +266,7 @@ _FADE = (1.6, 2.8)
 
 _CRATER_WIDTHS_M = (72.0, 36.0, 18.0, 9.0)  # cells; diameters are a third to two thirds of their width
 _CRATER_SHARE_PER_DENSITY = 1534e-6  # fraction of the cells, per crater of 10 m or more in a square kilometre
+_UNITS_M = ((260.0, 0.35), (110.0, 0.35), (45.0, 0.3))  # size of units of the ground, and how their cover differs
 _CLOD_CELLS_M = (2.1, 1.2, 0.7)
 _CRACK_DEPTH = 0.30  # of the cracks between blocks, per unit of the blocks' height
 
@@ -325,6 +326,16 @@ class Octaves:
     def amplitude(self, wavelength_m: float) -> np.float32:
         """Return the factor on an octave of standard deviation 1 that makes all octaves follow the law."""
         return np.float32(self._unit * float(self._roughness.deviation_at(wavelength_m)))
+
+    def dust_cover(self, above_m: Float32, border_m: float) -> Float32:
+        """Return the fraction of each facet that dust covers, float32[n], where it reaches `above_m` over the rock.
+
+        Relief below the facets lets rock show through thin dust, so the cover grows over its height, or over
+        `border_m` where that is larger: over metres of ground and not at a line. Units of 30 to 300 m differ.
+        """
+        hidden_m = self._unit * self._roughness.deviation_at(_FADE[1] * self.facet_m)
+        unit = sum(np.float32(a) * self.gradient(w, 680 + k) for k, (w, a) in enumerate(_UNITS_M))
+        return smooth_step(-1.0, 1.6, above_m / np.hypot(border_m, hidden_m) + unit)
 
     def wavelengths(self, longest_m: float, shortest_m: float) -> list[tuple[int, float]]:
         """Return the octaves in (shortest, longest] as (number, wavelength); the patch's longest is number 0."""

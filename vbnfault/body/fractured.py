@@ -222,11 +222,7 @@ def surface(noise: Octaves, rocks: Bedrock, broad: Float32, lie: Lie, spec: Frac
     dust = floor + depth + grit
     strewn = 0.1 + 0.9 * smooth_step(-0.4, 1.4, noise.gradient(13.0, 170) + 0.6 * noise.gradient(41.0, 171))
     dust = dust + noise.clods() * np.maximum(strewn, lie.talus)
-    above = dust - rock
-    cover = smooth_step(-0.5 * spec.border_m, spec.border_m, above) * rests
-    # thin dust varies the albedo softly
-    stain = 0.5 + 0.3 * noise.gradient(61.0, 680) + 0.2 * noise.gradient(17.0, 681)
-    cover += np.clip(stain, 0, 1) * (0.25 * rests * (1 - cover) - 0.15 * cover)
+    cover = noise.dust_cover(dust - rock, 0.5 * spec.border_m) * rests
     soft = spec.border_m * (0.2 + 0.8 * basin)
     top = np.asarray(smooth_max(rock, dust, soft), dtype=np.float32)
     return top, np.asarray(cover, dtype=np.float32)

@@ -28,6 +28,7 @@ from .scarps import form
 from .sites import Site
 from .spec import PatchSpec
 
+_COVER_M = 0.5  # height over which the cover of dust grows
 _SHARED_M = 20.0  # longer octaves raise dust and rock alike
 LONGEST_EDGES = 1.0  # wavelength of the longest octave, in mean edges of the model
 _REGION_EDGES = 4.5  # size of the regions, in longest octaves
@@ -44,6 +45,9 @@ _CASCADE, _CASCADE_STEPS, _CASCADE_LONGEST = 0.65, 3, 4.0
 _TERRACE_M = (5.5, 2.6)  # height of a step, and of the smaller steps between them
 # (cell width, height per unit of block noise) of the broken ground, in metres
 _BLOCKS_M = ((17.0, 1.9), (6.0, 0.95), (2.2, 0.40), (0.85, 0.14))
+# (rise, fraction of it that is gathered) of the layers whose edges are scarps along the contours of the ground
+_CONTOURS_M = ((45.0, 0.9), (21.0, 0.8))
+_CONTOUR_FACETS = 2.5  # least width of a scarp: a narrower one has an edge like a saw
 _STRATA_M = ((9.0, 1.3), (3.1, 0.55), (1.1, 0.20))  # thickness of a layer, and how far a hard layer stands out
 
 _DUST_LEAVES_DEG = (27.0, 40.0)  # dust lies on slopes below the first, and has slid off slopes above the second
@@ -154,7 +158,10 @@ def add_relief(
             model_slope_deg=model_slope, slope_deg=slope, talus=talus[order], elevation_m=elevation[order]
         )
         height, dust = fractured.surface(noise, rock, broad, lie, spec.fractured)
-    height_m = _slumped(points, faces, scale * (height * shown)[rank].astype(np.float64))
+    total = scale * (height * shown)[rank].astype(np.float64)
+    if spec.contour_scarps:
+        total += spec.contour_scarps * _contour_scarps(noise, elevation[order], model_slope)[rank]
+    height_m = _slumped(points, faces, total)
     dust = dust[rank]
     if spec.fractured is not None:
         slope = _slope_deg(points + height_m[:, None] * normals, normals, faces, up)
@@ -229,6 +236,32 @@ def _terraced(noise: Octaves, swell: Float32) -> Float32:
     return out
 
 
+def _contour_scarps(noise: Octaves, elevation_m: Float64, slope_deg: Float32) -> Float32:
+    """Return what gathers the rise of the ground into scarps along its contours, metres along the vertical.
+
+    Layers crop out along contours of the elevation, which random fields bend. A scarp ends where its layer is soft,
+    and lower layers are weaker where a higher one has left debris.
+    """
+    total = np.zeros_like(slope_deg)
+    tangent = np.hypot(np.tan(np.radians(np.minimum(slope_deg, 60.0))), np.float32(0.3))
+    for number, (rise, gathered) in enumerate(_CONTOURS_M):
+        if not noise.shown(2 * rise).any():
+            continue
+        bend = noise.gradient(14 * rise, 230 + 10 * number) + 0.5 * noise.gradient(5 * rise, 231 + 10 * number)
+        bend += 0.18 * noise.gradient(3 * rise, 232 + 10 * number) + 0.07 * noise.gradient(rise, 235 + 10 * number)
+        u = elevation_m / rise + bend
+        tread = np.floor(u)
+        inside = (u - tread).astype(np.float32)
+        hard = np.random.Generator(np.random.Philox(910 + number)).random(4096).astype(np.float32)
+        where = noise.gradient(20 * rise, 233 + 10 * number) + 0.6 * noise.gradient(7 * rise, 234 + 10 * number)
+        where = 0.6 * where + 5.0 * hard[tread.astype(np.int64) & 4095] - 3.9
+        wide = np.maximum(0.6 * rise, _CONTOUR_FACETS * noise.facet_m) * tangent / rise
+        stair = smooth_step(0, 1, 1 - (1 - inside) / np.clip(wide, 0.05, 0.95).astype(np.float32))
+        kept = np.float32(gathered * rise) * smooth_step(0.2, 1.1, where) * noise.shown(2 * rise)
+        total += kept * (stair - inside)
+    return total
+
+
 def _surface(
     noise: Octaves, broad: Float32, slope: Float32, talus: Float32, elevation: Float64
 ) -> tuple[Float32, Float32]:
@@ -269,9 +302,8 @@ def _surface(
     dust = broad + depth + grit + 0.05 * ripples * noise.gradient(4.5, 133)
     strewn = 0.15 + 0.85 * smooth_step(-0.4, 1.4, noise.gradient(13.0, 170) + 0.6 * noise.gradient(41.0, 171))
     dust = dust + noise.clods() * np.maximum(strewn, talus)
-    cover = smooth_step(-0.12, 0.30, dust - rock)
     # Stones and lumps of the ground below show through thin dust.
-    return smooth_max(rock, dust, 0.30), cover
+    return smooth_max(rock, dust, 0.30), noise.dust_cover(dust - rock, _COVER_M)
 
 
 def _strata(noise: Octaves, elevation: Float64) -> Float32:

@@ -69,6 +69,8 @@ class PatchSpec:
         Exponent of the roughness below the model's facets; None: that measured on the model.
     scarps
         Fraction of the way in which the slopes of the model are gathered into scarps.
+    contour_scarps
+        Factor on scarps along the contours of the ground, where layers crop out; 0: none.
     intermittency
         How much more relief lies on rough and steep ground than on smooth plains; 0: evenly.
     angularity
@@ -90,6 +92,7 @@ class PatchSpec:
     craters_per_km2: float = 60.0
     hurst: float | None = None
     scarps: float = 0.0
+    contour_scarps: float = 0.0
     intermittency: float = 0.0
     angularity: float = 0.0
     fractured: Fractured | None = None

@@ -152,9 +152,11 @@ class Device:
         """Return the black level in DN: the bias and the mean dark signal of the exposure.
 
         A real camera measures this level in its covered pixels. The dark signal of the charge transfer is not
-        included, because it differs from row to row (`row_black_dn`).
+        included, because it differs from row to row (`row_black_dn`). With `Sensor.black` "bias" it is the bias.
         """
         readout = self.sensor.readout
+        if self.sensor.black == "bias":
+            return float(readout.bias_dn)
         return readout.bias_dn + readout.system_gain_dn_per_e * float(self.dark_rate_e_s.mean()) * exposure_s
 
     @cached_property
@@ -163,7 +165,7 @@ class Device:
 
         None if this is at most `_LEAST_BLACK_DN` in every row.
         """
-        if self.transfer_dark_e is None:
+        if self.transfer_dark_e is None or self.sensor.black == "bias":
             return None
         rows = np.median(self.transfer_dark_e, axis=1, keepdims=True) * self.sensor.readout.system_gain_dn_per_e
         return rows.astype(np.float32) if rows.max() > _LEAST_BLACK_DN else None
@@ -243,18 +245,26 @@ class Device:
             noise=noise_dn,
             clipped=mosaic >= self.saturated_dn,
         )
-        # OpenCV multiplies with 64 bits, rounds to even and saturates at 0 and 255 as it converts
         above = cv2.subtract(linear, (black, black, black, 0.0))
-        rgb = np.asarray(cv2.multiply(above, (red, green, blue, 0.0), dtype=cv2.CV_8U))
+        rgb = self._levels(above, (red, green, blue, 0.0))
         out = np.empty((*raw.shape, 4), dtype=np.uint8)
         if "W" in sensor.pattern.channels:
             unfiltered = interpolate(mosaic, sensor.pattern, "W")
-            intensity = cv2.multiply(cv2.subtract(unfiltered, black), scale["W"], dtype=cv2.CV_8U)
+            intensity = self._levels(cv2.subtract(unfiltered, black), scale["W"])
         else:
             intensity = luminance(rgb)
         intensity = intensity.reshape(*raw.shape, 1)
         cv2.mixChannels([rgb, intensity], [out], [0, 0, 1, 1, 2, 2, 3, 3])
         return RGBI(array=out)
+
+    def _levels(self, above: Any, scale: Any) -> NDArray[np.uint8]:
+        """Return the 8 bit levels of DN above black times a factor, or one of each channel, stretched."""
+        exponent = self.sensor.stretch
+        if exponent == 1:
+            # OpenCV multiplies with 64 bits, rounds to even and saturates at 0 and 255 as it converts
+            return np.asarray(cv2.multiply(above, scale, dtype=cv2.CV_8U))
+        fraction = np.clip(np.asarray(cv2.multiply(above, scale)) / np.float32(255), 0, 1)
+        return np.rint(255 * fraction ** np.float32(exponent)).astype(np.uint8)
 
     @property
     def white_balance(self) -> NDArray[np.float32]:

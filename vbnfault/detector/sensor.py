@@ -128,6 +128,15 @@ class Sensor:
     correct_defects: bool = Field(
         default=False, description="whether known defects are replaced before demosaicing"
     )
+    stretch: float = Field(
+        default=1.0,
+        ge=0.3,
+        le=1,
+        description="exponent of the 8 bit levels: 255 times this power of the fraction of white; 0.5: square root",
+    )
+    black: Literal["dark", "bias"] = Field(
+        default="dark", description="what the 8 bit image shows as 0: bias and mean dark signal, or the bias alone"
+    )
     individual: IndividualSpec = Field(
         default_factory=IndividualSpec, description="how devices of this type differ"
     )

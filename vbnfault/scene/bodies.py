@@ -45,6 +45,9 @@ class BodyFile(Table):
     geometric_albedo: float = Field(gt=0, le=1, description="in V or near 550 nm")
     body: dict[str, Any] = Field(description="defaults of the scene's table [body]")
     orbit: dict[str, Any] | None = Field(None, description="default of the scene's table [orbit]")
+    patch: dict[str, Any] = Field(
+        default_factory=dict, description="its ground: defaults of the scene's table [patch], with their sources"
+    )
     spice: dict[str, Any] = Field(default_factory=dict, description="defaults of the scene's table [spice]")
     shape_file: ShapeFile | None = Field(None, description="a published shape model")
 
@@ -89,6 +92,7 @@ def with_named_body(table: Mapping[str, Any], *, source: str) -> Mapping[str, An
     """
     given = table.get("body")
     name = given.get("name") if isinstance(given, Mapping) else None
+    table = _with_ground(table, name)
     if not isinstance(name, str) or not isinstance(given, Mapping) or name == packaged_bodies()[DEFAULT].name:
         return table
     body_file = named_body(name)
@@ -108,6 +112,17 @@ def with_named_body(table: Mapping[str, Any], *, source: str) -> Mapping[str, An
     if body_file.spice and isinstance(spice, Mapping):
         filled["spice"] = {**body_file.spice, **spice}
     return filled
+
+
+def _with_ground(table: Mapping[str, Any], name: Any) -> Mapping[str, Any]:
+    """Return a scene in which the ground of a packaged body fills the keys of [patch] that it leaves out.
+
+    The body is the one that `patch.preset` names, or else the one that `body.name` does.
+    """
+    patch = table.get("patch", {})
+    preset = patch.get("preset", name) if isinstance(patch, Mapping) else None
+    ground = named_body(preset) if isinstance(preset, str) else None
+    return table if ground is None or not ground.patch else {**table, "patch": {**ground.patch, **patch}}
 
 
 def _filled(given: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:

@@ -27,7 +27,8 @@ OF_THE_DETECTOR = (
     "architectures",
 )
 
-
+# Keys that only a camera with a named detector has.
+OF_A_DETECTOR = ("individuals", "detector_temperature_K", "stretch", "black")
 # Keys of a sensor file that users expect under [camera].
 OF_A_SENSOR_FILE = (
     "architecture",
@@ -129,6 +130,18 @@ class CameraTable(Table):
         "are as many as splits",
     )
     detector_temperature_K: float | None = Field(None, ge=100, le=400, description="default: the detector's own")
+    stretch: float | None = Field(
+        None,
+        ge=0.3,
+        le=1,
+        description="of the detector's 8 bit image: exponent of the fraction of white, 0.5 for the square root "
+        "that published flight images often have; default: the detector's own, 1 of the packaged ones",
+    )
+    black: Literal["dark", "bias"] | None = Field(
+        None,
+        description="what the detector's 8 bit image shows as 0: bias and mean dark signal, or the bias alone, so "
+        "that the noise of the dark sky is not cut; default: the detector's own, dark of the packaged ones",
+    )
     binning: int = Field(
         1,
         ge=1,
@@ -247,7 +260,7 @@ class CameraTable(Table):
             value = getattr(self, key)
             if not self.lens and value not in ("", "paraxial"):
                 raise ValueError(f"{key} = {value!r}: needs lens")
-        for key in OF_THE_DETECTOR if self.detector else ("individuals", "detector_temperature_K"):
+        for key in OF_THE_DETECTOR if self.detector else OF_A_DETECTOR:
             if getattr(self, key) != CameraTable.model_fields[key].default:
                 why = "the detector has its own; leave one out" if self.detector else "needs detector"
                 raise ValueError(f"{key} = {getattr(self, key)!r}: {why}")

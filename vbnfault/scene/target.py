@@ -11,6 +11,7 @@ from ..core import spectra
 from ..core.tables import Table, pair_within
 from ..reflectance import AnyReflectance
 from ..reflectance.disc import Lambert
+from .bodies import named_body, packaged_bodies
 
 # The most rows of a spectrum or of Hapke's parameters.
 _MOST_ROWS = 10_000
@@ -117,7 +118,8 @@ class BodyTable(Table):
     sharpen: Literal["auto"] | Annotated[float, Field(ge=0, le=4)] = Field(
         0.0,
         description="restores the relief that a smoothed shape file has lost near its facets: the gain of its "
-        "shortest wavelengths; 'auto': as far as its roughness at longer ones asks for; 0: the file as it is",
+        "shortest wavelengths; 'auto': as far as its roughness at longer ones asks for, and other shapes as they "
+        "are; 0: the file as it is",
     )
     volume_km3: float | None = Field(
         None,
@@ -157,7 +159,7 @@ class BodyTable(Table):
 
     @model_validator(mode="after")
     def _of_a_mesh(self) -> BodyTable:
-        if self.sharpen and self.shape in ("embedded", "ellipsoid"):
+        if self.sharpen not in (0, "auto") and self.shape in ("embedded", "ellipsoid"):
             raise ValueError(f"sharpen = {self.sharpen!r}: needs a shape file, not shape = {self.shape!r}")
         if self.volume_km3 is not None and self.shape == "ellipsoid":
             raise ValueError(
@@ -203,6 +205,11 @@ class FracturedTable(Table):
 class PatchTable(Table):
     """Set how far and how finely the terrain around a site is refined."""
 
+    preset: str = Field(
+        "",
+        description="a packaged body (`vbnfault list bodies`), whose ground gives the keys of [patch] that are "
+        "left out; default: that of the short name in body.name; 'none': no body's",
+    )
     facet_m: float = Field(0.12, ge=0.05, le=1e6, description="edge length aimed at within radius_m of the site")
     facet_px: float = Field(
         1.0, ge=0.25, le=8, description="for poses of a table: edge length in pixels of the nearest ground in view"
@@ -217,6 +224,9 @@ class PatchTable(Table):
     )
     scarps: float = Field(
         0.0, ge=0, le=1, description="fraction of the way in which slopes of the model are gathered into scarps"
+    )
+    contour_scarps: float = Field(
+        0.0, ge=0, le=3, description="factor on scarps along contours of the ground, where layers crop out; 0: none"
     )
     intermittency: float = Field(
         0.0,
@@ -238,3 +248,10 @@ class PatchTable(Table):
     fractured: FracturedTable | None = Field(
         None, description="layered and jointed rock in place of rounded relief"
     )
+
+    @model_validator(mode="after")
+    def _known(self) -> PatchTable:
+        if self.preset not in ("", "none") and named_body(self.preset) is None:
+            known = ", ".join(packaged_bodies())
+            raise ValueError(f"preset = {self.preset!r}: must be 'none' or one of {known}")
+        return self

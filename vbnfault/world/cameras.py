@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -71,12 +72,14 @@ def _three_colours(c: CameraTable, architecture: str) -> ThreeColourDetector:
 
 @file_contents.cached_with_contents(maxsize=4)
 def mosaic_sensor(c: CameraTable) -> Sensor:
-    """Return the sensor that a camera names, with the camera's temperature, binning and gain. Raises InputError."""
+    """Return the sensor that a camera names, with the camera's own temperature, display, binning and gain.
+
+    Raises InputError.
+    """
     with under_key("camera.detector"):
         sensor = amplified(binned(load_sensor(c.detector), c.binning), c.gain)
-    if c.detector_temperature_K is not None:
-        sensor = replace(sensor, temperature_K=c.detector_temperature_K)
-    return sensor
+    own: dict[str, Any] = {"temperature_K": c.detector_temperature_K, "stretch": c.stretch, "black": c.black}
+    return replace(sensor, **{key: value for key, value in own.items() if value is not None})
 
 
 def _detector_of(scene: Scene, sensor: Sensor, individual: int, direction: str) -> MosaicDetector:

@@ -1,12 +1,30 @@
-"""Look at single flight images, align two of them, and compare silhouette, texture and sky.
+"""Look at single frames of a nucleus, align two of them, and measure silhouette, texture, edges and sky.
 
-`flight_replay.py` says what each figure means and how the images come about.
+Brightness is compared as (image - background) / (bright - background): `background` is the median of the sky,
+`bright` the 99th percentile of the lit body. Lit is a brightness above 0.12. Lengths are pixels of the frame.
+
+Figures of a pair of images of one pose:
+
+- `iou`: intersection over union of the lit silhouettes; `limb_px`: median distance between the bright limbs;
+- `rank`: Spearman's correlation of brightness where both are lit; `rank_smooth`: the same of both images smoothed
+  to the plates of the shape, below which a renderer has to make its texture up.
+
+Statistics of each image, whose distributions over many frames are compared:
+
+- `sky`, `glow_0.5` to `glow_3`: background, and mean of the sky up to so many radii of the body, over `bright`;
+- `noise`, `column`: deviation of the sky from its local median, and of the means of columns from a smooth curve;
+- `tracks`: spots and streaks of 2 px or more in the sky;
+- `noise_lit`: deviation from the local mean in the smoothest tenth of the lit body;
+- `floor`: fraction of the body's outline that is darker than 0.03; `stretch`: median brightness of the lit body;
+- `spikes`: lit pixels in 10,000 that exceed their neighbourhood by 8 deviations;
+- `limb_rise`: distance over which the mean brightness rises from 10 to 90 % across the bright limb;
+- `edge_rise`: reciprocal of the steepest twentieth of the gradients in the body;
+- `power_2_4` to `power_32_64`: variance of brightness over its mean at wavelengths of that many pixels.
 """
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,8 +34,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage, stats
 
-import vbnfault
-from vbnfault.core.files import user_files
+from ..core.errors import InputError
+from ..core.files import user_files
+from ..core.files.images import decoded_image
 
 F32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -25,6 +44,7 @@ Mask = NDArray[np.bool_]
 LIT = 0.12
 _BRIGHT_PERCENTILE = 99.0
 _BODY_LEVEL = 0.3  # of the brightest pixels: surely the body, to begin with
+_SUFFIXES, _MOST_VALUES, _LEAST_PX = (".png", ".tif", ".tiff"), 400_000_000, 64
 _OCTAVES_PX = ((2, 4), (4, 8), (8, 16), (16, 32), (32, 64))
 _GLOW_RADII = ((0.05, 0.5), (0.5, 1.0), (1.0, 2.0), (2.0, 3.0))
 _TRACK_SIGMAS = 6.0
@@ -34,6 +54,8 @@ _LARGE_PART, _NEAR_BODY = 0.02, 0.4
 _SMEAR = 0.1  # of the brightness: columns whose sky differs by more are smeared
 _ALIGNED_SIGMA_PX = 1.5  # blur before the similarity is searched: finer texture is random
 _MOST_TURN_RAD, _MOST_SCALE = 0.035, 0.02  # errors of pose that are mended
+_FEWEST_PX, _DARK, _CLOSED_PX, _PROFILE_PX = 200, 0.03, 12, 8  # of the statistics of the body
+_PLATE_PX = 4.0
 _CLIPPED = 0.5  # of the sky at 0: such a frame tells nothing of its background
 
 
@@ -144,24 +166,28 @@ def shifted(image: NDArray[Any], shift_xy: tuple[int, int]) -> NDArray[Any]:
 
 
 def limb_px(a: Mask, b: Mask, sun_xy: NDArray[np.float64]) -> float:
-    """Return the median distance between the bright limbs of two lit silhouettes, both ways, in px.
-
-    The bright limb is the edge whose outward normal lies within 45° of the Sun's direction in the image.
-    """
-    edges = []
-    for lit in (a, b):
-        whole = ndimage.binary_fill_holes(lit)
-        gradient = [
-            -ndimage.gaussian_filter(whole.astype(np.float32), 3.0, order=order) for order in ((0, 1), (1, 0))
-        ]
-        length = np.hypot(*gradient)
-        towards = (gradient[0] * sun_xy[0] + gradient[1] * sun_xy[1]) / np.maximum(length, 1e-9)
-        edge = whole & ~ndimage.binary_erosion(whole, border_value=1)
-        edges.append(edge & (towards > 0.5**0.5))
+    """Return the median distance between the bright limbs of two lit silhouettes, both ways, in px."""
+    edges = [_bright_limb(ndimage.binary_fill_holes(lit), sun_xy) for lit in (a, b)]
     if not edges[0].any() or not edges[1].any():
         return float("nan")
     far = [ndimage.distance_transform_edt(~edge) for edge in edges]
     return float(np.median(np.concatenate([far[1][edges[0]], far[0][edges[1]]])))
+
+
+def _bright_limb(whole: Mask, sun_xy: NDArray[np.float64]) -> Mask:
+    """Return the edge of a silhouette whose outward normal lies within 45° of the Sun's direction in the image."""
+    gradient = [-ndimage.gaussian_filter(whole.astype(np.float32), 3.0, order=order) for order in ((0, 1), (1, 0))]
+    length = np.hypot(*gradient)
+    towards = (gradient[0] * sun_xy[0] + gradient[1] * sun_xy[1]) / np.maximum(length, 1e-9)
+    edge = whole & ~ndimage.binary_erosion(whole, border_value=1)
+    return np.asarray(edge & (towards > 0.5**0.5))
+
+
+def _smoothed(level: F32, inside: Mask, sigma: float) -> NDArray[np.float64]:
+    """Return brightness smoothed by a Gaussian that sees the pixels of a mask only, float64[y, x]."""
+    weight = ndimage.gaussian_filter(inside.astype(np.float64), sigma)
+    values = ndimage.gaussian_filter(np.where(inside, level, 0.0).astype(np.float64), sigma)
+    return np.asarray(values / np.maximum(weight, 1e-9))
 
 
 def octave_variances(level: F32, inside: Mask) -> dict[str, float]:
@@ -170,19 +196,12 @@ def octave_variances(level: F32, inside: Mask) -> dict[str, float]:
     Octaves are differences of Gaussians that see the pixels of the mask only.
     """
 
-    def smooth(sigma: float) -> NDArray[np.float64]:
-        weight = ndimage.gaussian_filter(inside.astype(np.float64), sigma)
-        return np.asarray(
-            ndimage.gaussian_filter(np.where(inside, level, 0.0).astype(np.float64), sigma)
-            / np.maximum(weight, 1e-9)
-        )
-
     mean = float(level[inside].mean()) if inside.any() else 1.0
     out = {}
     for short, long in _OCTAVES_PX:
         # a Gaussian of deviation s passes half the amplitude at the wavelength 2 π s / sqrt(2 ln 2)
         low, high = (length * np.sqrt(2 * np.log(2)) / (2 * np.pi) for length in (short, long))
-        band = (smooth(low) - smooth(high))[inside] / mean
+        band = (_smoothed(level, inside, low) - _smoothed(level, inside, high))[inside] / mean
         out[f"power_{short}_{long}"] = float(band.var()) if band.size else float("nan")
     return out
 
@@ -217,50 +236,88 @@ def sky_figures(one: Look, around: Mask) -> dict[str, float]:
     return out
 
 
-def compare(real: Look, rendered: Look, sun_xy: NDArray[np.float64]) -> dict[str, float]:
-    """Return all figures of one aligned pair; those of the sky as `NAME real` and `NAME rendered`."""
+def body_figures(one: Look, sun_xy: NDArray[np.float64]) -> dict[str, float]:
+    """Return the statistics of an image that are of the lit body, see the module."""
+    lit, level = one.lit, one.level
+    inside = ndimage.binary_erosion(lit, iterations=3)
+    if inside.sum() < _FEWEST_PX:
+        names = ("noise_lit", "floor", "stretch", "spikes", "limb_rise", "edge_rise")
+        return dict.fromkeys(names, float("nan"))
+    fine = level - ndimage.uniform_filter(level, 3)
+    local = np.sqrt(np.maximum(ndimage.uniform_filter(fine**2, 7), 0))[inside]
+    outline = ndimage.binary_fill_holes(ndimage.binary_closing(np.pad(lit, _CLOSED_PX), iterations=_CLOSED_PX))
+    outline = outline[_CLOSED_PX:-_CLOSED_PX, _CLOSED_PX:-_CLOSED_PX]
+    residual = (level - ndimage.median_filter(level, 5))[inside]
+    deviation = max(1.4826 * float(np.median(np.abs(residual))), 1e-6)
+    steepest = np.percentile(np.hypot(*np.gradient(level))[inside], 95)
+    return {
+        "noise_lit": float(np.percentile(local, 10)),
+        "floor": float((level[outline] < _DARK).mean()),
+        "stretch": float(np.median(level[lit])),
+        "spikes": 1e4 * float((residual > 8 * deviation).mean()),
+        "limb_rise": _limb_rise_px(one, sun_xy),
+        "edge_rise": 1 / max(float(steepest), 1e-6),
+    }
+
+
+def _limb_rise_px(one: Look, sun_xy: NDArray[np.float64]) -> float:
+    """Return over how many pixels the mean profile across the bright limb rises from 10 to 90 % of its plateau."""
+    whole = ndimage.binary_fill_holes(one.lit)
+    edge = _bright_limb(whole, sun_xy)
+    if edge.sum() < _FEWEST_PX / 4:
+        return float("nan")
+    # pixels by their distance from the outline, negative outside, whose nearest outline is bright limb
+    outer, nearest = ndimage.distance_transform_edt(
+        ~(whole & ~ndimage.binary_erosion(whole, border_value=1)), return_indices=True
+    )
+    distance = np.where(whole, outer, -outer)
+    near = edge[nearest[0], nearest[1]] & (np.abs(distance) < _PROFILE_PX)
+    bins = np.round(distance[near]).astype(int) + _PROFILE_PX
+    count = np.bincount(bins, minlength=2 * _PROFILE_PX)
+    profile = np.bincount(bins, one.level[near], minlength=2 * _PROFILE_PX)[1:-1] / np.maximum(count, 1)[1:-1]
+    profile = np.maximum.accumulate((profile - profile[:2].mean()) / max(profile[-3:].mean(), 1e-6))
+    low, high = np.interp((0.1, 0.9), profile + 1e-9 * np.arange(len(profile)), np.arange(len(profile)))
+    return float(high - low)
+
+
+def compare(
+    real: Look, rendered: Look, sun_xy: NDArray[np.float64], plate_px: float = _PLATE_PX
+) -> dict[str, float]:
+    """Return all figures of one aligned pair; the statistics as `NAME real` and `NAME rendered`.
+
+    `plate_px` is the mean width of the shape's plates in the frame.
+    """
     both, either = real.lit & rendered.lit, real.lit | rendered.lit
     inside = ndimage.binary_erosion(both, iterations=3)
+    smooth = [_smoothed(one.level, both, plate_px / 2)[both] for one in (real, rendered)]
     out = {
         "iou": float(both.sum() / max(either.sum(), 1)),
         "limb_px": limb_px(real.lit, rendered.lit, sun_xy),
         "rank": float(stats.spearmanr(real.level[both], rendered.level[both]).statistic),
+        "rank_smooth": float(stats.spearmanr(*smooth).statistic),
     }
-    spectra = [octave_variances(one.level, inside) for one in (real, rendered)]
-    out |= {name: spectra[1][name] / max(spectra[0][name], 1e-12) for name in spectra[0]}
     for which, one in (("real", real), ("rendered", rendered)):
-        unusable = real.clipped
-        out |= {
-            f"{name} {which}": float("nan") if unusable and name != "tracks" else value
-            for name, value in sky_figures(one, either).items()
-        }
+        of_sky = sky_figures(one, either)
+        if real.clipped:
+            of_sky |= dict.fromkeys(set(of_sky) - {"tracks"}, float("nan"))
+        values = of_sky | body_figures(one, sun_xy) | octave_variances(one.level, inside)
+        out |= {f"{name} {which}": value for name, value in values.items()}
     return out
 
 
-def summary(figures: Sequence[Mapping[str, float]]) -> dict[str, tuple[float, float]]:
-    """Return median and worst 5 % of each figure: the 5th percentile, or the 95th where less is better."""
-    out = {}
-    for name in figures[0]:
-        values = np.array([one[name] for one in figures])
-        values = values[np.isfinite(values)]
-        worst = 5 if name in ("iou", "rank") else 95
-        out[name] = (
-            (float(np.median(values)), float(np.percentile(values, worst))) if len(values) else (np.nan, np.nan)
+def read_frame(folder: Path, name: str) -> F32:
+    """Return the frame NAME.png or NAME.tif of a folder, grey, float32[y, x] from 0 to 255. Raises InputError."""
+    found = [path for suffix in _SUFFIXES if (path := folder / f"{name}{suffix}").is_file()]
+    if not found:
+        raise InputError(f"{folder}: has no {name}.png or {name}.tif, which the table of poses names")
+    data = user_files.read_input(found[0], "texture", types=_SUFFIXES)
+    try:
+        colours, _ = decoded_image(data, _MOST_VALUES)
+    except InputError as error:
+        raise InputError(f"{found[0]}: {error}") from None
+    image = 255 * colours.mean(axis=2)
+    if min(image.shape) < _LEAST_PX or not np.isfinite(image).all():
+        raise InputError(
+            f"{found[0]}: is {image.shape[1]}x{image.shape[0]} px; must be at least {_LEAST_PX} px, finite"
         )
-    return out
-
-
-def reduced(frame: NDArray[np.uint8], width_px: int) -> NDArray[np.uint8]:
-    """Return a frame at another width, by the means of areas."""
-    height_px = round(frame.shape[0] * width_px / frame.shape[1])
-    return np.asarray(cv2.resize(frame, (width_px, height_px), interpolation=cv2.INTER_AREA), dtype=np.uint8)
-
-
-def read_frame(folder: Path, name: str) -> NDArray[np.uint8]:
-    """Return a real frame, uint8[y, x]. Raises InputError."""
-    path = folder / f"{name}.png"
-    data = user_files.read_input(path, "texture", types=(".png",))
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
-    if image is None:
-        raise vbnfault.InputError(f"{path}: is no PNG image")
-    return np.asarray(image, dtype=np.uint8)
+    return np.asarray(image, dtype=np.float32)

@@ -1,0 +1,63 @@
+"""Define the commands that compare a camera's own frames with a scene."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import typer
+
+from .app import app
+from .options import MOST_PROCESSES, SceneOption, local_path, number, overrides, progress_bar, replaced, whole
+
+_PANEL = "Your camera"
+
+
+@app.command(rich_help_panel=_PANEL)
+def passport(
+    frames: Annotated[Path, typer.Argument(help="Folder of NAME.png or NAME.tif and poses.csv.")],
+    scene: SceneOption,
+    out: Annotated[
+        Path, local_path("Folder for passport.html, passport.json and the pairs, to make or to continue.")
+    ],
+    poses: Annotated[
+        Path | None, typer.Option(help="Table of poses, a row for each frame.", show_default="poses.csv of FRAMES")
+    ] = None,
+    part: Annotated[
+        Literal["shown", "kept_back", "all"],
+        typer.Option(help="Frames to compare: choose settings on those shown, and judge by those kept back."),
+    ] = "shown",
+    kept_back: Annotated[float, number(0, 0.9, "Fraction of the frames that is kept back, by their names.")] = 0.33,
+    gain: Annotated[
+        list[float] | None,
+        typer.Option(help="Factor on the detector's gain that the camera has; may be repeated.", show_default="1"),
+    ] = None,
+    mend_poses: Annotated[int, whole(0, 5, "How often each pose is mended by its frame.")] = 1,
+    threads: Annotated[int | None, whole(1, MOST_PROCESSES, "Render threads.", unset="every core")] = None,
+    settings: Annotated[list[str] | None, replaced("scene", "body.shape=comet.obj")] = None,
+) -> None:
+    """Say how real a scene is for a camera: compare its frames with images rendered for their poses, by statistics
+    and by classifiers, and list what may be concluded. The same command continues an interrupted comparison.
+    """
+    from ..fit.passport import PAGE, PassportOptions
+    from ..fit.passport import passport as compare
+
+    options = PassportOptions(
+        part=part, kept_back=kept_back, gains=tuple(gain or (1.0,)), mendings=mend_poses, threads=threads
+    )
+    bar: Any = None
+
+    def advance(done: int, count: int) -> None:
+        nonlocal bar
+        if bar is None:
+            bar = progress_bar(count, "frames").__enter__()
+        bar.update(done - bar.pos)
+
+    result = compare(frames, scene, out, options, overrides=overrides(settings), poses=poses, advance=advance)
+    if bar is not None:
+        bar.__exit__(None, None, None)
+    for text in result["conclusions"]["may"]:
+        typer.echo(f"may: {text}")
+    for text in result["conclusions"]["may_not"]:
+        typer.echo(f"may not: {text}")
+    typer.echo(f"page: {out / PAGE}")

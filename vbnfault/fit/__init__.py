@@ -1,0 +1,1 @@
+"""Compare a camera's own frames with images that a scene renders for them."""

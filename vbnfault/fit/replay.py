@@ -1,0 +1,277 @@
+"""Render each row of a table of poses as the frame of that row was taken, and align the image with the frame.
+
+Pose, exposure, gain and black of a real frame are never known well enough, so each image takes them from its frame:
+
+- the attitude and the distance, where asked for: the similarity that correlates image and frame best moves the
+  camera, and the image is rendered again; then the image moves by whole native pixels, which leaves its noise as it
+  is;
+- the exposure, metered so that the rendered body is as bright as the frame's; an overexposed frame is metered on a
+  percentile that is not yet white;
+- the gain, of those that the camera has, whose noise in the sky is nearest to the frame's;
+- the black: the difference of the median levels of the skies, where the frame's is not clipped.
+
+All else is of the scene. Frames that are smaller than the camera's image by a whole factor are means of as many
+pixels, as published frames are; the means are taken after the stretch and rounded afterwards.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.spatial.transform import Rotation
+
+from ..body.geometry import mean_edge_m
+from ..core.errors import InputError
+from ..pipeline import Session
+from ..scene.config import Scene
+from ..scene.trajectory import FlownPose, Trajectory
+from .frames import F32, Look, compare, look, shift_between, shifted, similarity_between
+
+_SEARCH_PX = 16  # largest shift, for frames of 512 px
+# Of the neighbours' light in a mean over pixels. Noise of neighbours in the sky of Rosetta's frames correlates by
+# 0.07, which asks for 0.035; limb and ground are sharper and ask for less.
+_LEAK = 0.0325
+# A frame whose `bright` reaches this level is overexposed. It is metered on one of these percentiles.
+_WHITE, _LOWER_PERCENTILES = 250, (95.0, 90.0, 80.0, 70.0, 60.0, 50.0, 40.0, 30.0, 20.0, 10.0)
+_MOST_BLACK = 1e-3  # of white: more is light. Of 32 frames of Rosetta's the black differs by 4e-4
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Pair:
+    """Hold a real frame, the image rendered for it and moved onto it, their figures, and what was set for it."""
+
+    name: str
+    real: Look
+    rendered: Look
+    figures: dict[str, float]
+    settings: dict[str, Any]
+
+
+def replay_scene(scene: Scene) -> Scene:
+    """Return a scene that stores raw mosaics and gives every sample each of its faults.
+
+    Raises InputError for a camera without a monochrome detector file.
+    """
+    if not scene.camera.detector:
+        raise InputError("camera.detector: is missing; frames are compared with raw images of a sensor file")
+    count = len(scene.faults)
+    plan = {"mode": "per_sample", "faulty_fraction": float(count > 0), "on_invisible": "drop"}
+    plan |= {"classes_per_sample": (count, count)} if count else {}
+    dataset = {"layers": ("raw",), "mask_any": None}
+    return scene.model_copy(
+        update={"plan": scene.plan.model_copy(update=plan), "dataset": scene.dataset.model_copy(update=dataset)}
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Display:
+    """Turn digital numbers into levels, as the frames show them: 255 times a power of the fraction of white."""
+
+    bias_dn: float
+    top_dn: float
+    stretch: float
+
+    def developed(self, raw: NDArray[Any], factor: int, black_dn: float = 0.0) -> F32:
+        """Return a raw image stretched, then reduced by a whole factor, in levels of 0 to 255, float32[y, x].
+
+        `black_dn` is how far the black of the frame lies below the bias. A pixel at the top code is white.
+        """
+        above = np.clip(raw.astype(np.float32) - np.float32(self.bias_dn - black_dn), 0, None)
+        shown = np.minimum((above / np.float32(self.top_dn - self.bias_dn)) ** np.float32(self.stretch), 1)
+        shown[raw >= self.top_dn] = 1
+        return np.floor(255 * _reduced(shown, factor) + np.float32(0.5))
+
+    def fraction(self, level: float) -> float:
+        """Return the fraction of white that a level stands for."""
+        return min((level / 255) ** (1 / self.stretch), 1.0)
+
+    def black_excess_dn(self, real: Look, rendered: Look) -> float:
+        """Return by how many DN the sky of a frame is brighter than that of an aligned image.
+
+        0 where the frame's sky is clipped, or so much brighter that its light is no black.
+        """
+        sky = real.sky & rendered.sky
+        if real.clipped or not sky.any():
+            return 0.0
+        # levels are whole numbers, so means first; tracks hardly move the median of these
+        levels = [float(np.median(ndimage.uniform_filter(one.image, 9)[sky])) for one in (real, rendered)]
+        excess = self.fraction(levels[0]) - self.fraction(levels[1])
+        return excess * (self.top_dn - self.bias_dn) if abs(excess) < _MOST_BLACK else 0.0
+
+
+class Replay:
+    """Render the rows of a table for their frames.
+
+    Parameters
+    ----------
+    scene
+        See `replay_scene`.
+    trajectory
+        A table whose rows are the frames.
+    gains
+        Factors on the detector's gain that the camera has; the first is tried first.
+    mendings
+        How often each pose is mended by the similarity between image and frame.
+    threads
+        Of the renderer; default: every core.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        trajectory: Trajectory,
+        *,
+        gains: Sequence[float] = (1.0,),
+        mendings: int = 0,
+        threads: int | None = None,
+    ) -> None:
+        self.session = Session(replay_scene(scene), threads=threads, poses=trajectory)
+        self.scene, self.trajectory = self.session.scene, trajectory
+        self.gains, self.mendings = tuple(gains), mendings
+        sensor = self.session.base_camera.mosaic.sensor
+        if len(sensor.pattern.channels) > 1:
+            raise InputError(
+                f"camera.detector = {scene.camera.detector!r}: must be monochrome to compare grey frames"
+            )
+        readout = sensor.readout
+        self.display = Display(bias_dn=readout.bias_dn, top_dn=readout.top_dn, stretch=sensor.stretch)
+
+    @cached_property
+    def _plate_m(self) -> float:
+        return mean_edge_m(self.session.body.vertices_m, self.session.body.faces)
+
+    def pair(self, row: int, frame: F32) -> Pair:
+        """Render a row, align the image with its frame, float32[y, x] from 0 to 255, and compare the two.
+
+        Raises InputError for a frame whose size is no whole fraction of the camera's.
+        """
+        real, factor = look(frame), self._reduction(frame)
+        trajectory, search_px = self.trajectory, max(4, round(_SEARCH_PX * frame.shape[1] / 512))
+        percentile, brightness = metered_on(real)
+        settings: dict[str, Any] = {
+            "metering_level": self.display.fraction(brightness),
+            "metering_percentile": percentile,
+        }
+        raw = self._raw(row, trajectory, settings | {"gain": self.gains[0]})
+        for _ in range(self.mendings):
+            before = look(self.display.developed(raw, factor))
+            similarity = similarity_between(real, before, shift_between(real, before, search_px=search_px))
+            pose = trajectory.pose(row)
+            moved = mended_pose(pose, similarity, self.scene.camera.fov_deg, frame.shape)
+            trajectory = with_pose(trajectory, row, *moved)
+            raw = self._raw(row, trajectory, settings | {"gain": self.gains[0]})
+        before = look(self.display.developed(raw, factor))
+        gain = nearest_gain(real, before, self.gains)
+        if gain != self.gains[0]:
+            raw = self._raw(row, trajectory, settings | {"gain": gain})
+            before = look(self.display.developed(raw, factor))
+        shift = shift_between(real, before, search_px=search_px)
+        native = round(factor * shift[0]), round(factor * shift[1])
+        rendered = look(self.display.developed(shifted(raw, native), factor))
+        black = self.display.black_excess_dn(real, rendered)
+        if black:
+            rendered = look(self.display.developed(shifted(raw, native), factor, black))
+        pose = trajectory.pose(row)
+        settings |= {"gain": gain, "black_dn": black, "shift_px": (native[0] / factor, native[1] / factor)}
+        settings |= {"camera_T_m": pose.camera_position_T_m.tolist()}
+        sun_C = pose.T_from_C.T @ pose.sun_direction_T
+        sun_xy = sun_C[:2] / max(float(np.linalg.norm(sun_C[:2])), 1e-9)
+        pixel_m = (
+            float(np.linalg.norm(pose.camera_position_T_m)) * 2 * np.tan(np.radians(self.scene.camera.fov_deg) / 2)
+        )
+        figures = compare(real, rendered, sun_xy, self._plate_m / (pixel_m / frame.shape[1]))
+        return Pair(name=trajectory.name[row], real=real, rendered=rendered, figures=figures, settings=settings)
+
+    def _raw(self, row: int, trajectory: Trajectory, settings: dict[str, Any]) -> NDArray[Any]:
+        camera = self.scene.camera.model_copy(update=settings)
+        self.session.scene = self.scene.model_copy(update={"camera": camera})
+        self.session.trajectory = trajectory
+        return self.session.simulate(row).layers["raw"]
+
+    def _reduction(self, frame: F32) -> int:
+        width, height = self.scene.camera.width_px, self.scene.camera.height_px
+        factor = width // frame.shape[1]
+        if frame.shape != (height // max(factor, 1), width // max(factor, 1)) or factor * frame.shape[1] != width:
+            raise InputError(
+                f"the frame has {frame.shape[1]}x{frame.shape[0]} px, and the camera {width}x{height}: must be as "
+                "many or a whole fraction of them"
+            )
+        return factor
+
+
+def nearest_gain(real: Look, rendered: Look, gains: Sequence[float]) -> float:
+    """Return the gain whose noise in the sky is nearest to the frame's; its variance goes with the gain's square.
+
+    `rendered` has the first of the gains.
+    """
+    if len(gains) == 1 or real.clipped:
+        return gains[0]
+    ratio = noise_variance(real) / noise_variance(rendered)
+    if not ratio > 0:
+        return gains[0]
+    return min(gains, key=lambda gain: abs(np.log(ratio * (gains[0] / gain) ** 2)))
+
+
+def noise_variance(one: Look) -> float:
+    """Return the variance of the temporal noise in the sky, along columns, whose pattern and smear are no noise."""
+    calm = one.sky & (np.abs(one.image - ndimage.median_filter(one.image, 9)) < 4)
+    calm[1:] &= calm[:-1]
+    calm[0] = False
+    return float(np.diff(one.image, axis=0, prepend=0)[calm].var() / 2) if calm.sum() > 1000 else float("nan")
+
+
+def metered_on(real: Look) -> tuple[float, float]:
+    """Return a percentile of the lit pixels of a real frame, and its brightness.
+
+    It is the 99th, which is `bright`; in an overexposed frame, the highest one that is below white.
+    """
+    if real.bright < _WHITE:
+        return 99.0, real.bright
+    for percentile in _LOWER_PERCENTILES:
+        brightness = float(np.percentile(real.image[real.lit], percentile))
+        if brightness < _WHITE:
+            break
+    return percentile, brightness
+
+
+def mended_pose(pose: FlownPose, similarity: NDArray[np.float64], fov_deg: float, size: tuple[int, ...]) -> Any:
+    """Return the camera's position in m and the quaternion camera_from_T of a pose whose image a similarity moves.
+
+    `size` is (height, width) of the image in px. A scale moves the camera along its line to the origin of T.
+    """
+    focal_px = 0.5 * size[1] / np.tan(np.radians(fov_deg) / 2)
+    middle = 0.5 * np.array(size[::-1]) - 0.5
+    off = similarity[:, :2] @ middle + similarity[:, 2] - middle
+    scale = float(np.sqrt(np.linalg.det(similarity[:, :2])))
+    turn = float(np.arctan2(similarity[1, 0], similarity[0, 0]))
+    towards = np.array([off[0], off[1], focal_px]) / np.linalg.norm([*off, focal_px])
+    # moves the boresight to where its image has moved; small angles, so that the axis is z x towards
+    tilt = Rotation.from_rotvec(np.cross([0.0, 0.0, 1.0], towards))
+    moved = tilt * Rotation.from_rotvec([0.0, 0.0, turn]) * Rotation.from_matrix(pose.T_from_C.T)
+    return pose.camera_position_T_m / scale, moved.as_quat(scalar_first=True)
+
+
+def with_pose(trajectory: Trajectory, row: int, position_T_m: Any, camera_from_T: Any) -> Trajectory:
+    """Return a table with another position in m and quaternion camera_from_T in one row."""
+    positions, turns = trajectory.camera_position_T_m.copy(), trajectory.camera_from_T.copy()
+    positions[row], turns[row] = position_T_m, camera_from_T
+    return replace(trajectory, camera_position_T_m=positions, camera_from_T=turns)
+
+
+def _reduced(image: F32, factor: int) -> F32:
+    """Return the means of squares of pixels, with the light of neighbours that published frames show."""
+    if factor == 1:
+        return image
+    weights = [_LEAK, *[(1 - 2 * _LEAK) / factor] * factor, _LEAK]
+    for axis in (0, 1):
+        size = image.shape[axis]
+        padded = np.pad(image, [(1, 1) if k == axis else (0, 0) for k in (0, 1)], mode="symmetric")
+        taken = [padded.take(np.arange(k, k + size, factor), axis=axis) for k in range(factor + 2)]
+        image = np.sum([np.float32(weight) * part for weight, part in zip(weights, taken, strict=True)], axis=0)
+    return np.asarray(image, dtype=np.float32)
