@@ -161,8 +161,8 @@ def test_a_noisy_frame_is_rendered_with_the_higher_gain() -> None:
 
     for variance, gain in ((0.7, 1.0), (1.25, 1.0), (1.6, 1.4), (3.0, 1.4), (9.0, 2.5)):
         one = look_at(variance**0.5)
-        # of 19,000 differences, each with two neighbours, the variance has a deviation of 1.3 %; spots of 4 levels are
-        # left out, which cuts the tails of strong noise
+        # of 19,000 differences, each with two neighbours, the variance has a deviation of 1.3 %; spots of 4 levels
+        # are left out, which cuts the tails of strong noise
         assert variance > 1 or fit_replay.noise_variance(one) == pytest.approx(variance, rel=4 * 0.013)
         assert fit_replay.nearest_gain(one, look_at(1.0), (1.0, 1.4, 2.5)) == gain
     assert fit_replay.nearest_gain(look_at(3.0), look_at(1.0), (1.0,)) == 1

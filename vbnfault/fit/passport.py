@@ -188,6 +188,8 @@ def passport(
     images = {row: read_frame(frames, table.name[row]) for row in rows}
     loaded = load_scene(scene, dict(overrides or {}))
     replay = Replay(loaded, table, gains=options.gains, mendings=options.mendings, threads=options.threads)
+    for row in rows:
+        replay.reduction(images[row])
     resolved = json.dumps(replay.scene.resolved(), sort_keys=True, default=str)
     own_folder(out)
     own_folder(out / PAIRS)

@@ -151,7 +151,7 @@ class Replay:
 
         Raises InputError for a frame whose size is no whole fraction of the camera's.
         """
-        real, factor = look(frame), self._reduction(frame)
+        real, factor = look(frame), self.reduction(frame)
         trajectory, search_px = self.trajectory, max(4, round(_SEARCH_PX * frame.shape[1] / 512))
         percentile, brightness = metered_on(real)
         settings: dict[str, Any] = {
@@ -194,7 +194,8 @@ class Replay:
         self.session.trajectory = trajectory
         return self.session.simulate(row).layers["raw"]
 
-    def _reduction(self, frame: F32) -> int:
+    def reduction(self, frame: F32) -> int:
+        """Return by what the camera's image is larger than a frame. Raises InputError if by no whole factor."""
         width, height = self.scene.camera.width_px, self.scene.camera.height_px
         factor = width // frame.shape[1]
         if frame.shape != (height // max(factor, 1), width // max(factor, 1)) or factor * frame.shape[1] != width:

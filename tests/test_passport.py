@@ -1,0 +1,157 @@
+"""Passport of a camera: frames that the scene itself made agree with it, and a changed scene is found out."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from poses_kit import row
+from typer.testing import CliRunner
+
+import vbnfault
+from vbnfault import cli
+from vbnfault.core.errors import InputError
+from vbnfault.fit import passport as fit_passport
+from vbnfault.fit.replay import Replay
+from vbnfault.scene.trajectory import COLUMNS, load_trajectory
+
+SMALL = {
+    "camera.width_px": 128,
+    "camera.height_px": 128,
+    "patch.max_triangles": 80_000,
+    "render.samples_per_pixel": 4,
+    "sky.stars": "off",
+}
+FRAMES = 8
+
+
+@pytest.fixture(scope="module")
+def frames(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Frames of the scene itself, with the noise, tracks and grains of another seed, half the camera's size."""
+    folder = tmp_path_factory.mktemp("frames")
+    angles = np.linspace(0, 5, FRAMES)
+    table = [
+        row(f"frame_{k}", (8e4 * np.cos(a), 8e4 * np.sin(a), 2e4), (np.cos(a + 0.8), np.sin(a + 0.8), 0.0))
+        for k, a in enumerate(angles)
+    ]
+    with (folder / "poses.csv").open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, COLUMNS)
+        writer.writeheader()
+        writer.writerows(table)
+    scene = vbnfault.load_scene("rosetta67p", SMALL)
+    replay = Replay(scene, load_trajectory(str(folder / "poses.csv")))
+    # other sensors' noise on the same ground: the seed of the ground stays
+    for k in range(FRAMES):
+        raw = replay.session.simulate(k).layers["raw"]
+        rng = np.random.default_rng(k)
+        cv2.imwrite(
+            str(folder / f"frame_{k}.png"),
+            replay.display.developed(np.clip(raw + np.rint(0.3 * rng.normal(size=raw.shape)), 0, 4095), 2),
+        )
+    return folder
+
+
+@pytest.fixture(scope="module")
+def result(frames: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Path]:
+    out = tmp_path_factory.mktemp("passport")
+    options = fit_passport.PassportOptions(part="all", mendings=0, draws=1)
+    return fit_passport.passport(frames, "rosetta67p", out, options, overrides=SMALL), out
+
+
+def test_frames_of_the_scene_itself_agree_with_it(result: tuple[dict[str, Any], Path]) -> None:
+    found, out = result
+    assert found["pairs"]["iou"] > 0.99
+    assert found["pairs"]["rank"] > 0.95
+    by_name = {one["name"]: one for one in found["statistics"]}
+    assert set(by_name) == set(fit_passport.STATISTICS)
+    for name in ("stretch", "power_4_8", "power_16_32", "edge_rise"):
+        assert by_name[name]["distance"] < fit_passport.GOOD, name
+    assert any("texture at 4 to 8 px: rendered as in the frames" in text for text in found["conclusions"]["may"])
+    assert json.loads((out / "passport.json").read_text())["scene"] == "rosetta67p"
+    page = (out / "passport.html").read_text(encoding="utf-8")
+    assert "What may be concluded" in page
+    assert page.count("<img") >= FRAMES
+    assert "http" not in page.replace("http-equiv", "")
+
+
+def test_a_blurred_scene_is_found_out(frames: Path, tmp_path: Path) -> None:
+    """A pixel of the frames is 1.36 mrad wide; a core of two pixels takes most of the power below four pixels."""
+    blurred = SMALL | {"camera.point_spread.core_urad": 2700.0}
+    options = fit_passport.PassportOptions(part="all", mendings=0, draws=1)
+    found = fit_passport.passport(frames, "rosetta67p", tmp_path, options, overrides=blurred)
+    by_name = {one["name"]: one for one in found["statistics"]}
+    for name in ("power_2_4", "limb_rise"):
+        assert by_name[name]["low"] > fit_passport.GOOD, name
+    assert by_name["power_2_4"]["rendered_median"] < 0.5 * by_name["power_2_4"]["real_median"]
+    assert any(text.startswith("texture at 2 to 4 px: ") for text in found["conclusions"]["may_not"])
+    assert max(v[0] for name, v in found["classifiers"]["limb"].items() if name.endswith(", all features")) > 0.9
+
+
+def test_the_command_keeps_frames_back_and_continues(
+    frames: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sets = [word for key, value in SMALL.items() for word in ("--set", f"{key}={json.dumps(value)}")]
+    command = ["passport", str(frames), "--scene", "rosetta67p", "--out", str(tmp_path / "out"), *sets]
+    command += ["--kept-back", "0.6", "--mend-poses", "1", "--gain", "1", "--gain", "1.4", "--threads", "2"]
+    command += ["--poses", str(frames / "poses.csv")]
+    shown = CliRunner().invoke(cli.app, [*command, "--part", "shown"], catch_exceptions=False)
+    assert shown.exit_code == 0
+    assert "may not: frames on which settings were chosen flatter the scene" in shown.output
+    first = json.loads((tmp_path / "out/passport.json").read_text())["frames"]
+    monkeypatch.setattr(Replay, "pair", lambda *_: pytest.fail("a frame was rendered twice"))
+    CliRunner().invoke(cli.app, [*command, "--part", "shown"], catch_exceptions=False)
+    assert json.loads((tmp_path / "out/passport.json").read_text())["frames"] == first
+    monkeypatch.undo()
+    judged = CliRunner().invoke(cli.app, [*command, "--part", "kept_back"], catch_exceptions=False)
+    assert "flatter" not in judged.output
+    second = json.loads((tmp_path / "out/passport.json").read_text())["frames"]
+    assert set(first).isdisjoint(second)
+    assert len(first) + len(second) == FRAMES
+
+
+def test_wrong_frames_are_refused_before_anything_is_rendered(frames: Path, tmp_path: Path) -> None:
+    for name, image, sentence in (
+        ("frame_0.png", None, r"has no frame_0.png or frame_0.tif, which the table of poses names"),
+        ("frame_1.png", np.zeros((8, 8), np.uint8), r"frame_1.png: is 8x8 px; must be at least 64 px"),
+        ("frame_2.png", b"no image", r"frame_2.png: is not a PNG"),
+        ("frame_3.png", np.zeros((100, 64), np.uint8), r"has 64x100 px, and the camera 128x128: must be as many"),
+    ):
+        folder = tmp_path / name
+        folder.mkdir()
+        for path in frames.iterdir():
+            (folder / path.name).write_bytes(path.read_bytes())
+        (folder / name).unlink()
+        if isinstance(image, bytes):
+            (folder / name).write_bytes(image)
+        elif image is not None:
+            cv2.imwrite(str(folder / name), image)
+        options = fit_passport.PassportOptions(part="all", mendings=0)
+        with pytest.raises(InputError, match=sentence):
+            fit_passport.passport(folder, "rosetta67p", tmp_path / "out", options, overrides=SMALL)
+        assert not (tmp_path / "out").exists()
+
+
+def test_a_colour_camera_and_a_camera_without_a_sensor_file_are_refused(frames: Path, tmp_path: Path) -> None:
+    for scene, values, sentence in (
+        ("rosetta67p", SMALL | {"camera.detector": "cmv4000"}, "must be monochrome to compare grey frames"),
+        ("quickstart", {}, "camera.detector: is missing"),
+    ):
+        with pytest.raises(InputError, match=sentence):
+            fit_passport.passport(frames, scene, tmp_path, overrides=values)
+
+
+def test_distances_are_those_of_shifted_values() -> None:
+    """Values shifted by d have W1 = d; the interquartile range of 0, 1, …, 100 is 50."""
+    values = np.arange(101.0)
+    one = fit_passport.Statistic.of("sky", values, values + 20)
+    assert one.distance == pytest.approx(0.4)
+    assert one.low <= 0.4 <= one.high
+    assert fit_passport.Statistic.of("sky", values, values).distance == 0
+    none = fit_passport.Statistic.of("sky", np.full(5, np.nan), np.arange(5.0))
+    assert none.frames == 0
+    assert np.isnan(none.distance)
