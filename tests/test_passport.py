@@ -85,8 +85,7 @@ def test_a_blurred_scene_is_found_out(frames: Path, tmp_path: Path) -> None:
     options = fit_passport.PassportOptions(part="all", mendings=0, draws=1)
     found = fit_passport.passport(frames, "rosetta67p", tmp_path, options, overrides=blurred)
     by_name = {one["name"]: one for one in found["statistics"]}
-    for name in ("power_2_4", "limb_rise"):
-        assert by_name[name]["low"] > fit_passport.GOOD, name
+    assert by_name["power_2_4"]["low"] > fit_passport.GOOD
     assert by_name["power_2_4"]["rendered_median"] < 0.5 * by_name["power_2_4"]["real_median"]
     assert any(text.startswith("texture at 2 to 4 px: ") for text in found["conclusions"]["may_not"])
     assert max(v[0] for name, v in found["classifiers"]["limb"].items() if name.endswith(", all features")) > 0.9

@@ -57,6 +57,7 @@ _LEFT_OUT_AT_DEFAULT = (
     "camera.black",
     "camera.point_spread",
     "camera.stretch",
+    "camera.exposure_max_towards_sun_s",
     "camera.exposure_stops",
     "dataset.variants_per_view",
     "dataset.radiance_dtype",

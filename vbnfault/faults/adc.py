@@ -48,13 +48,17 @@ class ConverterFault(Fault):
         1, 5, limits=(0, 15), integer=True, doc="which bits: 0 is the most significant, the next 1, …; assumed"
     )
     missing_fraction: Interval = bounds(
-        0.0, 0.05, limits=(0, 0.5), doc="fraction of the codes that are missing, in one run; assumed"
+        0.004, 0.02, limits=(0, 0.5), doc="fraction of the codes that are missing, in one run: 1 to 5 levels of 255"
     )
     inl_fraction: Interval = bounds(
-        0.005, 0.03, limits=(0, 0.2), doc="height of the arc of integral non-linearity, of either sign; assumed"
+        2e-4,
+        3e-3,
+        limits=(0, 0.2),
+        doc="height of the arc of integral non-linearity, of either sign: 1 LSB of 12 bits, as of new converters, "
+        "to 12 after dose; assumed",
     )
     inl_cubic_fraction: Interval = bounds(
-        0.0, 0.01, limits=(0, 0.1), doc="height of its S, of either sign; assumed"
+        0.0, 1e-3, limits=(0, 0.1), doc="height of its S, of either sign; assumed"
     )
     dnl_lsb_rms: Interval = bounds(
         0.0, 0.5, limits=(0, 10), unit="LSB", doc="differential non-linearity beside the device's; assumed"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from functools import reduce
 
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from ..camera import Camera
 from ..core.quantities import BODY, Electrons, Radiance, Truth
 from ..reflectance import radiance_factor
-from ..render.description import View
+from ..render.description import RenderInput, View
 from ..scene.config import Scene
 from ..world import assemble, ephemeris
 from ..world.sky import StarRadiance
@@ -23,6 +24,7 @@ Direction = tuple[float, float, float]
 # grazing light does not make the whole frame noisy. Dark ground at zero phase is up to nine times as bright as that
 # facet; where this asks for a shorter exposure than the lower factor allows, it is allowed.
 _METERING_RANGE = (0.25, 8.0)
+_NEAR_FRAME_DEG = 10.0  # from a corner: nearer, the Sun's veil limits the exposure
 _AT_45_DEG = ((0.0, 0.5**0.5, 0.5**0.5), (0.5**0.5, 0.0, 0.5**0.5))  # towards the Sun and the camera: 60° of phase
 _AT_ZERO_PHASE = ((0.0, 0.0, 1.0), (0.0, 0.0, 1.0))
 
@@ -30,9 +32,9 @@ _AT_ZERO_PHASE = ((0.0, 0.0, 1.0), (0.0, 0.0, 1.0))
 def meter(spec: SampleSpec, rendering: Rendering) -> SceneExposure:
     """Set the exposure: fixed, or metered on the noise-free, fault-free frame. All twins share it."""
     metered_s, rate = _metered_light(spec, rendering)
-    seconds = metered_s * exposure_factor(spec)
-    if spec.scene.camera.exposure_s == "auto":
-        seconds = float(np.clip(seconds, spec.scene.camera.exposure_min_s, spec.scene.camera.exposure_max_s))
+    seconds, settings = metered_s * exposure_factor(spec), limited(spec.scene, rendering.scene).camera
+    if settings.exposure_s == "auto":
+        seconds = float(np.clip(seconds, settings.exposure_min_s, settings.exposure_max_s))
     return SceneExposure(camera=replace(spec.camera, exposure_s=seconds), light=rendering.light, rate=rate)
 
 
@@ -45,9 +47,22 @@ def _metered_light(spec: SampleSpec, rendering: Rendering) -> tuple[float, Elect
 
     def metered() -> tuple[float, Electrons]:
         rate = camera.expose(rendering.light.rendered, 1.0)
-        return exposure_s(spec.scene, camera, rendering.truth, rate.merged), rate
+        return exposure_s(limited(spec.scene, rendering.scene), camera, rendering.truth, rate.merged), rate
 
     return rendering.shared.once("metered light", camera.optics, metered)
+
+
+def limited(scene: Scene, rendered: RenderInput) -> Scene:
+    """Return a scene with the longest exposure of a view: shorter where the Sun is in the frame or near it."""
+    towards_sun_s, view = scene.camera.exposure_max_towards_sun_s, rendered.view
+    fx, fy, _, _ = view.intrinsics
+    corner_deg = math.degrees(math.atan(math.hypot(view.width_px / fx, view.height_px / fy) / 2))
+    away_deg = math.degrees(math.acos(np.clip(view.L_from_C[:, 2] @ rendered.sun.direction_L, -1, 1)))
+    if towards_sun_s is None or away_deg > corner_deg + _NEAR_FRAME_DEG:
+        return scene
+    longest_s = max(towards_sun_s, scene.camera.exposure_min_s)
+    camera = scene.camera.model_copy(update={"exposure_max_s": min(longest_s, scene.camera.exposure_max_s)})
+    return scene.model_copy(update={"camera": camera})
 
 
 def exposure_factor(spec: SampleSpec) -> float:

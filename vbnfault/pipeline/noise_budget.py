@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ..core.quantities import FineLight, Radiance, Truth
 from ..render.description import RenderInput
 from ..world import ephemeris
-from .exposure import foreseen_exposure_s, rate_on_axis
+from .exposure import foreseen_exposure_s, limited, rate_on_axis
 from .spec import SampleSpec
 
 if TYPE_CHECKING:
@@ -94,7 +94,7 @@ def sample_to_noise(
     light = sampled.radiance.array.copy() if indirect is None else sampled.radiance.array + indirect
     whole = replace(sampled.radiance, array=light.view(), fine=fine)
     sampled = replace(sampled, radiance=whole)  # a copy in all bands takes 37 MB for a frame of 1024 pixels
-    exposure = foreseen_exposure_s(spec.scene, camera, truth, scene.view, whole)
+    exposure = foreseen_exposure_s(limited(spec.scene, scene), camera, truth, scene.view, whole)
     exposure *= 2 ** max(spec.scene.camera.exposure_stops[1], 0.0)  # the longest of the samples of the view
     signal_e = np.einsum("b,byx->yx", electron_rate * exposure, whole.array)
     detector = camera.detector

@@ -175,6 +175,13 @@ class CameraTable(Table):
     )
     exposure_min_s: float = Field(1e-5, gt=0, le=1e4, description="shortest exposure that 'auto' takes")
     exposure_max_s: float = Field(5.0, gt=0, le=1e4, description="longest exposure that 'auto' takes")
+    exposure_max_towards_sun_s: float | None = Field(
+        None,
+        gt=0,
+        le=1e4,
+        description="longest exposure that 'auto' takes where the Sun is in the frame or within 10° of it, so that "
+        "its veil does not cover the frame; default: exposure_max_s",
+    )
     exposure_stops: pair_within(-10, 10) = Field(  # type: ignore[valid-type]
         (0.0, 0.0),
         description="the exposure of each sample is longer by 2 to a power drawn from this range, within "
