@@ -339,10 +339,13 @@ def test_a_paraboloid_focuses_every_ray_and_an_asphere_is_met() -> None:
 
 
 def test_rims_lose_rays() -> None:
+    """The stop loses a ray that meets every surface, 7 mm off the axis of a beam with a radius of 6.4 mm."""
     lens = load_lens("nikkor_35_f2p8")
-    found = trace(lens, [[0, 0, -5], [14.0, 0, -5], [20.0, 0, -5]], np.tile([0.0, 0, 1], (3, 1)))
-    assert found.arrives.tolist() == [True, False, False]
-    assert found.relative_radius[2] > 1
+    heights = [[x, 0, -5] for x in (0, 6.0, 7.0, 14.0, 20.0)]
+    found = trace(lens, heights, np.tile([0.0, 0, 1], (5, 1)))
+    assert found.arrives.tolist() == [True, True, False, False, False]
+    assert 1 < found.relative_radius[2] < 1.2
+    assert np.isinf(found.relative_radius[4])
 
 
 # --- the command ------------------------------------------------------------------------------------------------

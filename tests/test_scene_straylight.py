@@ -260,7 +260,7 @@ def test_wings_lie_around_the_image_of_a_lens_that_distorts() -> None:
 
 def test_the_tables_of_wings_are_made_once_and_not_for_dark_sources(monkeypatch: pytest.MonkeyPatch) -> None:
     lens, nodes = with_blades(0), Bands.lines(450.0, 650.0)
-    assert starburst_of_source(lens, nodes, 1e-3) is starburst_of_source(lens, nodes, 1e-3)
+    assert starburst_of_source(lens, nodes, 1e-3) == starburst_of_source(lens, nodes, 1e-3)  # and so their tables
     # a narrower disc would have rings that the tables do not resolve: at least three Airy units of the longest wave
     airy_rad = 650e-6 / paraxial_properties(lens).entrance_pupil_diameter_mm
     assert starburst_of_source(lens, nodes, 1e-9).sun_radius_rad == pytest.approx(3 * airy_rad)
@@ -440,13 +440,13 @@ def test_a_response_is_traced_once_and_read_by_others(
 ) -> None:
     """Bit for bit; damage is found, whichever byte it is in, and the response is traced and kept again."""
     scene = behind(singlet, 8, 30.0)
-    counted, trace = [0], ghost_response._traced_table
+    counted, trace = [0], ghost_response._Tracing.table
 
     def counting(*args: Any) -> F32:
         counted[0] += 1
         return trace(*args)
 
-    monkeypatch.setattr(ghost_response, "_traced_table", counting)
+    monkeypatch.setattr(ghost_response._Tracing, "table", counting)
     traced = fresh(scene)
     (path,) = folder.iterdir()
     good = path.read_bytes()
