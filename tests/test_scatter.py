@@ -394,18 +394,27 @@ def test_a_baffle_against_a_grid() -> None:
         assert max(share, 1e-6) == pytest.approx((entrance & through).sum() / entrance.sum(), abs=1e-4)
     assert found[0] == 1
     assert found[-1] == 1e-6
-    # equal discs: (2/π)(arccos q - q √(1-q²)), q = length tan θ / 2a
-    q = 50.0 * np.tan(np.radians(10.0)) / 20.0
-    equal = baffle_transmission(10.0, length_mm=50.0, radius_mm=10.0, entrance_radius_mm=10.0)
-    assert equal == pytest.approx(2 / np.pi * (np.arccos(q) - q * np.sqrt(1 - q * q)), rel=1e-9)
-    assert (baffle_transmission(angles, entrance_radius_mm=10.0) == 1).all()
     bare = baffle_transmission(
         [20.0, 90.0], length_mm=80.0, radius_mm=13.0, entrance_radius_mm=10.0, vane_attenuation=0.0
     )
     np.testing.assert_array_equal(bare, 0)
 
 
-# --- bad input --------------------------------------------------------------------------------------------------
+def test_a_baffle_only_shades() -> None:
+    angles = np.linspace(0, 180, 721)
+    for radius in (10.0, 10.001, 30.0):
+        share = baffle_transmission(
+            angles, length_mm=50.0, radius_mm=radius, entrance_radius_mm=10.0, vane_attenuation=1e-9
+        )
+        assert (np.diff(share) <= 0).all()
+        assert share.min() == 1e-9
+        assert share[0] == pytest.approx(1.0, rel=1e-12)
+    assert (baffle_transmission(angles, entrance_radius_mm=10.0) == 1).all()
+    # equal discs: (2/π)(arccos q - q √(1-q²)), q = length tan θ / 2a
+    q = 50.0 * np.tan(np.radians(10.0)) / 20.0
+    lens_shaped = 2 / np.pi * (np.arccos(q) - q * np.sqrt(1 - q * q))
+    equal = baffle_transmission(10.0, length_mm=50.0, radius_mm=10.0, entrance_radius_mm=10.0)
+    assert equal == pytest.approx(lens_shaped, rel=1e-9)
 
 
 @pytest.mark.parametrize("name", ["nikkor_28_f2p8", "heliar_100_f3p5"])
