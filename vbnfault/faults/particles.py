@@ -589,7 +589,7 @@ def _directions(slopes: F64) -> F64:
 
 def _random_direction(rng: np.random.Generator) -> F64:
     """Return a unit vector in any direction, float64[3]."""
-    return _in_cone(np.array([0.0, 0.0, 1.0]), 180.0, *rng.random((2, 1)))[0]
+    return np.asarray(_in_cone(np.array([0.0, 0.0, 1.0]), 180.0, *rng.random((2, 1)))[0])
 
 
 def _in_cone(axis: F64, half_angle_deg: float, height: F64, turn: F64) -> F64:
