@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import small_scene
+from lens_kit import paraxial_ghosts
 from test_faults_kit import flat_electrons
 from typer.testing import CliRunner
 
@@ -33,9 +34,11 @@ from vbnfault.lens import (
 )
 from vbnfault.lens.beams import Footprint
 from vbnfault.lens.glass import D_NM
+from vbnfault.lens.imaging import point_spreads
 from vbnfault.lens.prescription_file import to_table
 from vbnfault.lens.rays import trace
 from vbnfault.lens.straylight.scatter import Cleanliness, GlareLayout, veiling_glare
+from vbnfault.lens.straylight.starburst import starburst
 from vbnfault.scene import config
 from vbnfault.world import cameras
 
@@ -169,6 +172,39 @@ def test_beams_faults_and_other_lenses_follow_the_stop() -> None:
     assert lost[1] > 0.005
 
 
+def test_point_spread_and_rims_follow_the_stop() -> None:
+    wide, narrow = real("biotar_100_f1p4", None, fov_deg=20.0), real("biotar_100_f1p4", 8.0, fov_deg=20.0)
+    slope = math.tan(math.radians(7))
+    radius = []
+    for lens in (wide, narrow):
+        sharp = replace(lens, width_px=1024, height_px=1024, pixel_pitch_um=lens.pixel_pitch_um * SIDE_PX / 1024)
+        kernel = point_spreads(sharp, np.array([slope]), np.zeros(1), D_NM)[0]
+        at = np.arange(len(kernel)) - len(kernel) // 2
+        radius.append(math.sqrt(float((kernel * (at[:, None] ** 2 + at**2)).sum())))
+    assert radius[1] < 0.5 * radius[0]
+    # rims clip the wide beam at the corner, not the narrow one
+    corner = [float(lens.relative_illumination(np.array([math.hypot(0.176, 0.176)]))[0]) for lens in (wide, narrow)]
+    assert corner[1] > 1.2 * corner[0]
+
+
+def test_ghosts_and_starburst_follow_the_stop() -> None:
+    lenses = [real("nikkor_35_f2p8", n).prescription for n in (4.0, 16.0)]
+    flux = []
+    for lens in lenses:
+        pupil_mm2 = math.pi / 4 * paraxial_properties(lens).entrance_pupil_diameter_mm ** 2
+        flux.append({g.pair: g.flux_fraction * pupil_mm2 for g in paraxial_ghosts(lens, 0.0)})
+    shared = set(flux[0]) & set(flux[1])
+    ratio = np.array([flux[0][pair] / flux[1][pair] for pair in shared])
+    stops = [lens.surfaces[lens.stop].semi_diameter_mm for lens in lenses]
+    area = (stops[0] / stops[1]) ** 2
+    assert area == pytest.approx((16 / 4) ** 2, rel=0.03)
+    # what bounds a ghost is the stop, of which its light is the area, or another rim; 129 points across hold 3 %
+    assert ((ratio > 0.97) & (ratio < 1.03 * area)).all()
+    assert (ratio > 0.97 * area).sum() > 0.3 * len(ratio)
+    bursts = [starburst(lens, sun_radius_rad=4.65e-3).pupil_radius_mm for lens in lenses]
+    assert bursts[0] / bursts[1] == pytest.approx(math.sqrt(area), rel=1e-9)
+
+
 def test_a_build_tells_how_a_lens_was_scaled(tmp_path: Path) -> None:
     settings = scene(lens="nikkor_35_f2p8", f_number=5.6, fov_deg=40.0).model_copy(
         update={"faults": {"dust_on_optics": {"model": "defocused"}}}
@@ -196,7 +232,7 @@ def test_a_build_tells_how_a_lens_was_scaled(tmp_path: Path) -> None:
 # --- what scaling keeps -----------------------------------------------------------------------------------------
 
 
-def test_scaling_keeps_films_and_roughness_and_lengthens_paths_in_glass() -> None:
+def test_scaling_keeps_films_roughness_and_grains_and_lengthens_paths_in_glass() -> None:
     rows = to_table(load_lens("tessar_50_f2p8").coated("bbar"))
     for row in rows["surface"]:
         if "nd" in row:
@@ -237,3 +273,11 @@ def test_scaling_keeps_films_and_roughness_and_lengthens_paths_in_glass() -> Non
     ]
     # irradiance over the Sun's: of a lens f-number for f-number alike, at places in focal lengths alike
     np.testing.assert_allclose(images[1], images[0], rtol=2e-3)
+    # grains: as many µm at either scale
+    grains = []
+    for focal in (40.0, 20.0):
+        fault = from_dict("dust_on_optics", {"model": "defocused", "diameter_um": [80, 80]}, source="test")
+        lens_at = real("tessar_50_f2p8", fov_deg=2 * math.degrees(math.atan(SIDE_PX * 88e-3 / 2 / focal)))
+        grains.append(fault.draw(context(lens_at), np.random.default_rng(1)))
+    assert grains[0]["diameter_um"] == grains[1]["diameter_um"]
+    assert set(grains[0]["diameter_um"]) == {80.0}

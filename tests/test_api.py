@@ -251,6 +251,9 @@ def test_lens_sensor_and_flare_are_at_hand() -> None:
         ({"sun_deg": 10.0, "model": "painted"}, "model = 'painted': must be one of"),
         ({"sun_deg": 10.0, "reflections": 3}, "reflections = 3: must be 2 or 4"),
         ({"sun_deg": 10.0, "wavelength_nm": 20.0}, "20: must be from 250 to 2500"),
+        ({"sun_deg": -1.0}, "sun_deg = -1: must be from 0 to 90"),
+        ({"sun_deg": 10.0, "roughness_nm": -1.0}, "roughness_nm = -1: must be from 0 to 50"),
+        ({"sun_deg": 10.0, "cleanliness_level": -3.0}, "cleanliness_level = -3: must be from 0 to 1000"),
     ],
 )
 def test_a_flare_refuses_what_the_physics_does_not_take(setting: dict[str, Any], sentence: str) -> None:

@@ -13,6 +13,7 @@ from scipy.integrate import quad
 from test_faults_kit import flat_electrons, make, make_context, rng
 
 from vbnfault.core import spectra
+from vbnfault.core.errors import InputError
 from vbnfault.core.quantities import Electrons
 from vbnfault.faults import FaultContext, degradation_lens
 from vbnfault.faults.degradation_lens import browned, colours, haze_kernel, scratch_kernel, stabilised, worn
@@ -241,6 +242,19 @@ def test_a_worn_coating_reflects_as_its_parts_do() -> None:
         np.testing.assert_allclose(worn(lens, nodes, loss), expected, rtol=1e-6)
 
 
+def test_dose_reddens_and_darkens() -> None:
+    where = make_context(64)
+    before = np.ones(3)
+    for dose in (100.0, 1000.0, 5000.0):
+        after = colours(NONE | {"dose_krad": dose}, where)
+        assert (after < before).all()
+        assert after[0] > after[1] > after[2]  # red, green, blue
+        before = after
+    np.testing.assert_allclose(colours(NONE, where), 1.0, rtol=1e-12)
+    worn_ones = [colours(NONE | {"coating_loss": loss}, where) for loss in (0.0, 0.2, 0.6, 1.0)]
+    assert (np.diff(worn_ones, axis=0) < -1e-3).all()
+
+
 def test_colours_weigh_every_nanometre_as_the_detector_does() -> None:
     where = make_context(64)
     nodes = spectra.band_nodes_nm(400.0, 700.0, 4)
@@ -292,7 +306,9 @@ def test_the_mask_is_the_whole_image_and_a_clean_lens_does_nothing() -> None:
     np.testing.assert_allclose(applied(grey, NONE, where), grey.array, rtol=1e-6)
 
 
-def test_the_lens_is_the_one_named() -> None:
+def test_lenses_are_found_or_refused() -> None:
+    with pytest.raises(InputError, match="no_such_lens"):
+        make("optics_degradation", model="contamination", lens="no_such_lens")
     where = make_context(64)
     params = NONE | {"dose_krad": 3000.0}
     packaged = colours(params | {"lens": "nikkor_35_f2p8"}, where)

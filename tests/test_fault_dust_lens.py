@@ -472,6 +472,15 @@ def test_draws_keep_to_their_keys() -> None:
     assert np.abs(drawn["x_mm"]).max() <= half
 
 
+def test_no_grains_change_nothing() -> None:
+    context = lit(make_context(128), 0.1, 0.0)
+    fault = make("dust_on_optics", model="defocused", count=0)
+    params = fault.draw(context, rng())
+    grey = flat_electrons(context)
+    assert np.array_equal(fault.apply(grey, params, context).array, grey.array)
+    assert not fault.footprint(params, context).any()  # type: ignore[union-attr]
+
+
 def test_mask_holds_what_loses_enough(tmp_path: Path) -> None:
     context = thin_context()
     params = grains(window_lens(tmp_path, distance=20.0, pupil=4.0), (0.3, 0.1, 1.0))

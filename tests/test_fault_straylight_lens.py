@@ -16,6 +16,7 @@ from vbnfault.core import spectra
 from vbnfault.core.errors import InputError
 from vbnfault.core.shared_results import SharedResults
 from vbnfault.faults import FaultContext, from_dict, registry
+from vbnfault.lens import load_lens, paraxial_properties, scaled_to_focal_length
 from vbnfault.lens.coating import mean_reflectance
 from vbnfault.lens.rays import ghost, transmittance
 from vbnfault.lens.straylight.irradiance import FlareModel
@@ -140,6 +141,8 @@ def test_the_lens_is_the_cameras_own_or_the_one_named() -> None:
     np.testing.assert_array_equal(default, named)
     other, _ = light("traced", where, lens="tessar_50_f2p8", coating="as_prescribed")
     assert np.abs(other - named).max() > 0
+    scaled = scaled_to_focal_length(load_lens("tessar_50_f2p8"), where.camera.lens.focal_length_mm)
+    assert paraxial_properties(scaled).efl_mm == pytest.approx(where.camera.lens.focal_length_mm)
     assert params["lens"] == "nikkor_35_f2p8"
     with pytest.raises(InputError, match=r"scene\.toml: faults\.straylight|no_such_lens"):
         from_dict("straylight", {"model": "traced", "lens": "no_such_lens"}, source="scene.toml")

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from test_faults_kit import FOV_DEG, flat_electrons, make, make_context, rng
 
+from vbnfault.lens.thin import cos4_map
+
 
 @pytest.mark.parametrize("e0", [0.0, 105.0, 255.0])
 def test_factor_at_centre_edge_and_corner(e0: float) -> None:
@@ -44,3 +46,15 @@ def test_mask_starts_at_the_stated_loss() -> None:
         .footprint({"on_axis_illuminance_dn": 200.0, "mask_loss": 0.1}, context)
         .all()
     )  # type: ignore[union-attr]
+
+
+def test_draws_fill_the_table() -> None:
+    values = [make("vignetting").draw(make_context(64), rng(s))["on_axis_illuminance_dn"] for s in range(200)]
+    assert 105 <= min(values) < 115
+    assert 245 < max(values) <= 255
+
+
+def test_map_is_shared_and_protected() -> None:
+    assert cos4_map((64, 64), 90.0) is cos4_map((64, 64), 90.0)
+    with pytest.raises(ValueError, match="read-only"):
+        cos4_map((64, 64), 90.0)[0, 0] = 0

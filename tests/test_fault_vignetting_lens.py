@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from test_faults_kit import flat_electrons, make, make_context, rng
 
 from vbnfault.camera import Camera
+from vbnfault.core.errors import InputError
 from vbnfault.detector import ThreeColourDetector
 from vbnfault.faults import FaultContext
 from vbnfault.lens import RealLens, ThinLens, load_lens, paraxial_properties, scaled_to_field
@@ -245,3 +246,8 @@ def test_mask_starts_at_the_stated_loss() -> None:
         found = left(params, where)
         clear = np.abs(found - (1 - loss)) > 1e-6
         assert np.array_equal(mask[clear], found[clear] < 1 - loss)  # type: ignore[index]
+
+
+def test_a_lens_that_is_not_there_is_refused() -> None:
+    with pytest.raises(InputError, match="no_such_lens"):
+        make("vignetting", model="lens", lens="no_such_lens")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Callable
 from itertools import pairwise
 from typing import Any
@@ -219,6 +221,15 @@ def test_particles_grow_with_the_level_and_vanish_when_clean() -> None:
     np.testing.assert_array_equal(particle_bsdf(500.0, 550.0, [1.0, 1.7]), 0)
 
 
+def test_nothing_heavy_is_imported() -> None:
+    script = (
+        "import sys, vbnfault.lens.straylight.particles as s; s.scattered_intensity(3.0, 1.0); "
+        "assert not {'miepython', 'numba', 'matplotlib'} & set(sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
 # --- a lens -----------------------------------------------------------------------------------------------------
 
 STOP: dict[str, Any] = {"stop": True, "thickness_mm": 0.0, "diameter_mm": 10.0}
@@ -332,6 +343,25 @@ def test_an_image_is_the_formula_at_every_pixel() -> None:
             assert image[band, row, column] == pytest.approx(expected, rel=1e-3)
 
 
+def test_images_turn_with_the_sun() -> None:
+    lens = load_lens("nikkor_35_f2p8")
+    on_axis = veiling_glare(lens, GREEN, sun_deg=0.0)
+    image = image_of(on_axis, (0.0, 0.0), (65, 65), 0.1)[0]
+    for turned in (np.rot90(image), image[::-1], image.T):
+        np.testing.assert_allclose(turned, image, rtol=1e-3)  # a step of the table: 4e-4 in r², times slope/2
+    assert np.isfinite(image).all()
+    assert np.unravel_index(image.argmax(), image.shape) == (32, 32)
+    assert (np.diff(image[32, 32:]) < 0).all()
+    aside = veiling_glare(lens, Bands.lines(450.0, 550.0), sun_deg=20.0)
+    far = paraxial_properties(lens).efl_mm * np.tan(np.radians(20.0))
+    right = image_of(aside, (far, 0.0), (33, 33), 0.2)
+    assert (np.diff(right[:, 16], axis=1) > 0).all()  # brighter towards +x, where the Sun is
+    np.testing.assert_allclose(image_of(aside, (-far, 0.0), (33, 33), 0.2), right[..., ::-1], rtol=1e-3)
+    below = image_of(aside, (0.0, far), (33, 33), 0.2)
+    np.testing.assert_allclose(below, np.swapaxes(right, 1, 2), rtol=1e-3)
+    assert (right[0] > right[1]).all()  # bluer
+
+
 def test_light_past_a_rim_in_front() -> None:
     """A window whose rim stands 20 mm before the stop lights what two discs have in common."""
     window = {"radius_mm": np.inf, "thickness_mm": 0.0, "nd": 1.5, "diameter_mm": 12.0}
@@ -364,18 +394,27 @@ def test_a_baffle_against_a_grid() -> None:
         assert max(share, 1e-6) == pytest.approx((entrance & through).sum() / entrance.sum(), abs=1e-4)
     assert found[0] == 1
     assert found[-1] == 1e-6
-    # equal discs: (2/π)(arccos q - q √(1-q²)), q = length tan θ / 2a
-    q = 50.0 * np.tan(np.radians(10.0)) / 20.0
-    equal = baffle_transmission(10.0, length_mm=50.0, radius_mm=10.0, entrance_radius_mm=10.0)
-    assert equal == pytest.approx(2 / np.pi * (np.arccos(q) - q * np.sqrt(1 - q * q)), rel=1e-9)
-    assert (baffle_transmission(angles, entrance_radius_mm=10.0) == 1).all()
     bare = baffle_transmission(
         [20.0, 90.0], length_mm=80.0, radius_mm=13.0, entrance_radius_mm=10.0, vane_attenuation=0.0
     )
     np.testing.assert_array_equal(bare, 0)
 
 
-# --- bad input --------------------------------------------------------------------------------------------------
+def test_a_baffle_only_shades() -> None:
+    angles = np.linspace(0, 180, 721)
+    for radius in (10.0, 10.001, 30.0):
+        share = baffle_transmission(
+            angles, length_mm=50.0, radius_mm=radius, entrance_radius_mm=10.0, vane_attenuation=1e-9
+        )
+        assert (np.diff(share) <= 0).all()
+        assert share.min() == 1e-9
+        assert share[0] == pytest.approx(1.0, rel=1e-12)
+    assert (baffle_transmission(angles, entrance_radius_mm=10.0) == 1).all()
+    # equal discs: (2/π)(arccos q - q √(1-q²)), q = length tan θ / 2a
+    q = 50.0 * np.tan(np.radians(10.0)) / 20.0
+    lens_shaped = 2 / np.pi * (np.arccos(q) - q * np.sqrt(1 - q * q))
+    equal = baffle_transmission(10.0, length_mm=50.0, radius_mm=10.0, entrance_radius_mm=10.0)
+    assert equal == pytest.approx(lens_shaped, rel=1e-9)
 
 
 @pytest.mark.parametrize("name", ["nikkor_28_f2p8", "heliar_100_f3p5"])
@@ -400,3 +439,17 @@ def test_all_scattered_flux_arrives(name: str) -> None:
     surfaces = [Harvey.of_roughness(roughness_nm=1.0, index_step=s) for s in np.diff(lens.indices(550.0))]
     clean = veiling_glare(lens, GREEN, sun_deg=0.0)
     assert clean.glare_total_fraction[0] == pytest.approx(sum(s.tis for s in surfaces), rel=1e-9)
+
+
+def test_the_table_of_dust_is_the_same_from_disk() -> None:
+    """The table that the process keeps equals the one read from disk and, at some sizes, the one computed."""
+    edges, angles, kept = particles._intensities(particles.DUST_INDEX)
+    particles._intensities.cache_clear()
+    read = particles._intensities(particles.DUST_INDEX)[2]
+    assert read is not kept
+    np.testing.assert_array_equal(read, kept)
+    assert not read.flags.writeable
+    some = slice(0, None, 200)
+    middle = np.sqrt(edges[1:] * edges[:-1])[some]
+    # a matrix product of other rows may be summed in another order
+    np.testing.assert_allclose(particles.scattered_intensity(middle, np.cos(angles)), kept[some], rtol=1e-9)

@@ -258,6 +258,18 @@ def test_wings_lie_around_the_image_of_a_lens_that_distorts() -> None:
     assert np.abs(made * same - wanted).sum() < 1e-3 * wanted.sum()
 
 
+def test_the_tables_of_wings_are_made_once_and_not_for_dark_sources(monkeypatch: pytest.MonkeyPatch) -> None:
+    lens, nodes = with_blades(0), Bands.lines(450.0, 650.0)
+    assert starburst_of_source(lens, nodes, 1e-3) == starburst_of_source(lens, nodes, 1e-3)  # and so their tables
+    # a narrower disc would have rings that the tables do not resolve: at least three Airy units of the longest wave
+    airy_rad = 650e-6 / paraxial_properties(lens).entrance_pupil_diameter_mm
+    assert starburst_of_source(lens, nodes, 1e-9).sun_radius_rad == pytest.approx(3 * airy_rad)
+    monkeypatch.setattr("vbnfault.lens.straylight.scene._wings", pytest.fail)
+    scene = replace(behind(lens, 16, 35.0), diffraction=True)
+    dark = np.zeros((1, scene.render.shape[0] ** 2), np.float32)
+    assert not scene.starburst([(scene.render, dark)], np.eye(1)).any()
+
+
 def test_the_image_loses_what_the_stop_diffracts() -> None:
     """Light in the frame and beyond it, beyond 7 px, is the fraction that the image loses, but for the fade-in."""
     scene = replace(behind(with_blades(6), 96, 20.0), diffraction=True)
@@ -428,13 +440,13 @@ def test_a_response_is_traced_once_and_read_by_others(
 ) -> None:
     """Bit for bit; damage is found, whichever byte it is in, and the response is traced and kept again."""
     scene = behind(singlet, 8, 30.0)
-    counted, trace = [0], ghost_response._traced_table
+    counted, trace = [0], ghost_response._Tracing.table
 
     def counting(*args: Any) -> F32:
         counted[0] += 1
         return trace(*args)
 
-    monkeypatch.setattr(ghost_response, "_traced_table", counting)
+    monkeypatch.setattr(ghost_response._Tracing, "table", counting)
     traced = fresh(scene)
     (path,) = folder.iterdir()
     good = path.read_bytes()
@@ -462,7 +474,10 @@ def test_what_changes_a_response_changes_its_key(singlet: Prescription) -> None:
     first, *others = singlet.surfaces
     changed = [
         replace(first, radius_mm=61.0),
+        replace(first, semi_diameter_mm=7.9),
         replace(first, medium=replace(first.medium, coefficients=(1.61, 0.0))),
+        replace(first, conic=0.1),
+        replace(first, internal_transmittance_10mm=((400.0, 700.0), (0.9, 0.9))),
     ]
     keys = [
         key(),
@@ -473,6 +488,7 @@ def test_what_changes_a_response_changes_its_key(singlet: Prescription) -> None:
         key(loss=0.5),
         key(model="paraxial"),
         key(of=behind(singlet, 8, 31.0)),
+        key(of=behind(singlet, 10, 30.0)),
     ]
     assert len(set(keys)) == len(keys)
     assert key(replace(singlet, name="other", source="other")) == keys[0]

@@ -103,7 +103,12 @@ def fraunhofer_psf(
 @pytest.mark.parametrize("blades", [5, 6, 7, 8, 9])
 def test_even_blades_give_as_many_spikes_and_odd_ones_twice_as_many(blades: int) -> None:
     expected = blades * (1 + blades % 2)
+    stop = lens_with(blades).surfaces[0]
+    psf, _ = fraunhofer_psf(stop, NM, samples=512, across=128)
     angle = np.linspace(0, 2 * np.pi, 1440, endpoint=False)
+    radius = np.arange(100.0, 180.0)[:, None]  # 25 to 45 fringes of the whole pupil, averaged
+    rings = map_coordinates(psf, [256 + radius * np.sin(angle), 256 + radius * np.cos(angle)], order=1)
+    assert count_spikes((rings * radius**2).mean(axis=0)) == expected
     frame = starburst(lens_with(blades), sun_radius_rad=1e-3, table=(224, 1024)).image(
         frame_at((0, 0), np.array([NM]), (401, 401), 0.02)
     )[0]
@@ -111,15 +116,26 @@ def test_even_blades_give_as_many_spikes_and_odd_ones_twice_as_many(blades: int)
     assert count_spikes(circle) == expected
 
 
-def test_the_pattern_turns_with_the_stop() -> None:
-    """Three blades, the first corner at 17°: normals of edges at 77° and every 60° from there on."""
-    frame = starburst(lens_with(3, rotation_deg=17.0), sun_radius_rad=1e-3, table=(224, 1024)).image(
+def test_the_pattern_grows_with_the_wavelength_and_turns_with_the_stop() -> None:
+    stop = lens_with().surfaces[0]
+    dark = []
+    for nm in (450.0, 675.0):
+        psf, pitch = fraunhofer_psf(stop, nm, samples=1024, across=64)
+        dark.append((10 + int(np.argmin(psf[512, 522:540]))) * pitch)
+    # 1.2197 λ f / D, found to half a sample of λ f / 16 D
+    assert dark == pytest.approx([1.2197 * nm * 1e-6 * 100 / DIAMETER_MM for nm in (450.0, 675.0)], rel=0.03)
+    assert dark[1] / dark[0] == pytest.approx(1.5, rel=1e-9)
+    # three blades, the first corner at 17°: normals of edges at 77° and every 60° from there on
+    turned = lens_with(3, rotation_deg=17.0)
+    psf, _ = fraunhofer_psf(turned.surfaces[0], NM, samples=513, across=128)
+    frame = starburst(turned, sun_radius_rad=1e-3, table=(224, 1024)).image(
         frame_at((0, 0), np.array([NM]), (513, 513), 0.02)
     )[0]
-    r, angle = distance_and_angle(frame.shape)
-    ring = (r > 120) & (r < 200)
-    bright = np.angle(np.sum((frame * r**2)[ring] * np.exp(6j * angle[ring]))) / 6
-    assert math.degrees(bright) % 60 == pytest.approx(17.0, abs=0.5)
+    for picture in (psf, frame):
+        r, angle = distance_and_angle(picture.shape)
+        ring = (r > 120) & (r < 200)
+        bright = np.angle(np.sum((picture * r**2)[ring] * np.exp(6j * angle[ring]))) / 6
+        assert math.degrees(bright) % 60 == pytest.approx(17.0, abs=0.5)
 
 
 # --- the Sun's disc against the transform of the pupil ----------------------------------------------------------

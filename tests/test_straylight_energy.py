@@ -20,7 +20,6 @@ from vbnfault.core.quantities import Electrons, Radiance
 from vbnfault.core.spectra import Bands
 from vbnfault.detector import ThreeColourDetector
 from vbnfault.faults import FaultContext, from_dict, registry
-from vbnfault.faults.straylight_lens import channel_bands
 from vbnfault.lens import (
     Prescription,
     RealLens,
@@ -32,7 +31,7 @@ from vbnfault.lens import (
 )
 from vbnfault.lens.coating import mean_reflectance
 from vbnfault.lens.straylight.scatter import Cleanliness
-from vbnfault.lens.straylight.settings import GhostSettings, SensorGrid, StraylightSettings, SunSource
+from vbnfault.lens.straylight.settings import DirectPath, GhostSettings, SensorGrid, StraylightSettings, SunSource
 from vbnfault.lens.straylight.total import SunInLens, SunStraylight
 from vbnfault.output import flare_images
 
@@ -208,10 +207,28 @@ def test_a_frame_with_all_straylight_holds_what_enters(camera: str, sun_deg: flo
     x = (np.arange(SIZE) + 0.5 - SIZE / 2) / where.camera.focal_length_px
     caught = ((1 + x[None, :] ** 2 + x[:, None] ** 2) ** -2).sum() / np.pi / where.camera.focal_length_px**2
     # what of the Sun's light leaves the frame, from the model itself, checked by a wider frame above
-    source = fault.sun_in_lens(params, where)
-    assert source is not None
-    found = source.straylight()
-    to_e = channel_bands(where)[1] * where.camera.exposure_s / source.sensor.pitch_mm**2
+    pitch_mm = where.camera.detector.pixel_pitch_um * 1e-3
+    area = where.camera.lens.pupil_area_mm2([np.tan(np.radians(sun_deg)), 0.0])
+    assert where.sun_xy_px is not None
+    nm = spectra.fine_nodes_nm(NODES)
+    sensed = where.camera.detector.electron_rates(nm) * spectra.solar_irradiance_W_m2_nm(nm)
+    found = SunInLens(
+        lens=where.frame.prescription(params["lens"], params["coating"]),
+        bands=Bands.of(nm, sensed),
+        sensor=SensorGrid(shape=where.shape, pitch_mm=pitch_mm),
+        sun=SunSource(
+            angle_deg=sun_deg,
+            radius_rad=spectra.sun_angular_radius_rad(1.0),
+            image_xy_mm=(float((where.sun_xy_px[0] - SIZE / 2) * pitch_mm), 0.0),
+        ),
+        settings=StraylightSettings(cleanliness=Cleanliness(level=200.0, roughness_nm=1.0), veil_fraction=0.02),
+        path=DirectPath(
+            transmittance=where.camera.lens.transmittance(nm),
+            admitted_mm2=float(area[0] * np.cos(np.radians(sun_deg))),
+            beam_fraction=float(area[0] / area[1]),
+        ),
+    ).straylight()
+    to_e = np.trapezoid(sensed, nm, axis=1) * where.camera.exposure_s / pitch_mm**2
     gone = to_e * beyond_mm2(found)
     ghosts = to_e * found.ghosts.flux_mm2
     total = after.past_rims.sum(axis=(0, 1), dtype=np.float64) + gone - scene_e * (1 - kept) * caught
@@ -254,7 +271,9 @@ def test_light_that_has_met_the_rims_is_not_vignetted_again(model: str, vignetti
         np.testing.assert_allclose(apart.merged.array, whole.array, rtol=1e-5)
 
 
-@pytest.mark.parametrize("moved", [{"hood_offset": 0.6}, {"decentre": 0.7}, {"hood_offset": 10.0}])
+@pytest.mark.parametrize(
+    "moved", [{"hood_offset": 0.6}, {"decentre": 0.7}, {"hood_offset": 0.4, "decentre": 0.4}, {"hood_offset": 10.0}]
+)
 def test_a_moved_hood_or_ring_takes_of_the_sun_what_it_takes_of_its_beam(moved: dict[str, float]) -> None:
     """All light past the rims loses the fraction that the scene loses by the fault at the Sun's pixel."""
     where = thin_context(12.0)
@@ -330,6 +349,38 @@ def test_the_sun_in_a_build_is_vignetted_once() -> None:
     np.testing.assert_allclose(plain.past_rims.sum(axis=(0, 1), dtype=np.float64), admitted, rtol=1e-4)
     np.testing.assert_array_equal(plain.past_rims, dimmed.past_rims)
     assert dimmed.array[0].sum() < plain.array[0].sum() or not plain.array[0].any()
+
+
+def test_the_mask_level_is_that_of_the_mask() -> None:
+    """The mask holds the pixels that change by `mask_level_dn` or more, the effect all that change."""
+    from conftest import small_scene
+
+    from vbnfault.dataset import store_spec
+    from vbnfault.pipeline import Session
+    from vbnfault.scene import config
+
+    table = small_scene(
+        camera={"width_px": 48, "height_px": 48},
+        plan={"faulty_fraction": 1.0, "mode": "per_class"},
+        dataset={"layers": ["clean", "mask_effect"]},
+    )
+    table["faults"] = {"straylight": {"model": "texture", "mask_level_dn": 40}}
+    session = Session(config.parse_scene(table, source="test"))
+    seen = 0
+    for index in range(8):
+        frame = session.frame(index)
+        if "straylight" not in frame.drawn:
+            continue
+        development, draws = frame.injection.development, frame.injection.draws
+        with_it, without = (development.image(d, noisy=False).array.astype(int) for d in (draws, {}))
+        change = np.abs(with_it - without).max(axis=2)
+        np.testing.assert_array_equal(frame.labels.masks[0], change >= 40)
+        np.testing.assert_array_equal(frame.labels.effects["straylight"], change >= 1)
+        seen += (frame.labels.masks[0] != frame.labels.effects["straylight"]).any()
+    assert seen
+    spec = store_spec(session, [16])
+    assert spec.mask_kinds == ("strong effect",)
+    assert "mask_level_dn = 40 DN" in spec.mask_rules[0]
 
 
 # --- the veil ----------------------------------------------------------------------------------------------------

@@ -147,8 +147,8 @@ class _Particles(Fault):
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
         """Return the drawn density and one list per property of the grains that show."""
         density = self.density_per_m3.uniform(rng)
-        velocity = _random_directions(1, rng)[0] * self.camera_speed_m_s.uniform(rng)
-        up = context.up_C if context.up_C is not None else _random_directions(1, rng)[0]
+        velocity = _random_direction(rng) * self.camera_speed_m_s.uniform(rng)
+        up = context.up_C if context.up_C is not None else _random_direction(rng)
         grains = _Population(self, context, density=density, camera_velocity=velocity, up=up).drawn(rng)
         return {
             "density_per_m3": density,
@@ -255,18 +255,12 @@ class _Sunlight(NamedTuple):
         rise = reddening_per_100nm * (self.wavelength_nm - _REFERENCE_NM) / 100
         return self.irradiance * np.maximum(1 + rise, 0)
 
-    @property
-    def width_nm(self) -> F64:
-        """Return the width of each band, float64[band]; a single band covers 300 nm."""
-        nodes = self.wavelength_nm
-        if len(nodes) == 1:
-            return np.array([300.0])
-        edges = np.concatenate([nodes[:1], (nodes[1:] + nodes[:-1]) / 2, nodes[-1:]])
-        return np.diff(edges)
-
     def total(self, reddening_per_100nm: float) -> float:
-        """Return `reflected` summed over the bands, in W/m²."""
-        return float(self.reflected(reddening_per_100nm) @ self.width_nm)
+        """Return `reflected` summed over the bands, in W/m²; a single band covers 300 nm."""
+        nodes = self.wavelength_nm
+        edges = np.concatenate([nodes[:1], (nodes[1:] + nodes[:-1]) / 2, nodes[-1:]])
+        width_nm = np.diff(edges) if len(nodes) > 1 else np.array([300.0])
+        return float(self.reflected(reddening_per_100nm) @ width_nm)
 
     def phase_deg(self, towards: F64) -> F64:
         """Return the phase angles of grains in unit directions float64[n, 3]; 90° where the Sun is unknown."""
@@ -357,11 +351,6 @@ class _GrainsInView(NamedTuple):
     def select(self, keep: NDArray[Any]) -> _GrainsInView:
         """Return the grains that a mask, a slice or indices select."""
         return _GrainsInView(*(values[keep] for values in self))
-
-    @classmethod
-    def joined(cls, parts: list[_GrainsInView]) -> _GrainsInView:
-        """Return the grains of several arrays."""
-        return cls(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
 def _image_radius_px(grains: _GrainsInView, context: FaultContext) -> F64:
@@ -522,7 +511,8 @@ class _Population:
             keep = self._shows(grains)
             shown.append(grains.select(keep))
             owners.append(of[keep])
-        whole, of = _GrainsInView.joined(shown), np.concatenate(owners)
+        whole = _GrainsInView(*(np.concatenate(column) for column in zip(*shown, strict=True)))
+        of = np.concatenate(owners)
         for k in np.unique(of):
             yield whole.select(of == k)
 
@@ -530,7 +520,9 @@ class _Population:
         """Return grains of the whole volume, each with its motion and its light."""
         fault, camera = self.fault, self.context.camera
         uniform = rng.random((8, count))
-        radius_mm = self._radii(uniform[0])
+        # in proportion to the number of grains and the volume in which each can show
+        below = self.shown_below
+        radius_mm = np.exp(np.interp(uniform[0] * below[-1], below, np.log(self.radius_mm)))
         depth, reach = self._depths(radius_mm, uniform[1], uniform[2]), self._reach_m(radius_mm)
         edge = self.half[:, None] + reach / depth
         slope = (edge * (2 * uniform[3:5] - 1)).T
@@ -545,7 +537,7 @@ class _Population:
         phase_deg = self.sun.phase_deg(towards)
         light = albedo * phase_function(phase_deg, fault.phase_slope_mag_deg)
         if fault.diffraction:
-            light = light + diffracted(radius_mm, phase_deg)
+            light += diffracted(radius_mm, phase_deg)
         focus = abs(1 / depth - 1 / camera.lens.focus_distance_m)
         return _GrainsInView(
             x_px=(first[:, 0] + last[:, 0]) / 2,
@@ -560,11 +552,6 @@ class _Population:
             slope_y=slope[:, 1],
             irradiance_W_m2=self.flux_W_m2 * light * (radius_mm * 1e-3 / distance) ** 2,
         )
-
-    def _radii(self, uniform: F64) -> F64:
-        """Return radii in mm, in proportion to the number of grains and the volume in which each can show."""
-        below = self.shown_below
-        return np.exp(np.interp(uniform * below[-1], below, np.log(self.radius_mm)))
 
     def _depths(self, radius_mm: F64, uniform: F64, choice: F64) -> F64:
         """Return depths in m, in proportion to the cross-section of the volume there."""
@@ -600,9 +587,9 @@ def _directions(slopes: F64) -> F64:
     return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
 
 
-def _random_directions(count: int, rng: np.random.Generator) -> F64:
-    """Return unit vectors in all directions, float64[n, 3]."""
-    return _in_cone(np.array([0.0, 0.0, 1.0]), 180.0, *rng.random((2, count)))
+def _random_direction(rng: np.random.Generator) -> F64:
+    """Return a unit vector in any direction, float64[3]."""
+    return np.asarray(_in_cone(np.array([0.0, 0.0, 1.0]), 180.0, *rng.random((2, 1)))[0])
 
 
 def _in_cone(axis: F64, half_angle_deg: float, height: F64, turn: F64) -> F64:

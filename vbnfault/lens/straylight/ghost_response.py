@@ -250,6 +250,15 @@ class _Tracing:
             out.append(box)
         return out
 
+    def table(self) -> F32:
+        """Return `GhostResponse.table`."""
+        count = len(self.cells.slopes)
+        table = np.zeros((self.bands, self.nodes, self.cells.rings, count), dtype=np.float32)
+        if self.routes:
+            for ring in range(count):
+                table[..., ring] = self.ring(ring)
+        return table
+
     def ring(self, ring: int) -> F32:
         """Return one ring's part of the table, float32[band, harmonic, ring].
 
@@ -297,14 +306,15 @@ class _Tracing:
         wide = np.where(seen, near[..., 3], 0).max(axis=0)[route]
         return route, np.column_stack([(low + high) / 2, wide / 2, (high - low) / 2, wide / 2])
 
-    def _bundles(self, route: NDArray[np.int64], box: F64, slope: float) -> Rays:
-        """Return the bundles of routes at the middle node."""
+    def _bundles(self, route: NDArray[np.int64], box: F64, *slopes: float) -> Rays:
+        """Return the bundles of routes at the middle node, for one field angle after the other."""
+        turns, slope = len(slopes), np.repeat(slopes, len(route))
         cosine = 1 / np.hypot(1, slope)
         return Rays(
-            route=route,
-            wavelength=np.full(len(route), self.middle),
-            box_mm=box,
-            direction=np.tile([slope * cosine, 0.0, cosine], (len(route), 1)),
+            route=np.tile(route, turns),
+            wavelength=np.full(len(slope), self.middle),
+            box_mm=np.tile(box, (turns, 1)),
+            direction=np.column_stack([slope * cosine, np.zeros(len(slope)), cosine]),
         )
 
     def _near(self, route: NDArray[np.int64], box: F64, slope: float) -> _Ghosts:
@@ -355,18 +365,16 @@ class _Tracing:
         spectra = GhostSpectra.of(self.tracer, rays, reach_mm)
         return spectra.of_bands(self.middle).astype(np.float32)
 
-    def _traced(self, ghosts: _Ghosts, across: int, sources: _Sources, colours: F32) -> _Arrived:
-        """Return where the rays of all sources arrive, for the half of each box with y > 0."""
+    def _traced(self, ghosts: _Ghosts, across: int, sources: _Sources, colours: F32) -> tuple[NDArray[Any], ...]:
+        """Return the rays of all sources that arrive within the rings, for the half of each box with y > 0.
+
+        They are given by the first of the four cells around each, int[ray], its position between them across and
+        along the ring, float32[ray] each, and its light, float32[ray, band].
+        """
         be = backend()
         dr, Float, UInt32 = be.dr, be.Float, be.UInt32
-        count, turns = len(ghosts), len(sources.slope)
-        parts = [self._bundles(ghosts.route, ghosts.box_mm, float(slope)) for slope in sources.slope]
-        rays = Rays(
-            route=np.tile(parts[0].route, turns),
-            wavelength=np.tile(parts[0].wavelength, turns),
-            box_mm=np.tile(ghosts.box_mm, (turns, 1)),
-            direction=np.concatenate([part.direction for part in parts]),
-        )
+        count = len(ghosts)
+        rays = self._bundles(ghosts.route, ghosts.box_mm, *sources.slope)
         spots = self.tracer.trace(rays, across, centred=True, halved=False)
         light = lit_cells(spots, across)
         # the Sun's beam is inclined, and both halves of the box count
@@ -394,16 +402,14 @@ class _Tracing:
         cell, across_ring, along_ring, flux, bundle = (
             dr.gather(type(v), v, kept).numpy() for v in (cell, across_ring, along_ring, flux, bundle)
         )
-        return _Arrived(cell, across_ring, along_ring, flux[:, None] * colours[bundle % count])
+        return cell, across_ring, along_ring, flux[:, None] * colours[bundle % count]
 
-    def _in_cells(self, arrived: Sequence[_Arrived]) -> F32:
+    def _in_cells(self, arrived: Sequence[tuple[NDArray[Any], ...]]) -> F32:
         """Return the light in the cells of the half turn, both sides together, float32[cell, band]."""
         from scipy.sparse import csc_matrix
 
         rings, nodes = self.rings, self.nodes
-        first = np.concatenate([part.cell for part in arrived]).astype(np.int32)
-        across = np.concatenate([part.across for part in arrived])
-        along = np.concatenate([part.along for part in arrived])
+        first, across, along, light = (np.concatenate(column) for column in zip(*arrived, strict=True))
         cells, weights = np.empty((len(first), 4), dtype=np.int32), np.empty((len(first), 4), dtype=np.float32)
         for k, (step, weight) in enumerate(
             (
@@ -413,11 +419,11 @@ class _Tracing:
                 (nodes + 1, across * along),
             )
         ):
-            cells[:, k], weights[:, k] = first + step, weight
+            cells[:, k], weights[:, k] = first.astype(np.int32) + step, weight
         indptr = np.arange(0, 4 * len(first) + 1, 4, dtype=np.int32)
         shape = _LEVELS * rings * nodes, len(first)
         spread = csc_matrix((weights.ravel(), cells.ravel(), indptr), shape=shape)
-        return np.asarray(spread @ np.concatenate([part.light for part in arrived]))
+        return np.asarray(spread @ light)
 
 
 @dataclass(frozen=True, eq=False)
@@ -451,20 +457,6 @@ class _Sources:
     slope: F64
     mirrored: NDArray[np.bool_]
     spacing: float
-
-
-@dataclass(frozen=True, eq=False)
-class _Arrived:
-    """Hold the rays that arrive within the rings.
-
-    They are given by the first of the four cells around each, int[ray], its position between them across and along
-    the ring, float32[ray], and its light, float32[ray, band].
-    """
-
-    cell: NDArray[Any]
-    across: F32
-    along: F32
-    light: F32
 
 
 def _lit_spacing(spots: Spots, light: Any, across: int) -> Any:
@@ -573,29 +565,12 @@ def _response(
 
     def traced() -> dict[str, F32]:
         activity.begin(f"ghosts of {lens.name} at every field angle (new response)")
-        return {"table": _traced_table(lens, bands, cells, settings, coating_loss)}
+        return {"table": _Tracing(lens, bands, cells, settings, coating_loss).table()}
 
     key = response_key(lens, bands, cells, settings, coating_loss)
     table = RESPONSES.kept(key, traced)["table"]
     table.setflags(write=False)
     return GhostResponse(cells=cells, table=table)
-
-
-def _traced_table(
-    lens: Prescription,
-    bands: Bands,
-    cells: PolarCells,
-    settings: GhostSettings,
-    coating_loss: float,
-) -> F32:
-    """Return `GhostResponse.table` at one coating loss."""
-    tracing = _Tracing(lens, bands, cells, settings, coating_loss)
-    count = len(cells.slopes)
-    table = np.zeros((len(bands), tracing.nodes, cells.rings, count), dtype=np.float32)
-    if tracing.routes:
-        for ring in range(count):
-            table[..., ring] = tracing.ring(ring)
-    return table
 
 
 def response_key(
