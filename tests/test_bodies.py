@@ -297,6 +297,23 @@ def test_names_and_overrides() -> None:
     assert other.body.photometry == registry()["lambert"]()
 
 
+def test_the_ground_of_a_named_body_fills_the_keys_that_a_scene_leaves_out() -> None:
+    ground = bodies.packaged_bodies()["67p"].patch
+    assert ground["relief"] < 1
+    for tables, relief in (
+        ({"body": {"name": "67P"}}, ground["relief"]),
+        ({"patch": {"preset": "67p"}}, ground["relief"]),
+        ({"patch": {"preset": "67P", "relief": 0.7}}, 0.7),
+        ({"body": {"name": "67P"}, "patch": {"preset": "none"}}, 1.0),
+        ({"body": {"name": "67P/Churyumov-Gerasimenko"}}, 1.0),
+        ({}, 1.0),
+    ):
+        patch = config.parse_scene({"title": "t", **tables}, source="test").patch
+        assert patch.relief == relief, tables
+    with pytest.raises(InputError, match=r"patch.preset = 'Pluto': must be 'none' or one of .*bennu.*ryugu"):
+        config.parse_scene({"title": "t", "patch": {"preset": "Pluto"}}, source="test")
+
+
 def test_67p_by_its_full_name_is_a_scene_without_a_name() -> None:
     assert scene_of("67P/Churyumov-Gerasimenko") == config.parse_scene({"title": "t"}, source="t.toml")
     short, full = scene_of("67P").body, scene_of("67P/Churyumov-Gerasimenko").body

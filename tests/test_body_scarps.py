@@ -10,7 +10,7 @@ from conftest import small_scene
 from vbnfault.body import Body, PatchSpec, build_patch, site_at
 from vbnfault.body.fields import Octaves
 from vbnfault.body.geometry import mean_edge_m
-from vbnfault.body.relief import _unevenness
+from vbnfault.body.relief import _contour_scarps, _unevenness
 from vbnfault.body.roughness import Roughness
 from vbnfault.body.scarps import Form, form, gathered
 from vbnfault.pipeline import Session
@@ -126,6 +126,7 @@ def test_angular_relief_differs_where_it_is_longer_than_20_m(half_rough: Body) -
         ("relief", 0.3),
         ("hurst", 0.4),
         ("scarps", 0.2),
+        ("contour_scarps", 0.4),
         ("intermittency", 0.6),
         ("angularity", 0.7),
         ("craters_per_km2", 5.0),
@@ -158,3 +159,42 @@ def test_scarps_move_the_ground_by_their_fraction(half_rough: Body) -> None:
 
 def test_facets_too_coarse_for_scarps_leave_the_ground(half_rough: Body) -> None:
     np.testing.assert_array_equal(heights(half_rough, facet_m=45.0), heights(half_rough, facet_m=45.0, scarps=1.0))
+
+
+def test_contour_scarps_gather_the_rise_of_a_slope_in_steep_lines() -> None:
+    """A slope of 20° over 2 km: where layers crop out, a rise of up to 45 m stands in a scarp between treads.
+
+    Heights return to the slope at the edge of each layer, so they stray by less than a layer.
+    """
+    side = np.arange(0.0, 2000.0, 4.0)
+    x, y = np.meshgrid(side, side, indexing="ij")
+    slope = np.tan(np.radians(20.0))
+    place = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
+    law = Roughness(deviation_m=5.0, baseline_m=75.0, hurst=0.8)
+    noise = Octaves(place, np.full(x.size, 4.0), 3, law, 400.0)
+    added = _contour_scarps(noise, slope * place[:, 0], np.full(x.size, 20.0, np.float32)).reshape(x.shape)
+    assert np.abs(added).max() < 45
+    rise = np.gradient(slope * x + added, 4.0, axis=0)
+    steep = rise > 2 * slope
+    assert 0.01 < steep.mean() < 0.2  # lines, and not areas
+    gentle = rise[(np.abs(added) > 0.5) & ~steep]
+    assert np.median(gentle) < 0.9 * slope
+    # lines run across the slope: what is steep has steep neighbours along y more often than along x
+    along, across = (np.mean(steep & np.roll(steep, 5, axis)) for axis in (1, 0))
+    assert along > 1.5 * across
+
+
+def test_dust_covers_over_metres_where_facets_are_coarse() -> None:
+    """The cover depends on the height over rock; the relief that coarse facets do not show widens its edge."""
+    law = Roughness(deviation_m=5.0, baseline_m=75.0, hurst=0.8)
+    place = np.random.default_rng(0).uniform(0, 5000.0, (4000, 3))
+    spread = []
+    for facet_m in (0.1, 20.0):
+        noise = Octaves(place, np.full(len(place), facet_m), 3, law, 400.0)
+        above = [noise.dust_cover(np.full(len(place), h, np.float32), 0.5) for h in (-40.0, -1.0, 1.0, 40.0)]
+        assert [cover.mean() for cover in above] == sorted(cover.mean() for cover in above)
+        assert above[0].max() < 0.05
+        assert above[3].min() > 0.9
+        spread.append(above[2].mean() - above[1].mean())
+        assert above[2].std() > 0.05  # units of 30 to 300 m differ
+    assert spread[1] < 0.6 * spread[0]

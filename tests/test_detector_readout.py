@@ -5,12 +5,14 @@ from __future__ import annotations
 import dataclasses
 import math
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy import stats
 
 from vbnfault.core.errors import InputError
+from vbnfault.detector.chain import Device
 from vbnfault.detector.readout import (
     ReadoutIndividual,
     ReadoutNoise,
@@ -24,6 +26,7 @@ from vbnfault.detector.readout import (
     transitions_dn,
     transmission_order,
 )
+from vbnfault.detector.sensor import Sensor
 
 IDEAL = ReadoutSpec(read_noise_e_rms=0)
 
@@ -377,3 +380,24 @@ def test_a_bad_spec_is_told_in_a_sentence(values: dict, sentence: str) -> None:
 def test_a_bad_number_of_nodes_is_told_in_a_sentence() -> None:
     with pytest.raises(InputError, match="nodes is 3"):
         node_of((4, 4), 3)
+
+
+@pytest.mark.parametrize("pattern", ["mono", "rggb"])
+def test_a_stretched_image_shows_powers_of_the_fraction_of_white_and_the_bias_as_black(pattern: str) -> None:
+    """255 (DN / range)^0.5 of a linear ramp, and levels of the dark signal above 0 where the bias is black."""
+    sensor = Sensor(width_px=32, height_px=32, pattern=pattern, temperature_K=300.0)
+    raw = np.tile(np.linspace(sensor.readout.bias_dn, sensor.readout.top_dn, 32).astype(np.uint16), (32, 1))
+    linear, root = (
+        Device(replace(sensor, stretch=stretch, black="bias"), 1).rgbi(raw, 1.0).array for stretch in (1.0, 0.5)
+    )
+    # both are rounded to half a level; the root of a level l moves by 8 / sqrt(l) for each
+    exact = 255 * np.sqrt(linear / 255.0)
+    bright = linear > 16
+    assert np.abs(root - exact)[bright].max() <= 0.5 + 8 * 0.5 / np.sqrt(16) + 0.5
+    assert (root[linear == 255] == 255).all()
+    warm = replace(sensor, individual=replace(sensor.individual, dark_current_e_s=300.0))
+    dark = Device(warm, 1).raw(np.zeros((32, 32), np.float32), 3.0, None)
+    above, at_zero = (
+        Device(replace(warm, black=black), 1).rgbi(dark, 3.0).array[..., 3] for black in ("bias", "dark")
+    )
+    assert np.median(at_zero) <= 1 < np.median(above)

@@ -14,6 +14,7 @@ from vbnfault.camera import Camera
 from vbnfault.core import spectra
 from vbnfault.core.quantities import BODY, SKY, Electrons, Radiance
 from vbnfault.pipeline import exposure
+from vbnfault.render.description import View
 from vbnfault.scene import config
 from vbnfault.scene.config import Scene
 from vbnfault.world import cameras, ephemeris
@@ -131,3 +132,23 @@ def test_a_view_without_ground_is_foreseen_at_the_references_exposure(detector: 
     view = SimpleNamespace(intrinsics=(40.0, 40.0, 16.0, 16.0), width_px=32, height_px=32)
     foreseen = exposure.foreseen_exposure_s(scene, camera, sky, view, facet(scene))
     assert foreseen == exposure.reference_exposure_s(scene, camera)
+
+
+@pytest.mark.parametrize(("away_deg", "shorter"), [(0, True), (30, True), (42, True), (60, False), (180, False)])
+def test_the_exposure_is_shorter_where_the_sun_is_near_the_frame(away_deg: float, shorter: bool) -> None:
+    """A frame of 65° across has its corners at 42°; within 10° of them the Sun's veil limits the exposure."""
+    scene = parsed(camera={"exposure_max_s": 2.0, "exposure_max_towards_sun_s": 0.01, "fov_deg": 65.0})
+    focal_px = 16 / np.tan(np.radians(32.5))
+    view = View(
+        position_L_m=np.zeros(3),
+        L_from_C=np.eye(3),
+        intrinsics=np.array([focal_px, focal_px, 16.0, 16.0]),
+        width_px=32,
+        height_px=32,
+    )
+    angle = np.radians(away_deg)
+    towards = SimpleNamespace(direction_L=np.array([np.sin(angle), 0.0, np.cos(angle)]))
+    rendered: Any = SimpleNamespace(view=view, sun=towards)
+    assert exposure.limited(scene, rendered).camera.exposure_max_s == (0.01 if shorter else 2.0)
+    plain = parsed(camera={"exposure_max_s": 2.0})
+    assert exposure.limited(plain, rendered) is plain

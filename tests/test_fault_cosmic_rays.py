@@ -71,6 +71,12 @@ def test_number_of_tracks() -> None:
     assert make("cosmic_rays", flux_per_cm2_s=1e7, most_tracks=50).draw(c, rng())["count"] == 50
 
 
+def test_fluxes_of_a_range_are_even_in_their_logarithm() -> None:
+    fault, c = make("cosmic_rays", flux_per_cm2_s=[5.0, 5e3], most_tracks=1), context()
+    drawn = [fault.draw(c, rng(seed))["flux_per_cm2_s"] for seed in range(200)]
+    assert stats.kstest(np.log10(np.array(drawn) / 5) / 3, "uniform").pvalue > 1e-3
+
+
 def test_slower_protons_leave_more_charge() -> None:
     """80 e/µm of minimum ionisation by Bethe's formula; energies by their power law, as its distribution has it."""
     c = context(size=256)
