@@ -277,7 +277,8 @@ def test_figures_are_small() -> None:
 _DIMENSIONLESS = """
     adc_bits angularity antiblooming apron asymmetry axis bands binning bits blade_rounding blades boulder_index
     bounces
-    camera_axes classes_per_sample coefficients coherent_amplitude coherent_width conic dark_nonuniformity
+    camera_axes classes_per_sample coefficients coherent_amplitude coherent_width conic contour_scarps
+    dark_nonuniformity
     dead_fraction default_material distance_exponent dsnu_freedom dust_contrast eccentricity exposure_stops f_number
     faulty_fraction fill_power gain grain_albedo halo_index hot_clustered_fraction hot_offset_fraction hurst
     individuals
@@ -287,6 +288,7 @@ _DIMENSIONLESS = """
     quantum_efficiency_peak random random_jet_strength random_jets reflectance relief rts_per_interaction
     rts_fraction samples samples_per_pixel scarps seed shadow_hiding_amplitude shadow_hiding_width shard_samples
     sharpen shutter_transmission single_scattering_albedo site sites size_power slope_parameter strata strength
+    stretch
     stuck_bits stuck_fraction sun sun_facing_nominal_fraction sunlit_fraction test tile train transmission
     trap_fraction val value variants_per_view vd wing_index
 """

@@ -48,6 +48,7 @@ _BLOCKS_M = ((17.0, 1.9), (6.0, 0.95), (2.2, 0.40), (0.85, 0.14))
 # (rise, fraction of it that is gathered) of the layers whose edges are scarps along the contours of the ground
 _CONTOURS_M = ((45.0, 0.9), (21.0, 0.8))
 _CONTOUR_FACETS = 2.5  # least width of a scarp: a narrower one has an edge like a saw
+_NOTCH, _NOTCH_FACETS = 0.3, 1.6  # depth of the notch at the foot of a scarp over its rise, and its half-width
 _STRATA_M = ((9.0, 1.3), (3.1, 0.55), (1.1, 0.20))  # thickness of a layer, and how far a hard layer stands out
 
 _DUST_LEAVES_DEG = (27.0, 40.0)  # dust lies on slopes below the first, and has slid off slopes above the second
@@ -256,9 +257,13 @@ def _contour_scarps(noise: Octaves, elevation_m: Float64, slope_deg: Float32) ->
         where = noise.gradient(20 * rise, 233 + 10 * number) + 0.6 * noise.gradient(7 * rise, 234 + 10 * number)
         where = 0.6 * where + 5.0 * hard[tread.astype(np.int64) & 4095] - 3.9
         wide = np.maximum(0.6 * rise, _CONTOUR_FACETS * noise.facet_m) * tangent / rise
-        stair = smooth_step(0, 1, 1 - (1 - inside) / np.clip(wide, 0.05, 0.95).astype(np.float32))
+        wide = np.clip(wide, 0.05, 0.95).astype(np.float32)
+        stair = smooth_step(0, 1, 1 - (1 - inside) / wide)
         kept = np.float32(gathered * rise) * smooth_step(0.2, 1.1, where) * noise.shown(2 * rise)
-        total += kept * (stair - inside)
+        # a scarp is undercut: its foot lies in a notch, which is dark under any Sun
+        foot_m = (inside - (1 - wide)) * np.float32(rise) / tangent
+        notch = np.exp(-((foot_m / (_NOTCH_FACETS * noise.facet_m)) ** 2)).astype(np.float32)
+        total += kept * (stair - inside - _NOTCH * notch)
     return total
 
 
