@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 
 from .geometry import Float64, Int32, mean_edge_m, vertex_normals
 
+_FINE_M = 5.0
 _WINDOWS = 120  # neighbourhoods, spread evenly over the points
 _MOST_POINTS = 300  # points of a window; more cost time and add little
 _FEWEST_POINTS = 16  # needed to fit a quadric
@@ -34,19 +35,31 @@ _FACING = 0.5
 
 @dataclass(frozen=True, kw_only=True)
 class Roughness:
-    """Describe a self-affine surface: ν(L) = deviation_m · (L / baseline_m)^hurst, metres."""
+    """Describe a self-affine surface: ν(L) = deviation_m · (L / baseline_m)^hurst, metres.
+
+    Below 5 m, where `with_hurst` does not reach, the exponent is `fine_hurst`, unless that is None.
+    """
 
     deviation_m: float
     baseline_m: float
     hurst: float
+    fine_hurst: float | None = None
 
     def with_hurst(self, hurst: float | None) -> Roughness:
-        """Return the surface with another exponent and the same deviation at `baseline_m`; None keeps it."""
-        return self if hurst is None else replace(self, hurst=hurst)
+        """Return the surface with another exponent down to 5 m and the same deviation at `baseline_m`.
+
+        Images from afar tell the exponent of relief down to their pixels, some metres. Below, the ground is at
+        least as smooth as the model's own law has it. None keeps the surface.
+        """
+        return self if hurst is None else replace(self, hurst=hurst, fine_hurst=max(hurst, self.hurst))
 
     def deviation_at(self, baseline_m: NDArray | float) -> Float64:
         """Return the RMS deviation in metres at baselines in metres."""
-        return np.asarray(self.deviation_m * (np.asarray(baseline_m) / self.baseline_m) ** self.hurst)
+        length = np.asarray(baseline_m, dtype=np.float64)
+        deviation = self.deviation_m * (length / self.baseline_m) ** self.hurst
+        if self.fine_hurst is not None:
+            deviation = deviation * np.minimum(length / _FINE_M, 1.0) ** (self.fine_hurst - self.hurst)
+        return np.asarray(deviation)
 
 
 def deviogram(points_m: NDArray, normals: NDArray, baselines_m: NDArray, *, windows: int = _WINDOWS) -> Float64:

@@ -242,7 +242,7 @@ class Session:
             facet_m=patch.facet_m,
             radius_m=patch.radius_m,
             growth=GROWTH_POWER,
-            hurst=law.hurst,
+            hurst=law.hurst if law.fine_hurst is None else law.fine_hurst,
         )
         # The slope of an octave of wavelength λ is 0.44 d / (λ/4), where d is the deviation over λ/4. The factor
         # 0.44 is the ratio of two integrals of the spectrum of a self-affine surface of Hurst exponent 0.85.
