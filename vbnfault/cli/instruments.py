@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from ..core.files.whole_files import writing
 from .app import app
 from .options import (
     MOST_SEED,
@@ -24,7 +25,6 @@ from .options import (
     number,
     progress_bar,
     whole,
-    writing,
 )
 
 if TYPE_CHECKING:
