@@ -296,11 +296,8 @@ def recompute(folder: str | Path) -> xr.Dataset:
     data = _indices(Results(design, metrics, values.reshape(*design.shape, len(metrics))))
     data.attrs["timings"] = before.attrs["timings"]
     with locked(path), whole_files.writing(path, within=True):
-        from .report import write_report  # loads matplotlib
-        from .summaries import StudyResults
-
         results.write_indices(path / results.INDICES, data)
-        write_report(path, StudyResults(dataset=data, table=table, spec=spec.resolved()))
+        _write_report(path, data, table, spec)
     return data
 
 
@@ -441,9 +438,9 @@ def _indices(found: Results) -> xr.Dataset:
 
 
 def _write_report(
-    path: Path, data: xr.Dataset, table: pyarrow.Table, spec: StudySpec, evaluator: Evaluator
+    path: Path, data: xr.Dataset, table: pyarrow.Table, spec: StudySpec, evaluator: Evaluator | None = None
 ) -> None:
-    """Write the extreme images, the figures and the page of a study; without images where one fails."""
+    """Write the figures and the page of a study; its extreme images, too, with an evaluator, unless one fails."""
     from .report import write_images, write_report  # loads matplotlib
     from .summaries import StudyResults
 
