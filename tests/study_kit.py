@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from vbnfault.study import indices
+from vbnfault.study.designs import make_design
 from vbnfault.study.spec import Evaluation, Metric, StudySpec, parse_study
 
 _VARIANCE = 49 / 8 + 0.1 * math.pi**4 / 5 + 0.01 * math.pi**8 / 18 + 0.5
@@ -24,6 +26,13 @@ def spec(count: int = 3, low: float = -math.pi, high: float = math.pi, **tables:
     factors = [{"key": f"x{i}", "distribution": "uniform", "low": low, "high": high} for i in range(count)]
     plain = {"title": "test", "design": {"n": 64}, "factor": factors, "metrics": {"names": ["y"]}}
     return parse_study(plain | tables, source="test")
+
+
+def analysed(study: StudySpec, function: Any) -> Any:
+    """Return the indices of a function that takes the design's points x[factor, row] at once."""
+    design = make_design(study)
+    values = np.asarray(function(np.array(design.values, dtype=float)))[None, None, :, None, None]
+    return indices.compute(indices.Results(design, tuple(Function.metrics[:1]), values))
 
 
 class Function:

@@ -20,7 +20,7 @@ from typing import Any, get_args, get_type_hints
 import numpy as np
 import pytest
 import typer
-from conftest import deny
+from conftest import Called, deny
 
 from vbnfault import cli
 from vbnfault.body import load_shape
@@ -492,23 +492,19 @@ def test_a_page_shows_a_file_name_that_is_no_unicode(tmp_path: Path) -> None:
     assert (tmp_path / "p.html").read_text(encoding="utf-8") == "x?.zarr"
 
 
-def _writers() -> dict[str, Callable[[Path], object]]:
-    """By the name of a file, a function that writes it."""
-    lens = load_lens("tessar_50_f2p8")
-    levels = Levels().table
-    noise = np.random.default_rng(1).integers(0, 256, (32, 32, 3), dtype=np.uint8)
-    return {
-        "own.toml": lambda path: write_template("scene", path.stem, path.parent, overwrite=True),
-        "table.json": lambda path: write_json(path, list(range(100))),
-        "lens.toml": lambda path: write_lens(lens, path),
-        "levels.toml": lambda path: write_table(path, levels),
-        "image.png": lambda path: images.write_png(path, noise),
-    }
+NOISE = np.random.default_rng(1).integers(0, 256, (32, 32, 3), dtype=np.uint8)
+WRITERS: dict[str, Callable[[Path], object]] = {
+    "own.toml": lambda path: write_template("scene", path.stem, path.parent, overwrite=True),
+    "table.json": lambda path: write_json(path, list(range(100))),
+    "lens.toml": lambda path: write_lens(load_lens("tessar_50_f2p8"), path),
+    "levels.toml": lambda path: write_table(path, Levels().table),
+    "image.png": lambda path: images.write_png(path, NOISE),
+}
 
 
-@pytest.mark.parametrize("name", ["own.toml", "table.json", "lens.toml", "levels.toml", "image.png"])
+@pytest.mark.parametrize("name", WRITERS)
 def test_a_file_that_cannot_be_written_keeps_its_content(name: str, tmp_path: Path) -> None:
-    path, write = tmp_path / name, _writers()[name]
+    path, write = tmp_path / name, WRITERS[name]
     path.write_text("mine")
     with _files_of_at_most(16), pytest.raises((OSError, VbnfaultError)):
         write(path)
@@ -576,20 +572,11 @@ def test_every_number_of_the_command_line_has_both_limits_and_is_refused_beyond_
 
 
 @pytest.mark.parametrize("value", ["nan", "inf", "-inf", "1e400", "361"])
-def test_angles_that_are_none_are_refused(value: str, tmp_path: Path) -> None:
-    arguments = [
-        "flare",
-        "tessar_50_f2p8",
-        "--out",
-        str(tmp_path / "f.png"),
-        "--sun-deg",
-        "10",
-        "--azimuth-deg",
-        value,
-    ]
-    done = command(*arguments, "--pixels", "16")
-    assert done.returncode == 2
-    assert "--azimuth-deg" in done.stderr
+def test_angles_that_are_none_are_refused(value: str, tmp_path: Path, call: Callable[..., Called]) -> None:
+    words = ["flare", "tessar_50_f2p8", "--sun-deg", "10", "--pixels", "16", "--azimuth-deg"]
+    done = call(*words, value, "--out", tmp_path / "f.png")
+    assert done.code == 2
+    assert "--azimuth-deg" in done.err
     assert not list(tmp_path.iterdir())
 
 

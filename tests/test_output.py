@@ -16,7 +16,6 @@ from vbnfault.core.files.whole_files import write_json
 from vbnfault.lens import load_lens
 from vbnfault.lens.adapt import LensRequest, adapted_lens
 from vbnfault.output import flare_images, lens_sheet
-from vbnfault.output.sensor_report import SensorRequest
 
 
 def test_json_has_null_where_a_number_is_not_finite(tmp_path: Path) -> None:
@@ -101,9 +100,3 @@ def test_a_lens_request_makes_its_changes() -> None:
     assert figures["efl_mm"] == pytest.approx(10.0)
     assert figures["real_f_number"] == pytest.approx(8.0, rel=1e-6)
     assert not any(surface.coating for surface in lens.surfaces)
-
-
-def test_a_sensor_request_is_checked() -> None:
-    with pytest.raises(InputError, match="pixels = 8: must be at least 16"):
-        SensorRequest(sensor="cmv4000", pixels=8)
-    assert SensorRequest(sensor="cmv4000", points=10, stack=4).images == 2 * (10 + 5) + 8

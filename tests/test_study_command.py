@@ -2,32 +2,18 @@
 
 from __future__ import annotations
 
-import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-
-from vbnfault.cli import main
-
-
-def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str, str]:
-    """Run the program in this process; return its exit code, standard output and standard error."""
-    monkeypatch.setattr(sys, "argv", ["vbnfault", *words])
-    code = 0
-    try:
-        main()
-    except SystemExit as end:
-        code = int(end.code or 0)
-    said = capsys.readouterr()
-    return code, said.out, said.err
+from conftest import Called
 
 
 def test_a_dry_run_says_how_much_a_study_evaluates_and_writes_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, call: Callable[..., Called]
 ) -> None:
     out = tmp_path / "out"
-    words = ("study", "flare_textures", "--out", str(out), "--dry-run", "--set", "design.n=8")
-    code, said, errors = run(monkeypatch, capsys, *words)
+    code, said, errors = call("study", "flare_textures", "--out", out, "--dry-run", "--set", "design.n=8")
     assert (code, errors, out.exists()) == (0, "", False)
     lines = said.splitlines()
     assert lines[1] == ("latin_hypercube, n = 8: 8 points × 20 views × 1 seed × 3 models = 480 evaluations")
@@ -50,14 +36,10 @@ def test_a_dry_run_says_how_much_a_study_evaluates_and_writes_nothing(
     ],
 )
 def test_what_is_wrong_is_one_sentence(
-    setting: str,
-    sentence: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    setting: str, sentence: str, tmp_path: Path, call: Callable[..., Called]
 ) -> None:
-    words = ("study", "flare_lens", "--out", str(tmp_path / "out"), "--dry-run", "--set", setting)
-    code, said, errors = run(monkeypatch, capsys, *words)
+    words = ("study", "flare_lens", "--out", tmp_path / "out", "--dry-run", "--set", setting)
+    code, said, errors = call(*words)
     assert (code, said) == (2, "")
     (line,) = errors.splitlines()
     assert sentence in line

@@ -31,12 +31,6 @@ def mixed_spec(n: int, seed: int = 0, **design: Any) -> StudySpec:
     return parse_study(table | {"design": {"n": n, "seed": seed, **design}}, source="test")
 
 
-def analysed(spec: StudySpec, function: Any) -> Any:
-    design = make_design(spec)
-    values = np.asarray(function(np.array(design.values, dtype=float)))[None, None, :, None, None]
-    return indices.compute(indices.Results(design, tuple(kit.Function.metrics[:1]), values))
-
-
 def test_the_functions_of_a_factor_are_orthonormal_under_its_distribution() -> None:
     # 2**14 points of a scrambled sequence give means of these functions to some 1e-3
     design = make_design(mixed_spec(2**14))
@@ -85,7 +79,7 @@ def test_intervals_are_narrow_and_hold_the_analytic_indices() -> None:
     held, widths = np.zeros((2, 4)), []
     for seed in range(20):
         spec = kit.spec(3, 0.0, 1.0, design={"n": 64, "seed": seed, "resamples": 200})
-        data = analysed(spec, lambda x: x[0] * x[1] + 0.2 * (x[2] < 0.3))
+        data = kit.analysed(spec, lambda x: x[0] * x[1] + 0.2 * (x[2] < 0.3))
         for row, (name, values) in enumerate(exact.items()):
             low, high = data[f"{name}_interval"].values[0, 0].T
             held[row] += (low <= np.append(values, 0.0)) & (np.append(values, 0.0) <= high)
@@ -105,11 +99,11 @@ def test_without_a_good_surrogate_the_indices_are_those_of_before(n: int, monkey
     for name, (count, function) in cases.items():
         spec = kit.spec(count, 0.0, 1.0, design={"n": n, "resamples": 100})
         y = function(np.array(make_design(spec).values, dtype=float))
-        data = analysed(spec, lambda _, y=y: y)
+        data = kit.analysed(spec, lambda _, y=y: y)
         assert np.isnan(data["explained"]).all(), name
         with monkeypatch.context() as patch:
             patch.setattr(indices, "LEAST_SAMPLES", 2**30)
-            assert data.identical(analysed(spec, lambda _, y=y: y)), name
+            assert data.identical(kit.analysed(spec, lambda _, y=y: y)), name
 
 
 def test_incomplete_samples_and_several_blocks_have_control_variates() -> None:

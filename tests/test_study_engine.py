@@ -29,21 +29,7 @@ from vbnfault.study.spec import DUMMY, Evaluation, StudySpec, parse_study
 QUIET = BuildOptions(progress=False)
 
 
-def analysed(spec: StudySpec, function: Any) -> Any:
-    """Return the indices of a function that takes the design's points x[factor, row] at once."""
-    design = make_design(spec)
-    y = function(np.array(design.values, dtype=float))
-    values = np.asarray(y)[None, None, :, None, None]
-    return indices.compute(indices.Results(design, tuple(kit.Function.metrics[:1]), values))
-
-
 # ------------------------------------------------------------------------------------ the whole engine
-
-
-@pytest.fixture(autouse=True)
-def _without_report(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leave out the page, which takes longer than these studies; test_study_report.py writes it."""
-    monkeypatch.setattr(run, "_write_report", lambda *_: None)
 
 
 def test_ishigami_through_the_whole_engine(tmp_path: Path) -> None:
@@ -80,7 +66,7 @@ def test_sobol_indices_without_control_variates_are_those_of_scipy(monkeypatch: 
     monkeypatch.setattr(indices, "LEAST_SAMPLES", 2**30)
     spec = kit.spec(design={"n": 256})
     function = kit.Function(spec).function
-    data = analysed(spec, function)
+    data = kit.analysed(spec, function)
     f = function(np.array(make_design(spec).values, dtype=float)).reshape(256, 5).T
     exact = sobol_indices(func={"f_A": f[None, 0], "f_B": f[None, 1], "f_AB": f[2:, None]}, n=256)
     np.testing.assert_allclose(data["S1"].values[0, 0, :3], exact.first_order, atol=1e-12)
@@ -92,7 +78,7 @@ def test_morris_is_that_of_salib() -> None:
     from SALib.sample import morris as sample
 
     spec = kit.spec(design={"method": "morris", "n": 10, "seed": 5, "resamples": 200})
-    data = analysed(spec, kit.Function(spec).function)
+    data = kit.analysed(spec, kit.Function(spec).function)
     problem = {"num_vars": 4, "names": list("abcd"), "bounds": [[0.0, 1.0]] * 4}
     points = sample.sample(problem, 10, num_levels=4, seed=5)
     y = kit.Function(spec).function(np.pi * (2 * points.T - 1))
@@ -109,7 +95,7 @@ def test_morris_is_that_of_salib() -> None:
 
 def test_a_grid_gives_the_analysis_of_variance() -> None:
     spec = kit.spec(2, -1.0, 1.0, design={"method": "grid", "n": 3})
-    data = analysed(spec, lambda x: x[0] + x[0] * x[1])  # variances 2/3 and 4/9 over the levels -1, 0, 1
+    data = kit.analysed(spec, lambda x: x[0] + x[0] * x[1])  # variances 2/3 and 4/9 over the levels -1, 0, 1
     np.testing.assert_allclose(data["S1"].values[0, 0], [0.6, 0.0, 0.0], atol=1e-12)
     np.testing.assert_allclose(data["ST"].values[0, 0], [1.0, 0.4, 0.0], atol=1e-12)
 
@@ -118,7 +104,7 @@ def test_one_at_a_time_gives_ranges() -> None:
     spec = kit.spec(2, -1.0, 3.0, design={"method": "one_at_a_time", "n": 3})
     design = make_design(spec)
     assert [list(values) for values in design.values] == [[1, -1, 1, 3, 1, 1, 1], [1, 1, 1, 1, -1, 1, 3]]
-    data = analysed(spec, lambda x: 2 * x[0] - x[1])
+    data = kit.analysed(spec, lambda x: 2 * x[0] - x[1])
     np.testing.assert_allclose(data["range"].values[0, 0], [8.0, 4.0, 0.0])
 
 
@@ -128,24 +114,18 @@ def test_a_latin_hypercube_gives_delta_and_keeps_the_global_random_numbers(
     monkeypatch.setattr(indices, "_MOST_RESAMPLES_OF_DELTA", 2)
     state = np.random.get_state()[1].copy()  # noqa: NPY002
     spec = kit.spec(2, 0.0, 1.0, design={"method": "latin_hypercube", "n": 128, "resamples": 100})
-    data = analysed(spec, lambda x: x[0])
-    delta = data["delta"].values[0, 0]
-    assert delta[0] > 0.5 > delta[1]
-    assert np.array_equal(np.random.get_state()[1], state)  # noqa: NPY002
-
-
-def test_delta_does_not_depend_on_the_scale_of_the_values() -> None:
-    """The densities of the values themselves gave deltas from -4.4 to 1.9 for veils with a few bright ones."""
-    spec = kit.spec(2, 0.0, 1.0, design={"method": "latin_hypercube", "n": 128, "resamples": 100})
-    plain, steep = (analysed(spec, f)["delta"].values for f in (lambda x: x[0], lambda x: np.exp(40 * x[0])))
+    plain, steep = (kit.analysed(spec, f)["delta"].values for f in (lambda x: x[0], lambda x: np.exp(40 * x[0])))
+    assert plain[0, 0, 0] > 0.5 > plain[0, 0, 1]
+    # the densities of the values themselves gave deltas from -4.4 to 1.9 for veils with a few bright ones
     np.testing.assert_array_equal(plain, steep)
     assert ((plain > -0.1) & (plain < 1)).all()
+    assert np.array_equal(np.random.get_state()[1], state)  # noqa: NPY002
 
 
 def test_a_latin_hypercube_of_nearly_constant_values_has_no_delta() -> None:
     """One value of 128 differs: some resamples lack it, and a single value has no density."""
     spec = kit.spec(2, 0.0, 1.0, design={"method": "latin_hypercube", "n": 128, "resamples": 100})
-    data = analysed(spec, lambda x: (x[0] == x[0].max()).astype(float))
+    data = kit.analysed(spec, lambda x: (x[0] == x[0].max()).astype(float))
     assert np.isnan(data["delta"].values).all()
     assert np.isfinite(data["S1"].values).all()
 
@@ -374,9 +354,9 @@ def test_incomplete_blocks_count_where_they_are_complete() -> None:
     x = np.array(design.values, dtype=float)
     y = np.stack([x[0] + x[1], np.full(len(x[0]), np.nan)])[None, ..., None, None]
     data = indices.compute(indices.Results(design, tuple(kit.Function.metrics[:1]), y))
-    alone = analysed(kit.spec(2, 0.0, 1.0, design={"n": 128}), lambda x: x[0] + x[1])
+    alone = kit.analysed(kit.spec(2, 0.0, 1.0, design={"n": 128}), lambda x: x[0] + x[1])
     np.testing.assert_allclose(data["ST"].values, alone["ST"].values, atol=1e-12)
-    constant = analysed(kit.spec(2, 0.0, 1.0, design={"n": 8}), lambda x: np.ones_like(x[0]))
+    constant = kit.analysed(kit.spec(2, 0.0, 1.0, design={"n": 8}), lambda x: np.ones_like(x[0]))
     assert np.isnan(constant["ST"].values[..., :2]).all()
 
 

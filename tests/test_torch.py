@@ -172,12 +172,6 @@ def test_a_run_continues_in_mid_epoch(finished_store: Path, before: int, after: 
     assert rows(first) == wanted[:5]  # left early and without a state, an epoch begins again
 
 
-def test_a_state_of_another_order_is_refused(finished_store: Path) -> None:
-    state = Loader(batches(finished_store)).state_dict()
-    with pytest.raises(InputError, match="state: its batch_size = 2, but here batch_size = 3"):
-        Loader(batches(finished_store, batch_size=3)).load_state_dict(state)
-
-
 @pytest.mark.parametrize("state", [None, [], 5, "x"])
 def test_what_is_no_state_is_refused(finished_store: Path, state: Any) -> None:
     for of in (batches(finished_store), ShardSampler(data(finished_store)), Loader(batches(finished_store))):

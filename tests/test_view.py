@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import http.client
 import json
 import os
@@ -55,7 +56,7 @@ class Served:
         """Return a JSON object."""
         return dict(json.loads(self.ask(path)[1]))
 
-    def stop(self) -> None:
+    def close(self) -> None:
         """End the server."""
         self.viewer.stop()
         self.thread.join()
@@ -64,9 +65,8 @@ class Served:
 @pytest.fixture(scope="module")
 def served(described_store: Path) -> Iterator[Served]:
     """A viewer of a finished store of a real scene."""
-    one = Served(st.open_store(described_store))
-    yield one
-    one.stop()
+    with contextlib.closing(Served(st.open_store(described_store))) as one:
+        yield one
 
 
 # --- the server ---------------------------------------------------------------------------------------------
@@ -91,18 +91,14 @@ def test_nothing_else_is_served(path: str, served: Served) -> None:
     assert served.ask(path)[0] == 404
 
 
-def test_requests_for_another_host_are_refused(served: Served) -> None:
+def test_requests_for_another_host_are_refused(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
     for host in ("evil.example", f"evil.example:{served.viewer.port}", "127.0.0.1", "127.0.0.1:1", ""):
         assert served.ask("/", Host=host)[0] == 403
         assert served.ask("/api/store", Host=host)[0] == 403
     assert served.ask("/", Host=f"localhost:{served.viewer.port}")[0] == 200
     assert served.ask("/", "POST")[0] == 501
     assert served.viewer.server.server_address[0] == "127.0.0.1"
-
-
-def test_a_browser_leaves_out_the_port_of_http(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert served.ask("/", Host="127.0.0.1")[0] == 403
-    monkeypatch.setattr(server, "_PORT_OF_HTTP", served.viewer.port)  # as if it were that port
+    monkeypatch.setattr(server, "_PORT_OF_HTTP", served.viewer.port)  # a browser leaves this port out
     assert served.ask("/", Host="127.0.0.1")[0] == served.ask("/", Host="localhost")[0] == 200
     assert served.ask("/", Host="evil.example")[0] == 403
 
@@ -240,14 +236,11 @@ def test_damage_is_said_in_a_sentence(whole: st.Store) -> None:
     flip(whole.file("image", 0), 200)
     shutil.rmtree(whole.path / "exposure_s" / "c")
     flip(whole.file("tries", 1), 12)
-    one = Served(whole)
-    try:
+    with contextlib.closing(Served(whole)) as one:
         status, body, _ = one.ask("/api/layer/image/0")
         assert (status, b"the build command repairs it" in body) == (422, True)
         assert one.ask("/api/small/0")[0] == 422
         assert one.json("/api/sample/0") == {"index": 0, "finished": False}
-    finally:
-        one.stop()
 
 
 @pytest.mark.slow
@@ -306,11 +299,11 @@ def page() -> Iterator[Page]:
         yield one
 
 
-def ready(page: Page, served: Served) -> None:
-    """Open the page and wait for its listing and its first image."""
+def ready(page: Page, served: Served, first: str = "performance.getEntriesByName('first-image').length") -> None:
+    """Open the page and wait for its listing and its first image, or what stands in its place."""
     page.goto("about:blank")
     page.goto(served.viewer.url)
-    page.wait("window.vbnfault?.listing && performance.getEntriesByName('first-image').length")
+    page.wait(f"window.vbnfault?.listing && {first}")
 
 
 @needs_browser
@@ -474,29 +467,20 @@ def test_unfinished_and_damaged_samples_are_named(page: Page, tmp_path: Path) ->
     st.write_samples(store, [fake_sample(store.spec, i) for i in (0, 1, 2)])
     shutil.rmtree(store.path / "image")
     store = st.open_store(store.path)
-    one = Served(store)
-    try:
-        page.goto("about:blank")
-        page.goto(one.viewer.url)
-        page.wait("window.vbnfault?.listing")
-        page.wait("document.querySelector('.tile[data-index=\"5\"]').textContent.includes('not finished')")
+    with contextlib.closing(Served(store)) as one:
+        ready(page, one, "document.querySelector('.tile[data-index=\"5\"]').textContent.includes('not finished')")
         page.wait("document.querySelector('.tile[data-index=\"0\"]').textContent.includes('cannot be read')")
         page.click('.tile[data-index="0"]')
         page.wait("document.getElementById('message').textContent.includes('the build command repairs it')")
-    finally:
-        one.stop()
-        page.errors.clear()  # the browser logs each refused request
+    page.errors.clear()  # the browser logs each refused request
 
 
 @needs_browser
 def test_more_samples_than_a_browser_can_scroll_px(page: Page, tmp_path: Path) -> None:
     store = st.create(tmp_path / "s.zarr", make_spec(layers=(), shard_samples=16), 600_000)
     st.write_samples(store, [fake_sample(store.spec, i) for i in (0, 599_999)])
-    one = Served(store)
-    try:
-        page.goto("about:blank")
-        page.goto(one.viewer.url)
-        page.wait("window.vbnfault?.listing")
+    with contextlib.closing(Served(store)) as one:
+        ready(page, one, "true")
         page.press("End")
         page.wait("document.activeElement.dataset.index === '599999'")
         page.wait("document.activeElement.querySelector('img')?.naturalWidth > 0")
@@ -506,5 +490,3 @@ def test_more_samples_than_a_browser_can_scroll_px(page: Page, tmp_path: Path) -
         assert box[0] >= 40
         assert box[1] <= 768
         assert page.evaluate("document.querySelectorAll('.tile').length") < 100
-    finally:
-        one.stop()

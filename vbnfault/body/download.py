@@ -21,7 +21,7 @@ from urllib.parse import quote, unquote, urlsplit, urlunsplit
 from ..core.errors import InputError, VbnfaultError, shown
 from ..core.files import path_checks
 from ..core.files.user_files import LIMIT_BYTES, MIB, head_of_input, read_input, sha256_of_input
-from ..core.files.whole_files import own, unwritable, write_whole
+from ..core.files.whole_files import own, write_whole, writing
 from .shape import FILE_TYPES, load_shape
 
 LOCK = "shapes.lock"
@@ -137,24 +137,22 @@ def _encoded(url: str) -> str:
 
 def _download(url: str, path: Path, known: str) -> Pin:
     """Download a file beside its final path, check it, and move it there. Raises VbnfaultError."""
-    try:
+    with writing(path.parent):
         path.parent.mkdir(parents=True, exist_ok=True)
         handle, part = tempfile.mkstemp(dir=path.parent, prefix=".part-", suffix=path.suffix.lower())
-    except OSError as error:
-        raise unwritable(path.parent, error) from None
     try:
-        with os.fdopen(handle, "wb") as file:
-            pin = _received(url, file)
-        if known and pin.sha256 != known:
-            raise VbnfaultError(
-                f"{url}: has SHA-256 {pin.sha256} ({pin.size_bytes} bytes): must be {known}; the file was not kept"
-            )
-        if reason := _why_no_shape(Path(part)):
-            raise VbnfaultError(f"{url}: is not a shape: {reason}; the file was not kept")
-        os.chmod(part, 0o644)  # mkstemp lets nobody else read it
-        os.replace(part, path)
-    except OSError as error:
-        raise unwritable(path, error) from None
+        with writing(path):
+            with os.fdopen(handle, "wb") as file:
+                pin = _received(url, file)
+            if known and pin.sha256 != known:
+                raise VbnfaultError(
+                    f"{url}: has SHA-256 {pin.sha256} ({pin.size_bytes} bytes): must be {known}; "
+                    "the file was not kept"
+                )
+            if reason := _why_no_shape(Path(part)):
+                raise VbnfaultError(f"{url}: is not a shape: {reason}; the file was not kept")
+            os.chmod(part, 0o644)  # mkstemp lets nobody else read it
+            os.replace(part, path)
     finally:
         Path(part).unlink(missing_ok=True)
     return pin
@@ -231,7 +229,5 @@ def _read_lock(path: Path) -> dict[str, Pin]:
 def _write_lock(path: Path, pins: dict[str, Pin]) -> None:
     """Write the lock file, whole or not at all. Raises VbnfaultError."""
     text = json.dumps({name: asdict(pins[name]) for name in sorted(pins)}, indent=2) + "\n"
-    try:
+    with writing(path):
         write_whole(own(path), text)
-    except OSError as error:
-        raise unwritable(path, error) from None

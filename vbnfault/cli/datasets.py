@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from ..core.errors import InputError
+from ..core.files.whole_files import writing
 from .app import app
 from .options import (
     MOST_PROCESSES,
@@ -25,7 +26,6 @@ from .options import (
     progress_bar,
     shard_range,
     whole,
-    writing,
 )
 
 _PANEL = "Datasets"

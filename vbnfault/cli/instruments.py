@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from ..core.files.whole_files import writing
 from .app import app
 from .options import (
     MOST_SEED,
@@ -24,7 +25,6 @@ from .options import (
     number,
     progress_bar,
     whole,
-    writing,
 )
 
 if TYPE_CHECKING:
@@ -221,7 +221,7 @@ def _print_ghosts(name: str, ghosts: tuple[Ghost, ...]) -> None:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class DetectorOptions:
-    """Hold the options that describe the measurement of a sensor; see `output.sensor_report.SensorRequest`."""
+    """Hold the options that describe the measurement of a sensor; see `output.sensor_report`."""
 
     seed: Annotated[
         int,
@@ -250,23 +250,20 @@ def detector(
     plugins: PluginOption = None,
 ) -> None:
     """Characterise a virtual sensor as EMVA 1288 defines, with plots."""
+    from ..camera.characterise import Settings, pictures
     from ..output import sensor_report
 
     load_plugins(plugins)
-    request = sensor_report.SensorRequest(
-        sensor=detector,
-        individual=options.seed,
-        pixels=options.pixels,
-        wavelength_nm=options.wavelength_nm,
-        temperature_K=options.temperature_k,
-        points=options.points,
-        stack=options.stack,
+    # a sensor file that is refused leaves no folder behind
+    device = sensor_report.device_of(
+        detector, options.seed, pixels=options.pixels, temperature_K=options.temperature_k
     )
-    _ = request.device  # a sensor file that is refused leaves no folder behind
+    settings = Settings(points=options.points, stack=options.stack)
+    images = pictures(settings)
     with writing(out):  # before the work
         out.mkdir(parents=True, exist_ok=True)
-    with progress_bar(request.images, f"{request.images} images") as bar:
-        report = sensor_report.measure(request, bar.update)
+    with progress_bar(images, f"{images} images") as bar:
+        report = sensor_report.measure(device, settings, options.wavelength_nm, bar.update)
     typer.echo(report.title)
     for line in report.lines():
         typer.echo(line)

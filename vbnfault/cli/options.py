@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import functools
 import inspect
@@ -10,7 +9,7 @@ import math
 import re
 import sys
 import tomllib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
@@ -18,7 +17,6 @@ import typer
 
 from ..core.errors import InputError, shown
 from ..core.files.path_checks import real
-from ..core.files.whole_files import unwritable
 from ..core.process.environment import MOST_SAMPLES, MOST_THREADS
 
 if TYPE_CHECKING:
@@ -252,15 +250,6 @@ def progress_bar(length: int, label: str) -> Any:
     """
     hidden = not length or not sys.stderr.isatty()
     return typer.progressbar(length=length, label=label, file=sys.stderr, hidden=hidden)
-
-
-@contextlib.contextmanager
-def writing(path: Path) -> Iterator[None]:
-    """Turn an OSError of a block that writes `path` into the error of `unwritable`."""
-    try:
-        yield
-    except OSError as error:
-        raise unwritable(path, error) from None
 
 
 def check_written(read: str, written: Mapping[str, Path | None]) -> None:

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from ..core.files.whole_files import writing
 from .app import app
 from .options import (
     MOST_PROCESSES,
@@ -19,7 +20,6 @@ from .options import (
     overrides,
     replaced,
     whole,
-    writing,
 )
 
 _PANEL = "Studies"

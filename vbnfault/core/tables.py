@@ -219,6 +219,15 @@ def is_number(text: str) -> bool:
     return True
 
 
+def flat(table: Mapping[str, Any], above: str = "") -> dict[str, Any]:
+    """Return the values of nested tables by dotted key; an empty table is a value."""
+    values: dict[str, Any] = {}
+    for key, value in table.items():
+        below = isinstance(value, Mapping) and value
+        values |= flat(value, f"{above}{key}.") if below else {f"{above}{key}": value}
+    return values
+
+
 def dotted(key: str) -> str:
     """Return a key with dots before the numbers of entries of lists: `factor[0].low` as `factor.0.low`."""
     return re.sub(r"\[(\d+)\]", r".\1", key)

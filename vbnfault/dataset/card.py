@@ -13,6 +13,7 @@ from typing import Any
 
 from .. import store as stores
 from ..core.html_page import rendered
+from ..core.tables import flat
 from ..faults import registry
 from ..scene import config
 from ..scene.bodies import named_body
@@ -122,16 +123,16 @@ def markdown_table(rows: Sequence[Sequence[str]]) -> list[str]:
 def _provenance(attributes: Mapping[str, Any]) -> Iterator[list[str]]:
     """Yield parameter, value and origin of every value of the stored scene."""
     scene = attributes.get("scene", {})
-    defaults = _flat(config.parse_scene({"title": "defaults"}, source="defaults").resolved())
+    defaults = flat(config.parse_scene({"title": "defaults"}, source="defaults").resolved())
     body = scene.get("body", {})
     packaged = named_body(str(body.get("name", ""))) if isinstance(body, Mapping) else None
     tables = {name: getattr(packaged, name, None) or {} for name in ("body", "orbit", "spice")}
-    of_body = _flat({name: table for name, table in tables.items() if table})
+    of_body = flat({name: table for name, table in tables.items() if table})
     for fault, table in scene.get("faults", {}).items() if isinstance(scene.get("faults"), Mapping) else ():
         cls = registry().get(fault, {}).get(str(table.get("model")))
         if cls is not None:
-            defaults |= {f"faults.{fault}.{key}": value for key, value in _flat(cls().to_dict()).items()}
-    for key, value in _flat(scene).items():
+            defaults |= {f"faults.{fault}.{key}": value for key, value in flat(cls().to_dict()).items()}
+    for key, value in flat(scene).items():
         if key.endswith("sha256"):
             origin = "contents of the files"
         elif key in of_body and json.dumps(of_body[key]) == json.dumps(value):
@@ -142,15 +143,3 @@ def _provenance(attributes: Mapping[str, Any]) -> Iterator[list[str]]:
             origin = "set"
         text = json.dumps(value, ensure_ascii=False)
         yield [key, text if len(text) <= _LONGEST_VALUE else f"{text[: _LONGEST_VALUE - 3]}...", origin]
-
-
-def _flat(table: Mapping[str, Any], above: str = "") -> dict[str, Any]:
-    """Return the values of nested tables by dotted key."""
-    flat: dict[str, Any] = {}
-    for key, value in table.items():
-        name = f"{above}.{key}" if above else str(key)
-        if isinstance(value, Mapping) and value:
-            flat |= _flat(value, name)
-        else:
-            flat[name] = value
-    return flat

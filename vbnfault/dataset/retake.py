@@ -21,7 +21,6 @@ from .. import pipeline, store
 from ..core.errors import InputError
 from ..core.files import file_contents
 from ..core.process import llvm
-from ..faults import Fault
 from ..pipeline.rendering import ANGLE_LAYERS
 from ..pipeline.retaken import TRUTH_LAYERS, RetakeSession, StoredView
 from ..scene import config, plan
@@ -34,11 +33,11 @@ from .identity import (
     RETAKE,
     blocks_of_plan,
     check_described,
-    earlier_views,
     plan_numbers,
     planned,
     scene_identity,
     store_spec,
+    stored_plan,
 )
 from .resume import Difference, differences
 from .tasks import SampleMaker
@@ -173,7 +172,7 @@ def _planned(
             "attributes": {**spec.attributes, **attributes},
         }
     )
-    table = _retaken_plan(session.scene, attributes, session.faults)
+    _, table = stored_plan(spec.attributes, spec.faults)
     if not options.dry_run:
         for sentence in plan.shortcomings(scene, table):
             logging.getLogger("vbnfault").warning(sentence)
@@ -183,17 +182,6 @@ def _planned(
         blocks=(len(numbers),),
         planned_faults=table.injected[numbers],
         expected=planned(spec.attributes, spec.faults),
-    )
-
-
-def _retaken_plan(scene: Scene, attributes: Mapping[str, Any], faults: Mapping[str, Fault]) -> plan.Plan:
-    """Return the plan of the new samples."""
-    return plan.make_retaken_plan(
-        scene,
-        list(faults),
-        earlier_views(attributes),
-        blocks_of_plan(attributes),
-        need_sun=[name for name, fault in faults.items() if fault.needs_sun],
     )
 
 
@@ -350,10 +338,9 @@ class RetakeFactory:
 
     def __call__(self) -> SampleMaker:
         with self.contents.in_use():
-            scene = with_rows(self.scene)
             session = RetakeSession(
-                scene,
-                _retaken_plan(scene, self.attributes, pipeline.configure_faults(scene)),
+                with_rows(self.scene),
+                stored_plan(self.attributes, self.faults)[1],
                 blocks_of_plan(self.attributes[RETAKE]["source"]),
                 _StoredViews(store.open_store(self.path), self.attributes["scene"]["camera"]),
                 threads=render_threads(self.threads),

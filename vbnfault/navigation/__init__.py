@@ -5,46 +5,10 @@ with their true poses. `limb_error` and `centroid_shift` measure directions, `co
 `orb_repeatability` the detection of features, `match_precision`, `matches_lost`, `relative_pose_error` and
 `feature_lifetime` what follows from them. Images are uint8, uint16 or float; pixel coordinates count from the top
 left corner, centres at +0.5.
+
+Each public name, listed in `__init__.pyi`, loads its module when it is first used.
 """
 
-from .directions import CentroidShift, LimbError, centroid_shift, limb_error
-from .features import (
-    FeatureLifetime,
-    Matches,
-    Repeatability,
-    corner_repeatability,
-    corners,
-    feature_lifetime,
-    match,
-    match_precision,
-    matches_lost,
-    orb_repeatability,
-    right_matches,
-)
-from .geometry import CameraView, relative_motion, reprojected
-from .relative_pose import RelativePose, RelativePoseError, relative_pose, relative_pose_error
+import lazy_loader
 
-__all__ = [
-    "CameraView",
-    "CentroidShift",
-    "FeatureLifetime",
-    "LimbError",
-    "Matches",
-    "RelativePose",
-    "RelativePoseError",
-    "Repeatability",
-    "centroid_shift",
-    "corner_repeatability",
-    "corners",
-    "feature_lifetime",
-    "limb_error",
-    "match",
-    "match_precision",
-    "matches_lost",
-    "orb_repeatability",
-    "relative_motion",
-    "relative_pose",
-    "relative_pose_error",
-    "reprojected",
-    "right_matches",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

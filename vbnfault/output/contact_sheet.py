@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..core.errors import InputError
 from ..core.files.images import write_png
-from ..core.files.whole_files import unwritable
+from ..core.files.whole_files import writing
 from ..store import STRATA, Store, open_store
 
 U8 = NDArray[np.uint8]
@@ -245,10 +245,8 @@ def _text_width(text: str, scale: float) -> int:
 
 
 def _write_png(path: Path, rgb: U8) -> None:
-    """Write an RGB image. Raises InputError or VbnfaultError, see `unwritable`."""
+    """Write an RGB image. Raises InputError or VbnfaultError, see `whole_files.writing`."""
     if path.suffix.lower() != ".png":
         raise InputError(f"{path}: the sheet is a PNG, so its name must end in .png")
-    try:
+    with writing(path):
         write_png(path, rgb)
-    except OSError as error:
-        raise unwritable(path, error) from error

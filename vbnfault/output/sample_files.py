@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.files.images import write_exr, write_png
-from ..core.files.whole_files import own, unwritable, write_json
+from ..core.files.whole_files import own, write_json, writing
 from ..core.quantities import Sample, soft_kind
 from ..pipeline import masks
 from ..pipeline.labels import strength
@@ -44,7 +44,7 @@ def write_frame(frame: Frame, folder: Path) -> list[Path]:
         for name, fault in frame.spec.faults.items()
         if fault.soft_layer and (name in frame.drawn or fault.soft_layer in sample.layers)
     }
-    try:
+    with writing(folder, within=True):
         folder.mkdir(parents=True, exist_ok=True)
         files = [_write_exr(frame, strengths, own(folder / "sample.exr"))]
         for name, values in strengths.items():
@@ -64,9 +64,7 @@ def write_frame(frame: Frame, folder: Path) -> list[Path]:
             files.append(write_png(own(folder / f"annotated_{name}.png"), annotated(frame, name)))
         path = folder / "parameters.json"
         write_json(own(path), _scalars(sample))
-        return [*files, path]
-    except OSError as error:
-        raise unwritable(error.filename2 or error.filename or folder, error) from None
+    return [*files, path]
 
 
 def annotated(frame: Frame, fault: str) -> NDArray[np.uint8]:

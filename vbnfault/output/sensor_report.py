@@ -5,15 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..camera.characterise import Characterisation, Result, Settings, VirtualCamera, characterise, pictures
-from ..core.errors import InputError
+from ..camera.characterise import Characterisation, Result, Settings, VirtualCamera, characterise
 from ..core.files.whole_files import own, write_json, write_whole
 from ..detector.chain import Device
 from ..detector.sensor import load_sensor
@@ -21,7 +19,6 @@ from ..detector.sensor import load_sensor
 F64 = NDArray[np.float64]
 
 _COLOURS = {"R": "tab:red", "G": "tab:green", "B": "tab:blue", "N": "tab:brown", "W": "0.4", "M": "0.2"}
-_LEAST_PIXELS = 16
 _MOST_BINS = 200
 # Variances below this fraction of the largest one are not drawn. They belong to saturated pixels, whose noise is
 # clipped.
@@ -37,76 +34,39 @@ _PANELS = (
 )
 
 
-@dataclass(frozen=True, kw_only=True)
-class SensorRequest:
-    """Name a sensor and say how to measure it. Raises InputError if a value is out of range.
+def device_of(
+    sensor: str | Path, individual: int = 1, *, pixels: int = 512, temperature_K: float | None = None
+) -> Device:
+    """Return the device to measure: one of a sensor, of at most `pixels` rows and columns.
 
-    Attributes
-    ----------
-    sensor
-        Path of a sensor file, or name of a packaged sensor.
-    individual
-        Seed of the device: devices of one sensor differ in their defects and fixed patterns.
-    pixels
-        Width and height of the measured part of the sensor, at most the whole sensor.
-    wavelength_nm
-        Wavelength of the light; None takes the wavelength at which each channel is most sensitive.
-    temperature_K
-        Temperature of the sensor; None takes that of its file.
-    points, stack
-        See `camera.characterise.Settings`.
+    Devices of one sensor differ by their seed `individual`, in defects and fixed patterns; the temperature is by
+    default that of the sensor's file. Raises InputError if the sensor file is refused.
     """
-
-    sensor: str | Path
-    individual: int = 1
-    pixels: int = 512
-    wavelength_nm: float | None = None
-    temperature_K: float | None = None
-    points: int = 40
-    stack: int = 24
-
-    def __post_init__(self) -> None:
-        if self.pixels < _LEAST_PIXELS:
-            raise InputError(f"pixels = {self.pixels}: must be at least {_LEAST_PIXELS}")
-
-    @cached_property
-    def device(self) -> Device:
-        """Return the device to measure. Raises InputError if the sensor file is refused."""
-        sensor = load_sensor(self.sensor)
-        shape = min(self.pixels, sensor.height_px), min(self.pixels, sensor.width_px)
-        return Device(sensor, self.individual, shape=shape, temperature_K=self.temperature_K)
-
-    @property
-    def settings(self) -> Settings:
-        """Return the numbers of light levels and of images of the measurement."""
-        return Settings(points=self.points, stack=self.stack)
-
-    @property
-    def images(self) -> int:
-        """Return how many images `measure` takes."""
-        return pictures(self.settings)
+    kind = load_sensor(sensor)
+    shape = min(pixels, kind.height_px), min(pixels, kind.width_px)
+    return Device(kind, individual, shape=shape, temperature_K=temperature_K)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SensorReport:
-    """Hold the results of a measurement, one for each channel.
+    """Hold the results of a measurement, one for each channel; `wavelength_nm` is None for the best one of each."""
 
-    `effects` are those of plug-ins that act in the sensor, each with its keys.
-    """
-
-    request: SensorRequest
-    sensor: str
-    effects: Mapping[str, Mapping[str, Any]]
-    temperature_K: float
+    device: Device
+    wavelength_nm: float | None
     channels: Mapping[str, Characterisation]
+
+    @property
+    def effects(self) -> dict[str, dict[str, Any]]:
+        """Return the effects of plug-ins that act in the sensor, each with its keys."""
+        return {effect.name: effect.model_dump(mode="json") for effect in self.device.sensor.effects}
 
     @property
     def title(self) -> str:
         """Return a line that names the sensor and the conditions."""
-        title = f"{self.sensor}, individual {self.request.individual}, {self.temperature_K:g} K"
+        title = f"{self.device.sensor.name}, individual {self.device.seed}, {self.device.temperature_K:g} K"
         if self.effects:
             title += f", with {' and '.join(self.effects)}"
-        return title if self.request.wavelength_nm is None else f"{title}, {self.request.wavelength_nm:g} nm"
+        return title if self.wavelength_nm is None else f"{title}, {self.wavelength_nm:g} nm"
 
     def write(self, folder: Path) -> list[Path]:
         """Write `emva1288.json` and `emva1288.png` to a folder and return their paths.
@@ -115,11 +75,11 @@ class SensorReport:
         """
         paths = [folder / "emva1288.json", folder / "emva1288.png"]
         table = {
-            "detector": self.sensor,
+            "detector": self.device.sensor.name,
             "effects": self.effects,
-            "individual": self.request.individual,
-            "temperature_K": self.temperature_K,
-            "wavelength_nm": self.request.wavelength_nm,
+            "individual": self.device.seed,
+            "temperature_K": self.device.temperature_K,
+            "wavelength_nm": self.wavelength_nm,
             "channels": [channel.to_dict() for channel in self.channels.values()],
         }
         write_json(own(paths[0]), table, indent=1)
@@ -135,23 +95,25 @@ class SensorReport:
         return lines
 
 
-def measure(request: SensorRequest, progress: Callable[[int], None] | None = None) -> SensorReport:
-    """Characterise a sensor; `progress` is called with 1 after each image. Raises InputError."""
-    camera = VirtualCamera(request.device, wavelength_nm=request.wavelength_nm)
+def measure(
+    device: Device,
+    settings: Settings,
+    wavelength_nm: float | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> SensorReport:
+    """Characterise a device with light of a wavelength, by default the best one of each channel.
+
+    `progress` is called with 1 after each image. Raises InputError.
+    """
+    camera = VirtualCamera(device, wavelength_nm=wavelength_nm)
     channels = characterise(
         camera,
         sites=camera.sites,
         photons_at_saturation=camera.photons_at_saturation,
-        settings=request.settings,
+        settings=settings,
         progress=progress,
     )
-    return SensorReport(
-        request=request,
-        sensor=request.device.sensor.name,
-        effects={effect.name: effect.model_dump(mode="json") for effect in request.device.sensor.effects},
-        temperature_K=request.device.temperature_K,
-        channels=channels,
-    )
+    return SensorReport(device=device, wavelength_nm=wavelength_nm, channels=channels)
 
 
 def draw(channels: Mapping[str, Characterisation], title: str, path: Path) -> None:

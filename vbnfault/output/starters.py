@@ -13,7 +13,7 @@ from .. import faults, reflectance
 from ..core import tables
 from ..core.errors import InputError, shown
 from ..core.files.path_checks import check_folder
-from ..core.files.whole_files import own, unwritable, write_whole
+from ..core.files.whole_files import own, write_whole, writing
 from ..detector import Sensor, effects
 from ..lens.prescription_file import PrescriptionFile
 from ..scene import config
@@ -85,11 +85,9 @@ def write_template(kind: str, name: str, folder: Path, *, overwrite: bool = Fals
     if os.path.lexists(path) and not overwrite:
         raise InputError(f"{path}: exists already; --overwrite replaces it, or choose another name")
     check_folder(folder)
-    try:
+    with writing(path):
         folder.mkdir(parents=True, exist_ok=True)
         write_whole(own(path), text.replace(f"My{kind.capitalize()}", class_name))
-    except OSError as error:
-        raise unwritable(path, error) from None
     return path
 
 

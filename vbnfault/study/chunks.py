@@ -9,14 +9,14 @@ from __future__ import annotations
 import contextlib
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from ..core.errors import InputError
 from ..core.files import file_contents
-from ..core.files.whole_files import kind_of
+from ..core.files.whole_files import writing
 from ..core.process.interrupts import finishing
 from ..dataset.progress import Progress
 from ..dataset.work import ItemsFailed, Job, Lazy, Tick, attempt
@@ -97,7 +97,7 @@ class ChunkWorker:
             now = Counter(self._evaluator().timings())
             spent = Counter(seconds_before)
             spent.update({stage: seconds - self._seconds[stage] for stage, seconds in now.items()})
-            with _as_error(folder):
+            with writing(folder, then="; the same command continues"):
                 results.write_chunk(folder, task.number, outcomes, spent)
             seconds_before.update(spent)
             self._seconds = now
@@ -142,17 +142,6 @@ def _finished(folder: Path, chunk: int) -> tuple[dict[int, dict[str, Any]], dict
     with contextlib.suppress(ValueError):
         return results.read_chunk(folder, chunk)
     return {}, {}
-
-
-@contextlib.contextmanager
-def _as_error(folder: Path) -> Iterator[None]:
-    """Turn an OSError of a block that writes rows into a VbnfaultError."""
-    try:
-        yield
-    except OSError as error:
-        raise kind_of(error)(
-            f"{folder}: cannot be written: {error.strerror}; the same command continues"
-        ) from error
 
 
 class StudyJob(Job):

@@ -440,7 +440,7 @@ class SceneEvaluator:
 
     def _clean_views(
         self, evaluation: Evaluation, setting: Setting, count: int
-    ) -> tuple[Sequence[CleanView], nav.CleanTwins]:
+    ) -> tuple[Sequence[CleanView], nav.ViewedImages]:
         """Return the first `count` views of an evaluation's sequence without faults, and their clean twins."""
         without = replace(setting, scene={k: v for k, v in setting.scene.items() if k != FAULT_SCENE_KEY})
         made = self._scene(evaluation, without)
@@ -449,10 +449,10 @@ class SceneEvaluator:
         sequence = self.kept.once("render", key, lambda: list(rendered_sequence(view, count)), "sequence")
         sun, detector = tuple(sorted(setting.sun.items())), tuple(sorted(setting.detector.items()))
 
-        def make() -> tuple[Sequence[CleanView], nav.CleanTwins]:
+        def make() -> tuple[Sequence[CleanView], nav.ViewedImages]:
             seen = (self._seen(view, evaluation, made, setting) for view in sequence)
             views = [CleanView.of(view, nominal.spec.camera) for view, nominal in zip(seen, sequence, strict=True)]
-            return views, nav.CleanTwins([view.frame for view in views])
+            return views, nav.clean_twins([view.frame for view in views])
 
         return self.kept.once("clean twins", (*key, made.scene.camera, tuple(setting.lens), detector, sun), make)
 

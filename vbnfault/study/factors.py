@@ -348,7 +348,7 @@ def known_keys(spec: StudySpec, scene: Scene, camera: Camera, lens: Prescription
 def _scene_keys(spec: StudySpec, scene: Scene) -> list[Key]:
     """Return the keys of the scene; those of faults are the keys of every model in the study."""
     table = scene.resolved()
-    found = dict.fromkeys(_leaves({key: value for key, value in table.items() if key != "faults"}), "")
+    found = dict.fromkeys(tables.flat({key: value for key, value in table.items() if key != "faults"}), "")
     for name, fault in table["faults"].items():
         models = [fault.get("model", "")]
         if spec.models is not None and spec.models.fault == name:
@@ -357,14 +357,6 @@ def _scene_keys(spec: StudySpec, scene: Scene) -> list[Key]:
             found |= {f"faults.{name}.{key}": unit for key, unit in _fields(name, model).items()}
     keys = [Key(FAULT_KEY, (), _adder("scene", FAULT_SCENE_KEY))]
     return keys + [_table_key("scene", key, unit) for key, unit in found.items()]
-
-
-def _leaves(table: Mapping[str, Any], above: str = "") -> list[str]:
-    """Return the dotted keys of all values of nested tables."""
-    keys = []
-    for key, value in table.items():
-        keys += _leaves(value, f"{above}{key}.") if isinstance(value, Mapping) else [f"{above}{key}"]
-    return keys
 
 
 def _lens_keys(lens: Prescription) -> list[Key]:
@@ -419,7 +411,7 @@ def _detector_keys(camera: Camera) -> list[Key]:
         names = list(_OF_THREE_COLOURS)
     else:
         plain = dataclasses.asdict(camera.detector.mosaic.sensor)
-        names = _leaves({key: value for key, value in plain.items() if key not in _NOT_OF_A_DETECTOR})
+        names = list(tables.flat({key: v for key, v in plain.items() if key not in _NOT_OF_A_DETECTOR}))
     return [_table_key("detector", name) for name in names]
 
 

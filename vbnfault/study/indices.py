@@ -41,7 +41,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -50,7 +50,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import ranking
-from .bootstrap import bootstrap
+from .bootstrap import bootstrap_of_counts
 from .control_variates import LEAST_SAMPLES, Surrogates, fit, make_basis
 from .designs import Design, levels, salib, unit_problem
 from .factors import FAULT_KEY, fault_choices
@@ -66,6 +66,8 @@ LEAST_SAMPLES_OF_DELTA = 100  # SALib refuses to estimate delta from fewer
 LEAST_SAMPLES_OF_INTERVALS = 16
 _ROUNDING = 1e-9  # of indices
 _Array = NDArray[np.float64]
+_Arrays = dict[str, tuple[tuple[str, ...], _Array]]  # name → dimensions and values
+_DIMS = ("metric", "model", "factor")
 
 
 @dataclass(frozen=True)
@@ -98,7 +100,7 @@ def compute(results: Results) -> xr.Dataset:
     design = results.design
     spec = design.spec
     method = spec.design.method
-    arrays: dict[str, tuple[tuple[str, ...], _Array]] = {}
+    arrays: _Arrays = {}
     _add_moments(arrays, results)
     if method == "sobol":
         _add_sobol(arrays, results)
@@ -196,11 +198,11 @@ def _attributes(name: str) -> dict[str, str]:
 def _intervals(statistic: Any, n: int, design: Design) -> _Array:
     """Return percentile bootstrap intervals, float64[..., 2], over `n` base samples.
 
-    `statistic` is that of `bootstrap`. All metrics and models get the same resamples.
+    `statistic` is that of `bootstrap_of_counts`. All metrics and models get the same resamples.
     """
     if n < 2:
         return np.full((*np.shape(statistic(np.ones((1, n))))[:-1], 2), np.nan)
-    interval = bootstrap(statistic, n, design.spec.design).confidence_interval
+    interval = bootstrap_of_counts(statistic, n, design.spec.design).confidence_interval
     return np.stack([interval.low, interval.high], axis=-1)
 
 
@@ -220,25 +222,38 @@ def _studentised_intervals(terms: SobolTerms, design: Design) -> _Array:
             ratio = np.abs(terms.estimates(counts) - index) / terms.deviations(counts)
         return np.where(np.isfinite(ratio), ratio, 0.0)
 
-    drawn = bootstrap(distances, n, design.spec.design).bootstrap_distribution
+    drawn = bootstrap_of_counts(distances, n, design.spec.design).bootstrap_distribution
     half = np.quantile(drawn, design.spec.design.confidence, axis=-1) * deviation[:, 0]
     # an index of which the surrogates know all is exact up to rounding
     half = np.maximum(half, _ROUNDING)
     return np.stack([index[:, 0] - half, index[:, 0] + half], axis=-1)
 
 
-def _possible(values: _Array, n: int, dummy: Any = None) -> tuple[_Array, _Array] | None:
-    """Return fractions of the variance that few samples give, and their intervals; None for enough samples.
+def _possible(values: _Array, n: int, dummy: Any = None) -> tuple[_Array, _Array | None]:
+    """Return fractions of the variance, and their intervals where `n` samples are too few to give any.
 
     `dummy` indexes those of the dummy factor.
     """
     if n >= LEAST_SAMPLES_OF_INTERVALS:
-        return None
+        return values, None
     low = np.zeros_like(values)
     if dummy is not None:
         low[dummy] = -1.0
     within = np.clip(values, low, 1.0)
     return within, np.stack([low, np.ones_like(low)], axis=-1) + 0 * within[..., None]
+
+
+def _add_index(
+    arrays: _Arrays, name: str, values: _Array, interval: _Array | None = None, by_seed: _Array | None = None
+) -> None:
+    """Add an index, [metric, model, factor], its interval, and that of each seed with their deviation."""
+    arrays[name] = (_DIMS, values)
+    if interval is not None:
+        arrays[f"{name}_interval"] = ((*_DIMS, "bound"), interval)
+    if by_seed is not None:
+        arrays[f"{name}_by_seed"] = ((*_DIMS, "seed"), by_seed)
+        if by_seed.shape[-1] > 1:
+            arrays[f"{name}_seed_deviation"] = (_DIMS, by_seed.std(axis=-1, ddof=1))
 
 
 # --- Sobol' indices -----------------------------------------------------------------------------------------------
@@ -261,17 +276,18 @@ def _surrogates(results: Results) -> dict[tuple[int, int], list[Surrogates | Non
     }
 
 
-def _add_sobol(arrays: dict[str, tuple[tuple[str, ...], _Array]], results: Results) -> None:
+def _add_sobol(arrays: _Arrays, results: Results) -> None:
     """Add S1, ST and the interactions, with intervals and by seed."""
     factors, (seeds, views, rows, models) = len(results.design.spec.keys), results.design.shape
-    metrics, base = len(results.metrics), rows // (len(results.design.spec.keys) + 2)
-    whole = np.full((metrics, models, factors + 1), np.nan)
-    s1, total = whole.copy(), whole.copy()
-    s1_interval, total_interval = (np.full((*whole.shape, 2), np.nan) for _ in range(2))
-    pairs = np.full((metrics, models, factors + 1, factors + 1), np.nan)
-    pairs_interval = np.full((*pairs.shape, 2), np.nan)
-    s1_by_seed, total_by_seed = (np.full((*whole.shape, seeds), np.nan) for _ in range(2))
+    metrics, base = len(results.metrics), rows // (factors + 2)
+    values = np.empty((metrics, models, 2 * factors + 2 + factors * (factors - 1) // 2))
+    bounds, by_seed = np.empty((*values.shape, 2)), np.empty((*values.shape, seeds))
     used, explained = np.zeros((metrics, models)), np.full((metrics, models), np.nan)
+
+    def estimated(terms: SobolTerms) -> tuple[_Array, _Array | None]:
+        n = len(terms.variance)
+        return _possible(terms.estimates(np.ones((1, n)))[:, 0], n, [2 * factors, 2 * factors + 1])
+
     for (i, j), surrogates in _surrogates(results).items():
         blocks = results.blocks(i, j).reshape(-1, base, factors + 2)
         explained[i, j] = explained_variance(blocks, surrogates)
@@ -279,41 +295,24 @@ def _add_sobol(arrays: dict[str, tuple[tuple[str, ...], _Array]], results: Resul
             surrogates = [None] * len(surrogates)
         terms = sobol_terms(blocks, surrogates)
         used[i, j] = n = len(terms.variance)
-        estimates, dummy = terms.estimates(np.ones((1, n)))[:, 0], [2 * factors, 2 * factors + 1]
-        possible = _possible(estimates, n, dummy)
+        values[i, j], possible = estimated(terms)
         if possible is not None:
-            estimates, bounds = possible
+            bounds[i, j] = possible
         elif np.isnan(explained[i, j]):
-            bounds = _intervals(terms.estimates, n, results.design)
+            bounds[i, j] = _intervals(terms.estimates, n, results.design)
         else:
-            bounds = _studentised_intervals(terms, results.design)
-        s1[i, j], total[i, j], pairs[i, j] = split(estimates, factors)
-        s1_interval[i, j], total_interval[i, j], pairs_interval[i, j] = split(bounds, factors)
+            bounds[i, j] = _studentised_intervals(terms, results.design)
         for k in range(seeds):
             of_seed = slice(k * views, (k + 1) * views)
-            terms = sobol_terms(blocks[of_seed], surrogates[of_seed])
-            alone = terms.estimates(np.ones((1, len(terms.variance))))[:, 0]
-            alone, _ = _possible(alone, len(terms.variance), dummy) or (alone, None)
-            s1_by_seed[i, j, :, k], total_by_seed[i, j, :, k], _ = split(alone, factors)
-    dims = ("metric", "model", "factor")
-    arrays["S1"], arrays["S1_interval"] = (dims, s1), ((*dims, "bound"), s1_interval)
-    arrays["ST"], arrays["ST_interval"] = (dims, total), ((*dims, "bound"), total_interval)
-    pair_dims = (*dims, "factor_b")
-    arrays["interaction"] = (pair_dims, pairs)
-    arrays["interaction_interval"] = ((*pair_dims, "bound"), pairs_interval)
-    _add_by_seed(arrays, {"S1": s1_by_seed, "ST": total_by_seed})
-    arrays["samples_used"] = (dims[:2], used)
-    arrays["samples_left_out"] = (dims[:2], base - used)
-    arrays["explained"] = (dims[:2], explained)
-
-
-def _add_by_seed(arrays: dict[str, tuple[tuple[str, ...], _Array]], by_seed: dict[str, _Array]) -> None:
-    """Add indices of each seed, and their standard deviation where there are several seeds."""
-    dims = ("metric", "model", "factor")
-    for name, values in by_seed.items():
-        arrays[f"{name}_by_seed"] = ((*dims, "seed"), values)
-        if values.shape[-1] > 1:
-            arrays[f"{name}_seed_deviation"] = (dims, values.std(axis=-1, ddof=1))
+            by_seed[i, j, :, k], _ = estimated(sobol_terms(blocks[of_seed], surrogates[of_seed]))
+    s1, total, pairs = zip(*(split(v, factors) for v in (values, bounds, by_seed)), strict=True)
+    _add_index(arrays, "S1", *s1)
+    _add_index(arrays, "ST", *total)
+    arrays["interaction"] = ((*_DIMS, "factor_b"), pairs[0])
+    arrays["interaction_interval"] = ((*_DIMS, "factor_b", "bound"), pairs[1])
+    arrays["samples_used"] = (_DIMS[:2], used)
+    arrays["samples_left_out"] = (_DIMS[:2], base - used)
+    arrays["explained"] = (_DIMS[:2], explained)
 
 
 def half_widths(indices: xr.Dataset) -> xr.DataArray:
@@ -338,7 +337,7 @@ def power_of_two(n: float) -> int:
 # --- the other designs --------------------------------------------------------------------------------------------
 
 
-def _add_moments(arrays: dict[str, tuple[tuple[str, ...], _Array]], results: Results) -> None:
+def _add_moments(arrays: _Arrays, results: Results) -> None:
     """Add mean and variance of each metric and model: of Sobol' designs over A and B."""
     base = [i for i, role in enumerate(results.design.roles) if not role.startswith("AB:")]
     values = results.values[:, :, base]
@@ -372,7 +371,37 @@ def _student(n: int, confidence: float) -> float:
     return float(stats.t.ppf(q, n - 1) / stats.norm.ppf(q) * np.sqrt(n / (n - 1)))
 
 
-def _add_morris(arrays: dict[str, tuple[tuple[str, ...], _Array]], results: Results) -> None:
+def _by_block(
+    results: Results, names: Sequence[str], analyse: Callable[[_Array], Mapping[str, Any]]
+) -> list[_Array]:
+    """Return what SALib gives of each block by name, float64[metric, model, factor, block]; nan for nothing."""
+    seeds, views, _, models = results.design.shape
+    shape = (len(results.metrics), models, len(results.design.spec.keys) + 1, seeds * views)
+    values = {name: np.full(shape, np.nan) for name in names}
+    for i, j in np.ndindex(*shape[:2]):
+        for k, y in enumerate(results.blocks(i, j)):
+            with _steady():
+                found = analyse(y)
+            for name in values.keys() & found.keys():
+                values[name][i, j, :, k] = found[name]
+    return list(values.values())
+
+
+def _mean(values: _Array) -> _Array:
+    """Return the mean along the last axis of what has a value; nan for none."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # a metric that never has a value
+        return np.asarray(np.nanmean(values, axis=-1))
+
+
+def _mean_with_interval(values: _Array, half: _Array, seeds: int) -> tuple[_Array, _Array, _Array]:
+    """Return the mean of an index over blocks, its interval from half-widths, and the means of each seed."""
+    mean, mean_half = _mean(values), _mean(half)
+    interval = np.stack([mean - mean_half, mean + mean_half], axis=-1)
+    return mean, interval, _mean(values.reshape(*values.shape[:3], seeds, -1))
+
+
+def _add_morris(arrays: _Arrays, results: Results) -> None:
     """Add the elementary effects of a Morris design, by SALib.
 
     Over several blocks, `mu` and `mu_star` are means, `sigma` is the root mean square, and the half-width of the
@@ -381,50 +410,35 @@ def _add_morris(arrays: dict[str, tuple[tuple[str, ...], _Array]], results: Resu
     analyze = salib("analyze.morris", "design.method = 'morris'").analyze
     design, table = results.design, results.design.spec.design
     problem, steps = unit_problem(design.spec), len(design.spec.keys) + 2
-    seeds, views, _, models = design.shape
-    shape = (len(results.metrics), models, steps - 1, seeds * views)
-    mu, star, sigma, half = (np.full(shape, np.nan) for _ in range(4))
-    used = np.zeros(shape[:2])
-    for i, j in np.ndindex(*shape[:2]):
-        complete = np.zeros(table.n, dtype=bool)
-        for k, y in enumerate(results.blocks(i, j)):
-            whole = np.isfinite(y.reshape(table.n, steps)).all(axis=1)
-            complete |= whole
-            if not whole.any():
-                continue
-            rows = np.repeat(whole, steps)
-            with _steady():
-                found = analyze(
-                    problem,
-                    design.points[rows],
-                    y[rows],
-                    num_resamples=table.resamples,
-                    conf_level=table.confidence,
-                    num_levels=table.levels,
-                    seed=table.seed % 2**32,
-                )
-            mu[i, j, :, k], star[i, j, :, k] = found["mu"], found["mu_star"]
-            sigma[i, j, :, k] = found["sigma"]
-            half[i, j, :, k] = np.asarray(found["mu_star_conf"]) * _student(int(whole.sum()), table.confidence)
-        used[i, j] = complete.sum()
-    dims = ("metric", "model", "factor")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # a metric that never has a value
-        mean_star, mean_half = np.nanmean(star, axis=-1), np.nanmean(half, axis=-1)
-        arrays["mu"] = (dims, np.nanmean(mu, axis=-1))
-        arrays["mu_star"] = (dims, mean_star)
-        arrays["sigma"] = (dims, np.sqrt(np.nanmean(sigma**2, axis=-1)))
-        by_seed = np.nanmean(star.reshape(*shape[:3], seeds, views), axis=-1)
-    arrays["mu_star_interval"] = (
-        (*dims, "bound"),
-        np.stack([mean_star - mean_half, mean_star + mean_half], axis=-1),
-    )
-    _add_by_seed(arrays, {"mu_star": by_seed})
-    arrays["samples_used"] = (dims[:2], used)
-    arrays["samples_left_out"] = (dims[:2], table.n - used)
+
+    def analyse(y: _Array) -> Mapping[str, Any]:
+        whole = np.isfinite(y.reshape(table.n, steps)).all(axis=1)
+        if not whole.any():
+            return {}
+        rows = np.repeat(whole, steps)
+        found = analyze(
+            problem,
+            design.points[rows],
+            y[rows],
+            num_resamples=table.resamples,
+            conf_level=table.confidence,
+            num_levels=table.levels,
+            seed=table.seed % 2**32,
+        )
+        half = np.asarray(found["mu_star_conf"]) * _student(int(whole.sum()), table.confidence)
+        return {**found, "mu_star_conf": half}
+
+    mu, star, sigma, half = _by_block(results, ("mu", "mu_star", "sigma", "mu_star_conf"), analyse)
+    _add_index(arrays, "mu", _mean(mu))
+    _add_index(arrays, "sigma", np.sqrt(_mean(sigma**2)))
+    _add_index(arrays, "mu_star", *_mean_with_interval(star, half, design.shape[0]))
+    finite = np.isfinite(results.values).reshape(-1, table.n, steps, *results.values.shape[3:])
+    used = finite.all(axis=2).any(axis=0).sum(axis=0).T.astype(np.float64)
+    arrays["samples_used"] = (_DIMS[:2], used)
+    arrays["samples_left_out"] = (_DIMS[:2], table.n - used)
 
 
-def _add_delta(arrays: dict[str, tuple[tuple[str, ...], _Array]], results: Results) -> None:
+def _add_delta(arrays: _Arrays, results: Results) -> None:
     """Add the moment-independent index delta and the first-order index of given data, by SALib; means over blocks.
 
     Delta needs 100 samples; from fewer it is nan. Its bootstrap has at most 20 resamples. Where nearly all values
@@ -436,48 +450,38 @@ def _add_delta(arrays: dict[str, tuple[tuple[str, ...], _Array]], results: Resul
     analyze = salib("analyze.delta", "design.method = 'latin_hypercube'").analyze
     design, table = results.design, results.design.spec.design
     problem = unit_problem(design.spec)
-    seeds, views, _, models = design.shape
-    shape = (len(results.metrics), models, problem["num_vars"], seeds * views)
-    values = {name: np.full(shape, np.nan) for name in ("delta_raw", "delta_raw_conf", "S1", "S1_conf")}
-    used = np.zeros(shape[:2])
-    for i, j in np.ndindex(*shape[:2]):
-        for k, y in enumerate(results.blocks(i, j)):
-            rows = np.isfinite(y)
-            used[i, j] = max(used[i, j], rows.sum())
-            if rows.sum() < 2 or np.ptp(y[rows]) == 0:
-                continue
-            analysed = partial(
-                analyze,
-                problem,
-                design.points[rows],
-                num_resamples=min(table.resamples, _MOST_RESAMPLES_OF_DELTA),
-                conf_level=table.confidence,
-                seed=table.seed % (2**32 - 1) + 1,  # SALib takes 0 as no seed
-            )
-            with _steady():
-                found = analysed(y[rows], method="sobol")
-                if rows.sum() >= LEAST_SAMPLES_OF_DELTA:
-                    # ranks have the same delta; densities of a few far values lie between the nodes of SALib's grid
-                    with contextlib.suppress(ValueError):
-                        found |= analysed(stats.rankdata(y[rows]), method="delta")
-            for name in values.keys() & found.keys():
-                values[name][i, j, :, k] = found[name]
-    dims = ("metric", "model", "factor")
-    for name, key in {"delta": "delta_raw", "S1": "S1"}.items():
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)  # too few samples
-            mean, half = np.nanmean(values[key], axis=-1), np.nanmean(values[f"{key}_conf"], axis=-1)
-            by_seed = np.nanmean(values[key].reshape(*shape[:3], seeds, views), axis=-1)
-        interval = np.stack([mean - half, mean + half], axis=-1)
-        mean, interval = _possible(mean, int(used.max()), (..., -1)) or (mean, interval)
-        arrays[name] = (dims, mean)
-        arrays[f"{name}_interval"] = ((*dims, "bound"), interval)
-        _add_by_seed(arrays, {name: by_seed})
-    arrays["samples_used"] = (dims[:2], used)
-    arrays["samples_left_out"] = (dims[:2], len(design.roles) - used)
+
+    def analyse(y: _Array) -> Mapping[str, Any]:
+        rows = np.isfinite(y)
+        if rows.sum() < 2 or np.ptp(y[rows]) == 0:
+            return {}
+        analysed = partial(
+            analyze,
+            problem,
+            design.points[rows],
+            num_resamples=min(table.resamples, _MOST_RESAMPLES_OF_DELTA),
+            conf_level=table.confidence,
+            seed=table.seed % (2**32 - 1) + 1,  # SALib takes 0 as no seed
+        )
+        found: dict[str, Any] = dict(analysed(y[rows], method="sobol"))
+        if rows.sum() >= LEAST_SAMPLES_OF_DELTA:
+            # ranks have the same delta; densities of a few far values lie between the nodes of SALib's grid
+            with contextlib.suppress(ValueError):
+                found |= analysed(stats.rankdata(y[rows]), method="delta")
+        return found
+
+    delta, delta_half, s1, s1_half = _by_block(results, ("delta_raw", "delta_raw_conf", "S1", "S1_conf"), analyse)
+    finite = np.isfinite(results.values).reshape(-1, *results.values.shape[2:])
+    used = finite.sum(axis=1).max(axis=0).T.astype(np.float64)
+    for name, values, half in (("delta", delta, delta_half), ("S1", s1, s1_half)):
+        mean, interval, by_seed = _mean_with_interval(values, half, design.shape[0])
+        mean, possible = _possible(mean, int(used.max()), (..., -1))
+        _add_index(arrays, name, mean, interval if possible is None else possible, by_seed)
+    arrays["samples_used"] = (_DIMS[:2], used)
+    arrays["samples_left_out"] = (_DIMS[:2], len(design.roles) - used)
 
 
-def _add_grid(arrays: dict[str, tuple[tuple[str, ...], _Array]], results: Results) -> None:
+def _add_grid(arrays: _Arrays, results: Results) -> None:
     """Add S1 and ST over the points of a grid, exactly, as the analysis of variance of a full factorial design.
 
     There is nothing to resample, so they have no interval. A metric without a value at a point has no index.
@@ -498,10 +502,11 @@ def _add_grid(arrays: dict[str, tuple[tuple[str, ...], _Array]], results: Result
             others = tuple(a + 1 for a in range(len(axes)) if a != k)
             s1[i, j, k] = ratios(y.mean(axis=others).var(axis=1).sum(), variance)
             total[i, j, k] = ratios(y.var(axis=k + 1).mean(axis=tuple(range(1, len(axes)))).sum(), variance)
-    arrays["S1"], arrays["ST"] = (("metric", "model", "factor"), s1), (("metric", "model", "factor"), total)
+    _add_index(arrays, "S1", s1)
+    _add_index(arrays, "ST", total)
 
 
-def _add_ranges(arrays: dict[str, tuple[tuple[str, ...], _Array]], results: Results) -> None:
+def _add_ranges(arrays: _Arrays, results: Results) -> None:
     """Add the range of each metric over the levels of one factor with the others nominal: the mean over blocks."""
     spec, (_, _, rows, models) = results.design.spec, results.design.shape
     ends = np.cumsum([1, *(len(axis) for axis in levels(spec))])
@@ -514,10 +519,10 @@ def _add_ranges(arrays: dict[str, tuple[tuple[str, ...], _Array]], results: Resu
             moved = moved[np.isfinite(moved).all(axis=1)]
             values[i, j, k] = np.ptp(moved, axis=1).mean() if len(moved) else np.nan
         values[i, j, -1] = 0.0
-    arrays["range"] = (("metric", "model", "factor"), values)
+    _add_index(arrays, "range", values)
 
 
-def _add_model_share(arrays: dict[str, tuple[tuple[str, ...], _Array]], results: Results) -> None:
+def _add_model_share(arrays: _Arrays, results: Results) -> None:
     """Add the fraction of the variance that is due to the choice of the model, by the law of total variance.
 
     All models count equally, and a point counts only where every model has a value. A grid has no interval.
@@ -556,8 +561,8 @@ def _add_model_share(arrays: dict[str, tuple[tuple[str, ...], _Array]], results:
         n = count.shape[1]
         share[i] = of_counts(np.ones((1, n)))[0, 0]
         if design.spec.design.method != "grid":
-            possible = _possible(share[i : i + 1], n)
-            interval[i] = (_intervals(of_counts, n, design) if possible is None else possible[1])[0]
+            _, possible = _possible(share[i : i + 1], n)
+            interval[i] = (_intervals(of_counts, n, design) if possible is None else possible)[0]
     arrays["model_share"] = (("metric",), share)
     if design.spec.design.method != "grid":
         arrays["model_share_interval"] = (("metric", "bound"), interval)

@@ -245,11 +245,14 @@ def _sun_visible(spec: SampleSpec, pose: Pose, positions: F64) -> F64:
 # --- values ------------------------------------------------------------------------------------------------------
 
 
-class CleanTwins:
-    """Compute what the metrics need of the clean twins of a sequence of frames once, for all faults on them."""
+class ViewedImages:
+    """Compute what the metrics need of the images of a sequence of views, each value once.
 
-    def __init__(self, frames: Sequence[NavigationFrame]) -> None:
-        self.images, self.views = [frame.clean for frame in frames], [frame.view for frame in frames]
+    Those of the clean twins serve all faults on them.
+    """
+
+    def __init__(self, images: Sequence[NDArray[np.uint8]], views: Sequence[navigation.CameraView]) -> None:
+        self.images, self.views = images, views
 
     @cached_property
     def matches(self) -> navigation.Matches:
@@ -272,29 +275,18 @@ class CleanTwins:
         return navigation.feature_lifetime(self.images[:VIEWS], self.views[:VIEWS]).mean_views
 
 
+def clean_twins(frames: Sequence[NavigationFrame]) -> ViewedImages:
+    """Return the clean twins of a sequence of frames."""
+    return ViewedImages([frame.clean for frame in frames], [frame.view for frame in frames])
+
+
+@dataclass(frozen=True, eq=False)
 class _Frames:
-    """Compute the metrics of a sequence; what several metrics need is computed once."""
+    """Hold the first frame of a sequence, and the faulted images and the clean twins of all."""
 
-    def __init__(self, frames: Sequence[NavigationFrame], clean: CleanTwins) -> None:
-        self.frames = frames
-        self.first = frames[0]
-        self.clean = clean
-
-    @property
-    def views(self) -> tuple[navigation.CameraView, navigation.CameraView]:
-        """Return the first two views."""
-        return self.first.view, self.frames[1].view
-
-    @cached_property
-    def matches(self) -> navigation.Matches:
-        """Return the matches of the first two faulted images."""
-        return navigation.match(*(frame.image for frame in self.frames[:2]))
-
-    @cached_property
-    def pose_errors(self) -> tuple[float, float]:
-        """Return how much more rotation and direction of translation are off in the faulted images, in deg."""
-        faulted, clean = navigation.relative_pose_error(self.matches, *self.views), self.clean.pose_error
-        return faulted.rotation_deg - clean.rotation_deg, faulted.translation_deg - clean.translation_deg
+    first: NavigationFrame
+    faulted: ViewedImages
+    clean: ViewedImages
 
 
 _LIMB = "Christian 2017, J. Spacecraft and Rockets 54, 708"
@@ -356,25 +348,25 @@ def orb_repeatability(of: _Frames) -> float:
 @_metric("1", _PRECISION, better="high", views=2)
 def match_precision(of: _Frames) -> float:
     """Return the fraction of the ORB matches of two views within 3 px of the true reprojection."""
-    return navigation.match_precision(of.matches, *of.views)
+    return of.faulted.precision
 
 
 @_metric("1", _PRECISION, views=2)
 def matches_lost(of: _Frames) -> float:
     """Return the fraction of the right ORB matches of two clean twins that the faulted images lack."""
-    return navigation.matches_lost(of.clean.matches, of.matches, *of.views)
+    return navigation.matches_lost(of.clean.matches, of.faulted.matches, *of.clean.views[:2])
 
 
 @_metric("deg", _FIVE_POINTS, views=2)
 def rotation_error_deg(of: _Frames) -> float:
     """Return the error of the rotation between two views, from their matches, faulted images minus clean twins."""
-    return of.pose_errors[0]
+    return of.faulted.pose_error.rotation_deg - of.clean.pose_error.rotation_deg
 
 
 @_metric("deg", _FIVE_POINTS, views=2)
 def translation_error_deg(of: _Frames) -> float:
     """Return the error of the direction of translation between two views, faulted images minus clean twins."""
-    return of.pose_errors[1]
+    return of.faulted.pose_error.translation_deg - of.clean.pose_error.translation_deg
 
 
 @_metric("views", _TRACKS, better="high", views=VIEWS)
@@ -382,14 +374,13 @@ def feature_lifetime_views(of: _Frames) -> float:
     """Return the mean number of consecutive views, of ten, in which corners are tracked within 3 px of the
     truth.
     """
-    frames = of.frames[:VIEWS]
-    return navigation.feature_lifetime([f.image for f in frames], [f.view for f in frames]).mean_views
+    return of.faulted.lifetime_views
 
 
 @_metric("1", _PRECISION, views=2)
 def match_precision_lost(of: _Frames) -> float:
     """Return the fraction of right ORB matches of two views, clean twins minus faulted images."""
-    return of.clean.precision - match_precision(of)
+    return of.clean.precision - of.faulted.precision
 
 
 @_metric("views", _TRACKS, views=VIEWS)
@@ -397,14 +388,14 @@ def feature_lifetime_lost_views(of: _Frames) -> float:
     """Return the mean number of consecutive views, of ten, in which corners are tracked, clean twins minus
     faulted images.
     """
-    return of.clean.lifetime_views - feature_lifetime_views(of)
+    return of.clean.lifetime_views - of.faulted.lifetime_views
 
 
 METRICS = tuple(_METRICS)
 
 
 def navigation_values(
-    frames: Sequence[NavigationFrame], names: Collection[str], clean: CleanTwins | None = None
+    frames: Sequence[NavigationFrame], names: Collection[str], clean: ViewedImages | None = None
 ) -> dict[str, float]:
     """Return the named metrics of a sequence of views by name; nan where a metric has no value.
 
@@ -429,5 +420,6 @@ def navigation_values(
         raise ValueError(f"{len(frames)} views: these metrics need {needed}")
     if not needed:
         return {}
-    computed = _Frames(frames, clean or CleanTwins(frames))
+    faulted = ViewedImages([frame.image for frame in frames], [frame.view for frame in frames])
+    computed = _Frames(frames[0], faulted, clean or clean_twins(frames))
     return {name: float(_COMPUTED[name](computed)) for name in names if name in _COMPUTED}

@@ -143,7 +143,7 @@ def indices(results: StudyResults, metric: str) -> tuple[Figure, str] | None:
     if not drawn:
         return None
     shares, order = drawn[0].is_fraction, [*results.ranked(metric), DUMMY]
-    values = np.asarray([[_intervals(results, metric, m, s.name, order) for s in drawn] for m in results.models])
+    values = np.asarray([[results.with_interval(s.name, metric, m, order) for s in drawn] for m in results.models])
     exponent = 0 if shares else axis_exponent(values)
     values /= 10.0**exponent
     low, high = _index_limits(values[:, :, 0], values, shares)
@@ -173,17 +173,6 @@ def indices(results: StudyResults, metric: str) -> tuple[Figure, str] | None:
     return figure, "Intervals that reach the edge of a panel go on beyond it." if cut else ""
 
 
-def _intervals(results: StudyResults, metric: str, model: str, name: str, order: Sequence[str]) -> F64:
-    """Return value, low and high of an index, [3, factor]; nan where there is none."""
-    index, bounds = results.index(name, metric, model), results.index(f"{name}_interval", metric, model)
-    values = np.full((3, len(order)), np.nan)
-    if index is not None:
-        values[0] = index.reindex(factor=order).values
-    if bounds is not None:
-        values[1:] = bounds.reindex(factor=order).sel(bound=["low", "high"]).transpose("bound", "factor").values
-    return values
-
-
 def _index_limits(dots: F64, every: F64, shares: bool) -> tuple[float, float]:
     """Return the limits of the axis of indices: all dots are within, but long intervals of fractions are cut."""
     dots, every = dots[np.isfinite(dots)], every[np.isfinite(every)]
@@ -211,7 +200,7 @@ def seeds(results: StudyResults, metric: str) -> tuple[Figure, str] | None:
         return None
     order = [*results.ranked(metric), DUMMY]
     every = results.dataset[f"{series.name}_by_seed"].sel(metric=metric, factor=order)
-    pooled = np.stack([_intervals(results, metric, model, series.name, order) for model in results.models])
+    pooled = np.stack([results.with_interval(series.name, metric, model, order) for model in results.models])
     exponent = 0 if series.is_fraction else axis_exponent(every.values)
     unit = 10.0**exponent
     numbers = [str(seed) for seed in results.dataset["seed"].values]

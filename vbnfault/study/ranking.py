@@ -97,15 +97,11 @@ def _resampled(values: F64, results: Results) -> tuple[F64, F64, F64]:
     `values` is [fault, view].
     """
     count = values.shape[1]
-    quantiles = np.stack([weighted_quantiles(row, np.ones((1, count)))[:, 0] for row in values])
+    quantiles = _quantiles(values[:, None])[..., 0]
     table = results.design.spec.design
     if count < 2:
         return quantiles, np.full((*quantiles.shape, 2), np.nan), quantiles[:, [QUANTILES.index(0.5)]]
-
-    def of_views(counts: F64) -> F64:
-        return np.stack([weighted_quantiles(row, counts) for row in values])
-
-    done = bootstrap(of_views, count, table)
+    done = bootstrap(lambda views: _quantiles(values[:, views]), count, table)
     medians = done.bootstrap_distribution[:, QUANTILES.index(0.5)]
     return quantiles, _interval(done.bootstrap_distribution, table.confidence), medians
 
@@ -118,29 +114,13 @@ def _interval(distribution: F64, confidence: float) -> F64:
     return np.moveaxis(ends, 0, -1)
 
 
-def weighted_quantiles(values: F64, times: F64) -> F64:
-    """Return the quantiles of values that count several times, [quantile, resample]; nan where none counts.
+def _quantiles(values: F64) -> F64:
+    """Return the quantiles of values [fault, resample, view], [fault, quantile, resample]; nan for no value."""
+    from scipy import stats
 
-    Parameters
-    ----------
-    values
-        float64[view]; those that are nan do not count.
-    times
-        How often each value counts, float64[resample, view].
-    """
-    known = np.flatnonzero(np.isfinite(values))
-    if not len(known):
-        return np.full((len(QUANTILES), len(times)), np.nan)
-    order = known[np.argsort(values[known], kind="stable")]
-    ranked, reached = values[order], np.cumsum(times[:, order], axis=1)
-    total = reached[:, -1:]
-    out = np.empty((len(QUANTILES), len(times)))
-    for k, quantile in enumerate(QUANTILES):
-        at_least = (reached >= quantile * total - 1e-9).argmax(axis=1)
-        more = (reached > quantile * total + 1e-9).argmax(axis=1)
-        out[k] = (ranked[at_least] + ranked[more]) / 2
-    out[:, total[:, 0] == 0] = np.nan
-    return out
+    p = np.reshape(QUANTILES, (1, 1, -1))
+    found = stats.quantile(values, p, method="averaged_inverted_cdf", axis=-1, nan_policy="omit")
+    return np.moveaxis(found, -1, 1)
 
 
 def _fraction_above(a: F64, b: F64) -> float:

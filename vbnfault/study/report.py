@@ -16,6 +16,7 @@ import numpy as np
 from markupsafe import Markup, escape
 from numpy.typing import NDArray
 
+from ..core import tables
 from ..core.figures import formula, inline_svg, png_bytes, svg_text
 from ..core.files.images import write_png
 from ..core.files.whole_files import own, own_folder, write_whole
@@ -78,14 +79,14 @@ def write_report(folder: Path, results: StudyResults) -> Path:
         indices=_index_tables(results),
         distribution=_distribution,
         plain=_plain,
-        flat=_flat,
+        flat=tables.flat,
         code=_code,
         missed=_missed(results),
         without_value=_without_value(results),
         failures=_failures(results),
         scene=Path(str(results.spec.get("scene", {}).get("base", ""))).name,
-        timings=_json(results.dataset.attrs.get("timings")),
-        versions=_json(results.dataset.attrs.get("versions")),
+        timings=json.loads(results.dataset.attrs.get("timings", "{}")),
+        versions=json.loads(results.dataset.attrs.get("versions", "{}")),
         most_rows=_MOST_ROWS,
         counts=_counts(results),
     )
@@ -224,11 +225,10 @@ def _leading(results: StudyResults, metric: str, model: str) -> Markup:
         floor = max(points.chance_swing(), 0.0)
         above = {f: swing for f, swing in above.items() if swing > floor}
     else:
-        index, bounds = results.index(name, metric, model), results.index(f"{name}_interval", metric, model)
-        assert index is not None
-        lows, highs = (index if bounds is None else bounds.sel(bound=end) for end in ("low", "high"))
-        floor = float(np.nan_to_num(highs.sel(factor=DUMMY)))
-        above = {f: float(index.sel(factor=f)) for f in results.factors if float(lows.sel(factor=f)) > floor}
+        values, *bounds = results.with_interval(name, metric, model, [*results.factors, DUMMY])
+        lows, highs = bounds if f"{name}_interval" in results.dataset else (values, values)
+        floor = float(np.nan_to_num(highs[-1]))
+        above = {f: float(values[k]) for k, f in enumerate(results.factors) if lows[k] > floor}
     if not above:
         constant = float(results.dataset["variance"].sel(metric=metric, model=model)) == 0
         return Markup('<span class="small">{}</span>').format("constant" if constant else "none")
@@ -260,35 +260,28 @@ def _model_form(results: StudyResults) -> dict[str, str]:
 def _index_tables(results: StudyResults) -> dict[str, tuple[list[str], list[list[Any]]]]:
     """Return headings and rows of the indices of each metric, the dummy's last; empty without indices."""
     names = [name for name in _COLUMNS if results.has(name)]
-    tables = {}
+    found = {}
     for metric in results.metrics if names else ():
         unit = results.about(metric, "unit")
-        heads = ["factor"]
+        heads, order = ["factor"], [*results.ranked(metric), DUMMY]
+        columns: list[list[str]] = [[_code(factor) for factor in order]]
         for model in results.models:
             for name in names:
                 head, fraction = _COLUMNS[name]
                 head += "" if fraction or unit in ("", "1") else f" / {unit}"
                 heads.append(f"{model}: {head}" if len(results.models) > 1 else head)
-        rows = [
-            [_code(factor), *(_cell(results, n, metric, m, factor) for m in results.models for n in names)]
-            for factor in (*results.ranked(metric), DUMMY)
-        ]
-        tables[metric] = heads, rows
-    return tables
+                values = results.with_interval(name, metric, model, order).T
+                columns.append([_cell(v, low, high, ".3f" if fraction else ".3g") for v, low, high in values])
+        found[metric] = heads, [list(row) for row in zip(*columns, strict=True)]
+    return found
 
 
-def _cell(results: StudyResults, name: str, metric: str, model: str, factor: str) -> str:
+def _cell(value: float, low: float, high: float, digits: str) -> str:
     """Return an index with its interval as text."""
-    index, bounds = results.index(name, metric, model), results.index(f"{name}_interval", metric, model)
-    assert index is not None
-    value = float(index.sel(factor=factor))
     if not np.isfinite(value):
         return "–"
-    digits = ".3f" if _COLUMNS[name][1] else ".3g"
-    if bounds is None:
-        return with_minus(f"{value:{digits}}")
-    low, high = bounds.sel(factor=factor, bound=["low", "high"]).values
-    return with_minus(f"{value:{digits}} [{low:{digits}}, {high:{digits}}]")
+    interval = f" [{low:{digits}}, {high:{digits}}]" if np.isfinite(low) else ""
+    return with_minus(f"{value:{digits}}{interval}")
 
 
 # ------------------------------------------------------------------------------------ what was asked, what to watch
@@ -355,20 +348,3 @@ def _plain(value: Any) -> str:
     if isinstance(value, list | tuple):
         return "[" + ", ".join(_plain(entry) for entry in value) + "]"
     return str(value)
-
-
-def _flat(table: Mapping[str, Any], above: str = "") -> list[tuple[str, Any]]:
-    """Return the values of nested tables with their dotted keys."""
-    pairs: list[tuple[str, Any]] = []
-    for key, value in table.items():
-        pairs += _flat(value, f"{above}{key}.") if isinstance(value, Mapping) else [(f"{above}{key}", value)]
-    return pairs
-
-
-def _json(text: Any) -> dict[str, Any]:
-    """Return an attribute that holds a table as JSON; empty where it is missing or no such table."""
-    try:
-        table = json.loads(text) if isinstance(text, str) else {}
-    except ValueError:
-        return {}
-    return table if isinstance(table, dict) else {}

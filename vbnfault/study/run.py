@@ -7,7 +7,6 @@ results do not depend on the number of workers, on the order of work, or on inte
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
 import os
@@ -178,7 +177,7 @@ def run_study(
         outcomes, seconds = job.outcomes(), job.seconds_by_stage()
         data = _indices(Results(design, metrics, _values(design, metrics, outcomes)))
         data.attrs["timings"] = json.dumps(seconds)
-        with _writing(path):
+        with whole_files.writing(path, within=True):
             table = results.write_table(path / results.TABLE, design, metrics, outcomes)
             results.write_indices(path / results.INDICES, data)
             if report:
@@ -296,12 +295,9 @@ def recompute(folder: str | Path) -> xr.Dataset:
     values = np.stack([table[metric.name].to_numpy() for metric in metrics], axis=-1)
     data = _indices(Results(design, metrics, values.reshape(*design.shape, len(metrics))))
     data.attrs["timings"] = before.attrs["timings"]
-    with locked(path), _writing(path):
-        from .report import write_report  # loads matplotlib
-        from .summaries import StudyResults
-
+    with locked(path), whole_files.writing(path, within=True):
         results.write_indices(path / results.INDICES, data)
-        write_report(path, StudyResults(dataset=data, table=table, spec=spec.resolved()))
+        _write_report(path, data, table, spec)
     return data
 
 
@@ -358,7 +354,7 @@ def _identity(
 def _prepare_folder(path: Path, spec: StudySpec, identity: Mapping[str, Any]) -> None:
     """Make the folder of a study, or check that it holds this study. Raises InputError."""
     record = path / "identity.json"
-    with _writing(path):
+    with whole_files.writing(path, within=True):
         check_folder(path)
         if path.is_dir() and not record.exists():
             own = {"rows", "study.toml", *(file.name for file in results.partial_files(path))}  # of a begun study
@@ -387,15 +383,6 @@ def _prepare_folder(path: Path, spec: StudySpec, identity: Mapping[str, Any]) ->
         if not record.exists():
             whole_files.write_whole(whole_files.own(path / "study.toml"), toml_files.toml_text(spec.resolved()))
             whole_files.write_whole(whole_files.own(record), json.dumps(identity, indent=1))
-
-
-@contextlib.contextmanager
-def _writing(path: Path) -> Iterator[None]:
-    """Turn an OSError of a block that writes below `path` into an InputError that names it."""
-    try:
-        yield
-    except OSError as error:
-        raise whole_files.unwritable(error.filename or path, error) from None
 
 
 # --- evaluations ----------------------------------------------------------------------------------------------
@@ -451,9 +438,9 @@ def _indices(found: Results) -> xr.Dataset:
 
 
 def _write_report(
-    path: Path, data: xr.Dataset, table: pyarrow.Table, spec: StudySpec, evaluator: Evaluator
+    path: Path, data: xr.Dataset, table: pyarrow.Table, spec: StudySpec, evaluator: Evaluator | None = None
 ) -> None:
-    """Write the extreme images, the figures and the page of a study; without images where one fails."""
+    """Write the figures and the page of a study; its extreme images, too, with an evaluator, unless one fails."""
     from .report import write_images, write_report  # loads matplotlib
     from .summaries import StudyResults
 

@@ -171,7 +171,9 @@ def _counts(frames: Sequence[navigation_metrics.NavigationFrame], metric: str) -
 # --- the error as a function of severity -------------------------------------------------------------------------
 
 
-def error_of(fault: Fault, views: Sequence[CleanView], metric: str, clean: navigation_metrics.CleanTwins) -> float:
+def error_of(
+    fault: Fault, views: Sequence[CleanView], metric: str, clean: navigation_metrics.ViewedImages
+) -> float:
     """Return the metric of a sequence of views with a fault; `clean` are their twins without any."""
     frames = [faulted(view, fault) for view in views]
     return navigation_metrics.navigation_values(frames, [metric], clean)[metric]
@@ -234,7 +236,7 @@ class ViewWorker:
     def _errors(self, group: ViewGroup, views: Sequence[CleanView]) -> dict[str, list[tuple[float, float]]]:
         """Return the values and errors of each model, by its name."""
         width_px = views[0].spec.scene.camera.width_px
-        clean = navigation_metrics.CleanTwins([view.frame for view in views])
+        clean = navigation_metrics.clean_twins([view.frame for view in views])
         return {
             model.name: measure(model, width_px, lambda fault: error_of(fault, views, self._metric, clean))
             for model in group.models

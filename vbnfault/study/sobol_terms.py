@@ -152,13 +152,16 @@ def complete_samples(blocks: _Array) -> NDArray[np.bool_]:
 
 
 def split(values: _Array, factors: int) -> tuple[_Array, _Array, _Array]:
-    """Return S1 and ST, each [factor, ...] with the dummy factor last, and interaction [factor, factor, ...]."""
-    s1 = np.concatenate([values[:factors], values[2 * factors : 2 * factors + 1]])
-    total = np.concatenate([values[factors : 2 * factors], values[2 * factors + 1 : 2 * factors + 2]])
-    pairs = np.full((factors + 1, factors + 1, *values.shape[1:]), np.nan)
-    lower = np.tril_indices(factors, -1)
-    pairs[lower] = values[2 * factors + 2 :]
-    pairs[lower[::-1]] = values[2 * factors + 2 :]
+    """Return S1 and ST, and the interactions, of indices [metric, model, index, ...].
+
+    S1 and ST are [metric, model, factor, ...] with the dummy factor last, interactions [metric, model, factor,
+    factor, ...].
+    """
+    own = np.arange(factors)
+    s1, total = values[:, :, [*own, 2 * factors]], values[:, :, [*(own + factors), 2 * factors + 1]]
+    pairs = np.full((*values.shape[:2], factors + 1, factors + 1, *values.shape[3:]), np.nan)
+    first, second = np.tril_indices(factors, -1)
+    pairs[:, :, first, second] = pairs[:, :, second, first] = values[:, :, 2 * factors + 2 :]
     return s1, total, pairs
 
 

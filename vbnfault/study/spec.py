@@ -183,16 +183,7 @@ class SceneTable(Table):
 
         An empty table, such as that of a fault without keys, adds to the scene what it lacks.
         """
-        return _flat(self.model_extra or {})
-
-
-def _flat(table: Mapping[str, Any], above: str = "") -> dict[str, Any]:
-    """Return the values of nested tables by dotted key; an empty table is a value."""
-    values: dict[str, Any] = {}
-    for key, value in table.items():
-        below = isinstance(value, Mapping) and value
-        values |= _flat(value, f"{above}{key}.") if below else {f"{above}{key}": value}
-    return values
+        return tables.flat(self.model_extra or {})
 
 
 class ModelsTable(Table):

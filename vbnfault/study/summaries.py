@@ -11,7 +11,7 @@ values of a point are averaged over its blocks. The shifts cancel where every po
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -261,6 +261,18 @@ class StudyResults:
         if name not in self.dataset:
             return None
         return self.dataset[name].sel(metric=metric, model=model)
+
+    def with_interval(self, name: str, metric: str, model: str, factors: Sequence[str]) -> F64:
+        """Return value, low and high of an index of factors, [3, factor]; nan where the design gives none."""
+        index, bounds = self.index(name, metric, model), self.index(f"{name}_interval", metric, model)
+        values = np.full((3, len(factors)), np.nan)
+        if index is not None:
+            values[0] = index.reindex(factor=factors).values
+        if bounds is not None:
+            values[1:] = (
+                bounds.reindex(factor=factors).sel(bound=["low", "high"]).transpose("bound", "factor").values
+            )
+        return values
 
     def has(self, name: str) -> bool:
         """Return whether a variable is among the indices, with at least one value."""

@@ -16,7 +16,7 @@ import os
 import shutil
 import stat
 import uuid
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -35,12 +35,20 @@ def kind_of(error: OSError) -> type[VbnfaultError]:
     return VbnfaultError if error.errno in _FAILED_RUNS else InputError
 
 
-def unwritable(path: object, error: OSError) -> VbnfaultError:
-    """Return the error for a file or folder that cannot be written."""
-    why = error.strerror or str(error)
-    if isinstance(error, FileExistsError):
-        why = "it is a link that leads nowhere" if os.path.islink(str(path)) else "it is a file, not a folder"
-    return kind_of(error)(f"{path}: cannot be written: {why}")
+@contextlib.contextmanager
+def writing(path: object, *, within: bool = False, then: str = "") -> Iterator[None]:
+    """Turn an OSError of a block that writes a file into a VbnfaultError of one sentence, which `then` ends.
+
+    With `within`, `path` is a folder, and the sentence names the file of the error.
+    """
+    try:
+        yield
+    except OSError as error:
+        why = error.strerror or str(error)
+        if isinstance(error, FileExistsError):
+            why = "it is a link that leads nowhere" if os.path.islink(str(path)) else "it is a file, not a folder"
+        named = (error.filename2 or error.filename) if within else ""
+        raise kind_of(error)(f"{named or path}: cannot be written: {why}{then}") from None
 
 
 def write_whole(path: Path, content: str | bytes) -> None:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ...core import tables
 from ...core.errors import InputError, VbnfaultError, shown
 from ...core.files.path_checks import path_of
-from ...core.files.whole_files import unwritable
+from ...core.files.whole_files import writing
 from ...core.html_page import data_url, image_url, write_page
 from ...core.quantities import Sample
 from ...dataset.statistics import Statistics, statistics
@@ -108,10 +108,8 @@ def write_report(
             why = f"the scalars of all {scalars.unreadable} finished samples cannot be read"
         raise InputError(f"{store.path}: {why}, so there is nothing to show")
     values = _values(store, scalars, int(samples), int(pixels))
-    try:
+    with writing(path):
         write_page(path, "output/report/report.html", **values)
-    except OSError as error:
-        raise unwritable(path, error) from error
     return path
 
 
