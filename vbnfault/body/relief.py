@@ -48,7 +48,7 @@ _BLOCKS_M = ((17.0, 1.9), (6.0, 0.95), (2.2, 0.40), (0.85, 0.14))
 # (rise, fraction of it that is gathered) of the layers whose edges are scarps along the contours of the ground
 _CONTOURS_M = ((45.0, 0.9), (21.0, 0.8))
 _CONTOUR_FACETS = 2.5  # least width of a scarp: a narrower one has an edge like a saw
-_NOTCH, _NOTCH_FACETS = 0.3, 1.6  # depth of the notch at the foot of a scarp over its rise, and its half-width
+_NOTCH, _NOTCH_FACETS = 0.25, 2.4  # depth of the notch at the foot of a scarp over its rise, and its half-width
 _STRATA_M = ((9.0, 1.3), (3.1, 0.55), (1.1, 0.20))  # thickness of a layer, and how far a hard layer stands out
 
 _DUST_LEAVES_DEG = (27.0, 40.0)  # dust lies on slopes below the first, and has slid off slopes above the second
@@ -248,20 +248,26 @@ def _contour_scarps(noise: Octaves, elevation_m: Float64, slope_deg: Float32) ->
     for number, (rise, gathered) in enumerate(_CONTOURS_M):
         if not noise.shown(2 * rise).any():
             continue
-        bend = noise.gradient(14 * rise, 230 + 10 * number) + 0.5 * noise.gradient(5 * rise, 231 + 10 * number)
-        bend += 0.18 * noise.gradient(3 * rise, 232 + 10 * number) + 0.07 * noise.gradient(rise, 235 + 10 * number)
+        # small closed bends would be ringed by scarps
+        bend = 0.8 * noise.gradient(22 * rise, 230 + 10 * number) + 0.25 * noise.gradient(
+            6 * rise, 231 + 10 * number
+        )
+        bend += 0.12 * noise.gradient(3 * rise, 232 + 10 * number) + 0.05 * noise.gradient(rise, 235 + 10 * number)
         u = elevation_m / rise + bend
         tread = np.floor(u)
         inside = (u - tread).astype(np.float32)
         hard = np.random.Generator(np.random.Philox(910 + number)).random(4096).astype(np.float32)
-        where = noise.gradient(20 * rise, 233 + 10 * number) + 0.6 * noise.gradient(7 * rise, 234 + 10 * number)
-        where = 0.6 * where + 5.0 * hard[tread.astype(np.int64) & 4095] - 3.9
+        where = 0.6 * noise.gradient(20 * rise, 233 + 10 * number) + 0.9 * noise.gradient(
+            5 * rise, 234 + 10 * number
+        )
+        where += 5.0 * hard[tread.astype(np.int64) & 4095] - 3.7
         wide = np.maximum(0.6 * rise, _CONTOUR_FACETS * noise.facet_m) * tangent / rise
         wide = np.clip(wide, 0.05, 0.95).astype(np.float32)
-        stair = smooth_step(0, 1, 1 - (1 - inside) / wide)
+        foot = 0.5 * (1 - wide)
+        stair = smooth_step(0, 1, (inside - foot) / wide)
         kept = np.float32(gathered * rise) * smooth_step(0.2, 1.1, where) * noise.shown(2 * rise)
         # a scarp is undercut: its foot lies in a notch, which is dark under any Sun
-        foot_m = (inside - (1 - wide)) * np.float32(rise) / tangent
+        foot_m = (inside - foot) * np.float32(rise) / tangent
         notch = np.exp(-((foot_m / (_NOTCH_FACETS * noise.facet_m)) ** 2)).astype(np.float32)
         total += kept * (stair - inside - _NOTCH * notch)
     return total
