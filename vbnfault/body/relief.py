@@ -240,26 +240,24 @@ def _terraced(noise: Octaves, swell: Float32) -> Float32:
 def _contour_scarps(noise: Octaves, elevation_m: Float64, slope_deg: Float32) -> Float32:
     """Return what gathers the rise of the ground into scarps along its contours, metres along the vertical.
 
-    Layers crop out along contours of the elevation, which random fields bend. A scarp ends where its layer is soft,
-    and lower layers are weaker where a higher one has left debris.
+    Layers crop out along contours of the elevation, which random fields bend. A few of them are hard enough, and a
+    scarp ends where its layer is soft.
     """
     total = np.zeros_like(slope_deg)
     tangent = np.hypot(np.tan(np.radians(np.minimum(slope_deg, 60.0))), np.float32(0.3))
+    gentle = 1 - smooth_step(25.0, 45.0, slope_deg)  # on cliffs, contours are too near to each other
     for number, (rise, gathered) in enumerate(_CONTOURS_M):
         if not noise.shown(2 * rise).any():
             continue
         # small closed bends would be ringed by scarps
-        bend = 0.8 * noise.gradient(22 * rise, 230 + 10 * number) + 0.25 * noise.gradient(
-            6 * rise, 231 + 10 * number
-        )
-        bend += 0.12 * noise.gradient(3 * rise, 232 + 10 * number) + 0.05 * noise.gradient(rise, 235 + 10 * number)
+        stream = 230 + 10 * number
+        bend = 0.8 * noise.gradient(22 * rise, stream) + 0.25 * noise.gradient(6 * rise, stream + 1)
+        bend += 0.12 * noise.gradient(3 * rise, stream + 2) + 0.05 * noise.gradient(rise, stream + 5)
         u = elevation_m / rise + bend
         tread = np.floor(u)
         inside = (u - tread).astype(np.float32)
         hard = np.random.Generator(np.random.Philox(910 + number)).random(4096).astype(np.float32)
-        where = 0.6 * noise.gradient(20 * rise, 233 + 10 * number) + 0.9 * noise.gradient(
-            5 * rise, 234 + 10 * number
-        )
+        where = 0.6 * noise.gradient(20 * rise, stream + 3) + 0.9 * noise.gradient(5 * rise, stream + 4)
         where += 5.0 * hard[tread.astype(np.int64) & 4095] - 3.7
         wide = np.maximum(0.6 * rise, _CONTOUR_FACETS * noise.facet_m) * tangent / rise
         wide = np.clip(wide, 0.05, 0.95).astype(np.float32)
@@ -269,7 +267,7 @@ def _contour_scarps(noise: Octaves, elevation_m: Float64, slope_deg: Float32) ->
         # a scarp is undercut: its foot lies in a notch, which is dark under any Sun
         foot_m = (inside - foot) * np.float32(rise) / tangent
         notch = np.exp(-((foot_m / (_NOTCH_FACETS * noise.facet_m)) ** 2)).astype(np.float32)
-        total += kept * (stair - inside - _NOTCH * notch)
+        total += gentle * kept * (stair - inside - _NOTCH * notch)
     return total
 
 
