@@ -295,3 +295,40 @@ def test_looking_does_not_load_mitsuba() -> None:
         "assert not {'mitsuba', 'drjit'} & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-W", "error", "-c", script], check=True)
+
+
+AT_THE_END_OF_MEMORY = """
+import ctypes, mmap, sys
+import numpy as np
+from vbnfault.core.process.llvm import backend, flat
+from vbnfault.body.fields import Points
+
+def at_the_end(values):
+    # the last byte is the last before a page that may not be read
+    size, pages = values.nbytes, -(-values.nbytes // mmap.PAGESIZE)
+    block = mmap.mmap(-1, (pages + 1) * mmap.PAGESIZE)
+    base = ctypes.addressof(ctypes.c_char.from_buffer(block))
+    assert ctypes.CDLL(None).mprotect(ctypes.c_void_p(base + pages * mmap.PAGESIZE), mmap.PAGESIZE, 0) == 0
+    placed = np.frombuffer(block, np.uint8)[pages * mmap.PAGESIZE - size : pages * mmap.PAGESIZE].view(values.dtype)
+    placed[:] = values
+    return placed
+
+be = backend()
+for kind, dtype in (("Float", np.float32), ("Float64", np.float64), ("UInt32", np.uint32), ("UInt8", np.uint8)):
+    for size in (4001, 4008, 4016, 4088):
+        values = np.arange(size).astype(dtype)
+        doubled = getattr(be, kind)(flat(at_the_end(values))) * 2
+        be.dr.eval(doubled)
+        be.dr.sync_thread()
+        assert np.array_equal(doubled.numpy(), values * 2), (kind, size)
+places = at_the_end(np.arange(3.0 * 4008)).reshape(-1, 3)
+assert len(Points(places).gradient(7.0, 1, 4008)) == 4008
+"""
+
+
+def test_kernels_read_nothing_past_the_memory_of_an_array() -> None:
+    """They read whole vectors of 16 numbers, and an unreadable page behind an array would end the process."""
+    done = subprocess.run(
+        [sys.executable, "-c", AT_THE_END_OF_MEMORY], capture_output=True, text=True, timeout=300, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.process.llvm import backend
+from ..core.process.llvm import backend, flat
 from .geometry import Float64
 from .noise import Float32, noise_key, seed_word
 from .roughness import Roughness, deviogram
@@ -52,7 +52,7 @@ class Points:
     def __init__(self, position_m: Float64) -> None:
         d = backend()
         self.count = len(position_m)
-        self._axes = [d.Float64(np.ascontiguousarray(position_m[:, k])) for k in range(3)]
+        self._axes = [d.Float64(flat(position_m[:, k])) for k in range(3)]
 
     def gradient(self, wavelength_m: float, key: int, count: int) -> Float32:
         """Return gradient noise of one cycle per 1-2 wavelengths, float32[count], mean 0, within ±1.3."""
@@ -266,7 +266,13 @@ _FADE = (1.6, 2.8)
 
 _CRATER_WIDTHS_M = (72.0, 36.0, 18.0, 9.0)  # cells; diameters are a third to two thirds of their width
 _CRATER_SHARE_PER_DENSITY = 1534e-6  # fraction of the cells, per crater of 10 m or more in a square kilometre
-_UNITS_M = ((260.0, 0.35), (110.0, 0.35), (45.0, 0.3))  # size of units of the ground, and how their cover differs
+_UNITS_M = (
+    (260.0, 0.35),
+    (110.0, 0.35),
+    (45.0, 0.3),
+    (18.0, 0.2),
+    (8.0, 0.15),
+)  # size of units of the ground, and how their cover differs
 _CLOD_CELLS_M = (2.1, 1.2, 0.7)
 _CRACK_DEPTH = 0.30  # of the cracks between blocks, per unit of the blocks' height
 
@@ -331,11 +337,12 @@ class Octaves:
         """Return the fraction of each facet that dust covers, float32[n], where it reaches `above_m` over the rock.
 
         Relief below the facets lets rock show through thin dust, so the cover grows over its height, or over
-        `border_m` where that is larger: over metres of ground and not at a line. Units of 30 to 300 m differ.
+        `border_m` where that is larger: over metres of ground and not at a line. Units of 8 to 300 m differ.
         """
         hidden_m = self._unit * self._roughness.deviation_at(_FADE[1] * self.facet_m)
         unit = sum(np.float32(a) * self.gradient(w, 680 + k) for k, (w, a) in enumerate(_UNITS_M))
-        return smooth_step(-1.0, 1.6, above_m / np.hypot(border_m, hidden_m) + unit)
+        # deep dust varies, too, by its age and its thickness
+        return smooth_step(-1.6, 2.0, np.tanh(above_m / np.hypot(border_m, hidden_m)) + unit)
 
     def wavelengths(self, longest_m: float, shortest_m: float) -> list[tuple[int, float]]:
         """Return the octaves in (shortest, longest] as (number, wavelength); the patch's longest is number 0."""

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .description import View
-from .runtime import dr, mi
+from .runtime import dr, mi, packets
 
 F64 = NDArray[np.float64]
 Float32 = NDArray[np.float32]
@@ -177,7 +177,7 @@ def _integrated(
     nearest, miss, towards_sun, camera_sun = line
 
     def column(values: F64) -> Any:
-        return mi.Float(np.ascontiguousarray(values, dtype=np.float32))
+        return packets(mi.Float, np.asarray(values, dtype=np.float32))
 
     # t counts from the point nearest to the centre, where float32 resolves heights best
     first, width, lateral = column(begin - nearest), column(step), column(miss - unit)

@@ -41,4 +41,4 @@ def packets(kind: Any, values: NDArray[Any]) -> Any:
 
 def columns(vectors: NDArray[Any]) -> list[Any]:
     """Return the columns of an array [n, k] as drjit floats, such as the components of vectors."""
-    return [mi.Float(np.ascontiguousarray(column, np.float32)) for column in vectors.T]
+    return [mi.Float(llvm.flat(np.asarray(column, np.float32))) for column in vectors.T]

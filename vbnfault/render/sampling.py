@@ -234,7 +234,7 @@ class Optics:
 
     def rays_of(self, slopes: NDArray[np.float64]) -> Any:
         """Return one ray from the lens's centre for each pair of tangents x/z and y/z in C, float64[y, x, 2]."""
-        across, down = (mi.Float(np.ascontiguousarray(slopes[..., k], np.float32).ravel()) for k in (0, 1))
+        across, down = (packets(mi.Float, np.asarray(slopes[..., k], np.float32)) for k in (0, 1))
         ax, ay, az = self.axes
         direction = dr.normalize(across * ax + down * ay + az)
         return mi.Ray3f(self.origin + self.start_m * direction, direction)

@@ -91,7 +91,7 @@ class TerrainMesh:
 
     def corners_m(self, facets: NDArray[np.intp]) -> NDArray[np.float64]:
         """Return the corners of facets, float64[facet, corner, 3] in L."""
-        corners = self._corners_of(mi.UInt32(np.ascontiguousarray(facets, np.uint32)))
+        corners = self._corners_of(packets(mi.UInt32, np.asarray(facets, np.uint32)))
         return np.stack([corner.numpy().T for corner in corners], axis=1).astype(np.float64)
 
     def facets_near(self, positions_L_m: NDArray[np.float64], reach_m: float) -> NDArray[np.intp]:

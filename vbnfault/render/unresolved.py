@@ -27,7 +27,7 @@ from ..core.quantities import FineLight, Radiance
 from ..core.sundisc import sunflower
 from .description import RenderInput, View
 from .light import Cells, CellStrata, Direct
-from .runtime import columns, dr, mi
+from .runtime import columns, dr, mi, packets
 from .surface import TerrainMesh
 
 F32 = NDArray[np.float32]
@@ -214,7 +214,7 @@ def thin_parts(surface: TerrainMesh, scene: RenderInput) -> FineLight | None:
     rays = mi.Ray3f(direct.optics.origin, dr.normalize(across * ax + down * ay + az))
     cells = Cells(pixel=np.arange(len(owner), dtype=np.uint32), cell=np.zeros(len(owner), np.uint32), side=1)
     strata = CellStrata(cells, 1, scene.key ^ _FACET_KEY, None)
-    terms = direct.terms(strata, rays, mi.UInt32(facets[owner].astype(np.uint32)))
+    terms = direct.terms(strata, rays, packets(mi.UInt32, facets[owner].astype(np.uint32)))
     dr.eval(*terms)
     radiance = direct.weights.T.astype(np.float32) @ np.stack([term.numpy() for term in terms])
     # defocus shifts the light of each point of the aperture

@@ -32,7 +32,7 @@ T = TypeVar("T", bound=np.generic)
 OLDEST_USABLE = 16
 VARIABLE = "DRJIT_LIBLLVM_PATH"
 _WHEEL = "karellen-llvm-core"
-_ALIGNED_BYTES = 64
+_ALIGNED_BYTES, _LANES = 64, 16
 
 _SYSTEM_PATTERNS = {
     "linux": (
@@ -114,14 +114,17 @@ def backend() -> Any:
 
 
 def flat(array: NDArray[T]) -> NDArray[T]:
-    """Return an array, or a copy of it, in one dimension and beginning at a multiple of 64 bytes.
+    """Return an array, or a copy of it, in one dimension and beginning at a multiple of 16 numbers and 64 bytes.
 
-    drjit uses numpy's memory as it is, and compiles another kernel for each set of arrays that begin elsewhere.
+    drjit uses numpy's memory as it is, and compiles another kernel for each set of arrays that begin elsewhere. Its
+    kernels also read past the end, up to the next 16 numbers. From such a place on, these lie in the same page of
+    memory as the last number; from others they may lie in a page that is not there, which ends the process.
     """
-    if array.flags.c_contiguous and array.ctypes.data % _ALIGNED_BYTES == 0:
+    step = max(_ALIGNED_BYTES, _LANES * array.itemsize)
+    if array.flags.c_contiguous and array.ctypes.data % step == 0:
         return array.reshape(-1)
-    memory = np.empty(array.nbytes + _ALIGNED_BYTES, np.uint8)
-    start = -memory.ctypes.data % _ALIGNED_BYTES
+    memory = np.empty(array.nbytes + step, np.uint8)
+    start = -memory.ctypes.data % step
     out: NDArray[T] = memory[start : start + array.nbytes].view(array.dtype)
     out[...] = array.reshape(-1)
     return out
