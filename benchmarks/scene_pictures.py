@@ -4,9 +4,9 @@
     python benchmarks/scene_pictures.py --out scenes landing flares
 
 Contact sheets show samples of a dataset with their masks. Their samples are 512 pixels wide, over terrain as coarse
-as quickstart's; the sheets are then shrunk. The figures of `flares`, `navcam67p`, `paper_example` and `physical67p`
-show single samples, rendered at the scene's own size and then shrunk. A figure without colour is written as a grey
-PNG, whose file is smaller.
+as quickstart's; the sheets are then shrunk. The figures of `flares`, `navcam67p`, `paper_example`, `physical67p`
+and `rosetta67p` show single samples, rendered at the scene's own size and then shrunk. A figure without colour is
+written as a grey PNG, whose file is smaller.
 """
 
 from __future__ import annotations
@@ -117,13 +117,25 @@ def paper_example() -> U8:
     return spaced([[*pictures, masks[0]], [*masks[1:], mask(frame, *local)]], 400)
 
 
+def rosetta67p() -> U8:
+    """Draw four frames."""
+    images = [rgb(frame, "image") for frame in frames("rosetta67p", (0, 1, 2, 3))]
+    return spaced([images[:2], images[2:]], NAVCAM_TILE_PX)
+
+
 def physical67p() -> U8:
     """Draw two samples, each with and without its faults."""
     taken = frames("physical67p", PHYSICAL)
     return spaced([[rgb(frame, "image"), rgb(frame, "clean")] for frame in taken], 540)
 
 
-SINGLE = {"flares": flares, "navcam67p": navcam67p, "paper_example": paper_example, "physical67p": physical67p}
+SINGLE = {
+    "flares": flares,
+    "navcam67p": navcam67p,
+    "paper_example": paper_example,
+    "physical67p": physical67p,
+    "rosetta67p": rosetta67p,
+}
 
 
 def sheet(scene: str) -> U8:

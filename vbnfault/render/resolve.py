@@ -198,7 +198,7 @@ def _any_hit(
     origins = np.repeat(position, k, axis=0)
     d = np.broadcast_to(directions, (n, k, 3)).reshape(-1, 3)
     rays = mi.Ray3f(mi.Point3f(*columns(origins)), mi.Vector3f(*columns(d)))
-    rays.maxt = packets(mi.Float, np.minimum(reach_m, 3e38).astype(np.float32))
+    rays.maxt = packets(mi.Float, np.asarray(np.minimum(reach_m, 3e38), np.float32))
     hits = surface.occluded(rays, mi.Bool(True), coherent=False)
     return hits.numpy().astype(bool).reshape(n, k)
 
