@@ -5,8 +5,8 @@ Pose, exposure, gain and black of a real frame are never known well enough, so e
 - the attitude and the distance, where asked for: the similarity that correlates image and frame best moves the
   camera, and the image is rendered again; then the image moves by whole native pixels, which leaves its noise as it
   is;
-- the exposure, metered so that the rendered body is as bright as the frame's; an overexposed frame is metered on a
-  percentile that is not yet white;
+- the exposure, metered so that the rendered body is as bright as the frame's in its median; an overexposed frame is
+  metered on a percentile that is not yet white;
 - the gain, of those that the camera has, whose noise in the sky is nearest to the frame's;
 - the black: the difference of the median levels of the skies, where the frame's is not clipped.
 
@@ -37,8 +37,8 @@ _SEARCH_PX = 16  # largest shift, for frames of 512 px
 # Of the neighbours' light in a mean over pixels. Noise of neighbours in the sky of Rosetta's frames correlates by
 # 0.07, which asks for 0.035; limb and ground are sharper and ask for less.
 _LEAK = 0.0325
-# A frame whose `bright` reaches this level is overexposed. It is metered on one of these percentiles.
-_WHITE, _LOWER_PERCENTILES = 250, (95.0, 90.0, 80.0, 70.0, 60.0, 50.0, 40.0, 30.0, 20.0, 10.0)
+# The first of these percentiles that is below this level is metered on.
+_WHITE, _PERCENTILES = 250, (50.0, 40.0, 30.0, 20.0, 10.0)
 _MOST_BLACK = 1e-3  # of white: more is light. Of 32 frames of Rosetta's the black differs by 4e-4
 
 
@@ -230,11 +230,9 @@ def noise_variance(one: Look) -> float:
 def metered_on(real: Look) -> tuple[float, float]:
     """Return a percentile of the lit pixels of a real frame, and its brightness.
 
-    It is the 99th, which is `bright`; in an overexposed frame, the highest one that is below white.
+    It is the median; in an overexposed frame, the highest one that is below white.
     """
-    if real.bright < _WHITE:
-        return 99.0, real.bright
-    for percentile in _LOWER_PERCENTILES:
+    for percentile in _PERCENTILES:
         brightness = float(np.percentile(real.image[real.lit], percentile))
         if brightness < _WHITE:
             break
