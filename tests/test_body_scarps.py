@@ -194,7 +194,7 @@ def test_dust_covers_over_metres_where_facets_are_coarse() -> None:
         above = [noise.dust_cover(np.full(len(place), h, np.float32), 0.5) for h in (-40.0, -1.0, 1.0, 40.0)]
         assert [cover.mean() for cover in above] == sorted(cover.mean() for cover in above)
         assert above[0].max() < 0.05
-        assert above[3].min() > 0.9
+        assert above[3].mean() > 0.75
         spread.append(above[2].mean() - above[1].mean())
         assert above[2].std() > 0.05  # units of 30 to 300 m differ
     assert spread[1] < 0.6 * spread[0]

@@ -212,7 +212,7 @@ def test_neighbouring_sites_see_the_same_fractured_ground(body: Body) -> None:
 
 def test_keys_of_the_scene() -> None:
     assert load_scene("quickstart").patch.fractured is None
-    assert load_scene("navcam67p").patch.fractured is not None
+    assert load_scene("navcam67p", {"patch.fractured": {}}).patch.fractured is not None
     table = load_scene("quickstart", {"patch.fractured": {"dust_m": 2.5}}).patch.fractured
     assert table is not None
     assert Fractured(**table.model_dump()) == Fractured(dust_m=2.5)

@@ -342,7 +342,7 @@ class Octaves:
         hidden_m = self._unit * self._roughness.deviation_at(_FADE[1] * self.facet_m)
         unit = sum(np.float32(a) * self.gradient(w, 680 + k) for k, (w, a) in enumerate(_UNITS_M))
         # deep dust varies, too, by its age and its thickness
-        return smooth_step(-1.6, 2.0, np.tanh(above_m / np.hypot(border_m, hidden_m)) + unit)
+        return smooth_step(-1.6, 2.0, np.minimum(above_m / np.hypot(border_m, hidden_m), 1.0) + unit)
 
     def wavelengths(self, longest_m: float, shortest_m: float) -> list[tuple[int, float]]:
         """Return the octaves in (shortest, longest] as (number, wavelength); the patch's longest is number 0."""

@@ -30,7 +30,7 @@ def passport(
     kept_back: Annotated[float, number(0, 0.9, "Fraction of the frames that is kept back, by their names.")] = 0.33,
     gain: Annotated[
         list[float] | None,
-        typer.Option(help="Factor on the detector's gain that the camera has; may be repeated.", show_default="1"),
+        number(1, 1000, "Factor on the detector's gain that the camera has; may be repeated.", unset="1"),
     ] = None,
     mend_poses: Annotated[int, whole(0, 5, "How often each pose is mended by its frame.")] = 1,
     threads: Annotated[int | None, whole(1, MOST_PROCESSES, "Render threads.", unset="every core")] = None,
