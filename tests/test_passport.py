@@ -119,6 +119,7 @@ def test_wrong_frames_are_refused_before_anything_is_rendered(frames: Path, tmp_
         ("frame_1.png", np.zeros((8, 8), np.uint8), r"frame_1.png: is 8x8 px; must be at least 64 px"),
         ("frame_2.png", b"no image", r"frame_2.png: is not a PNG"),
         ("frame_3.png", np.zeros((100, 64), np.uint8), r"has 64x100 px, and the camera 128x128: must be as many"),
+        ("frame_4.png", np.zeros((64, 64), np.uint8), r"frame_4: the frame shows no lit body"),
     ):
         folder = tmp_path / name
         folder.mkdir()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -45,17 +46,15 @@ def passport(
     options = PassportOptions(
         part=part, kept_back=kept_back, gains=tuple(gain or (1.0,)), mendings=mend_poses, threads=threads
     )
-    bar: Any = None
+    with contextlib.ExitStack() as stack:
+        bars: list[Any] = []
 
-    def advance(done: int, count: int) -> None:
-        nonlocal bar
-        if bar is None:
-            bar = progress_bar(count, "frames").__enter__()
-        bar.update(done - bar.pos)
+        def advance(done: int, count: int) -> None:
+            if not bars:
+                bars.append(stack.enter_context(progress_bar(count, "frames and classifiers")))
+            bars[0].update(done - bars[0].pos)
 
-    result = compare(frames, scene, out, options, overrides=overrides(settings), poses=poses, advance=advance)
-    if bar is not None:
-        bar.__exit__(None, None, None)
+        result = compare(frames, scene, out, options, overrides=overrides(settings), poses=poses, advance=advance)
     for text in result["conclusions"]["may"]:
         typer.echo(f"may: {text}")
     for text in result["conclusions"]["may_not"]:

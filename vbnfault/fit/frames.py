@@ -195,7 +195,6 @@ def octave_variances(level: F32, inside: Mask) -> dict[str, float]:
 
     Octaves are differences of Gaussians that see the pixels of the mask only.
     """
-
     mean = float(level[inside].mean()) if inside.any() else 1.0
     out = {}
     for short, long in _OCTAVES_PX:
@@ -293,8 +292,8 @@ def compare(
     out = {
         "iou": float(both.sum() / max(either.sum(), 1)),
         "limb_px": limb_px(real.lit, rendered.lit, sun_xy),
-        "rank": float(stats.spearmanr(real.level[both], rendered.level[both]).statistic),
-        "rank_smooth": float(stats.spearmanr(*smooth).statistic),
+        "rank": _rank(real.level[both], rendered.level[both]),
+        "rank_smooth": _rank(*smooth),
     }
     for which, one in (("real", real), ("rendered", rendered)):
         of_sky = sky_figures(one, either)
@@ -303,6 +302,11 @@ def compare(
         values = of_sky | body_figures(one, sun_xy) | octave_variances(one.level, inside)
         out |= {f"{name} {which}": value for name, value in values.items()}
     return out
+
+
+def _rank(a: NDArray[Any], b: NDArray[Any]) -> float:
+    """Return Spearman's correlation, or NaN of too few pixels."""
+    return float(stats.spearmanr(a, b).statistic) if len(a) >= _FEWEST_PX else float("nan")
 
 
 def read_frame(folder: Path, name: str) -> F32:

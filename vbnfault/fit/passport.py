@@ -9,6 +9,7 @@ ones, over the interquartile range of the real values: at 0.5 the rendered value
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -23,7 +24,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from .. import __version__
-from ..core.errors import InputError, shown
+from ..core.errors import InputError, in_file, shown
 from ..core.figures import inline_svg, panels, svg_text
 from ..core.files.images import encoded
 from ..core.files.whole_files import own, own_folder, write_json, write_whole
@@ -32,7 +33,7 @@ from ..scene.config import load_scene
 from ..scene.trajectory import load_trajectory
 from .frames import read_frame
 from .replay import Replay
-from .two_samples import PLACES, kinds, two_sample_test
+from .two_samples import FEWEST_FRAMES, PLACES, kinds, two_sample_test
 
 PAGE, FILE, PAIRS = "passport.html", "passport.json", "pairs"
 Part = Literal["shown", "kept_back", "all"]
@@ -169,7 +170,7 @@ def passport(
     poses
         Table of poses, one row for each frame; default: `poses.csv` in the folder.
     advance
-        Called with the number of finished frames and of all.
+        Called with the number of finished steps and of all: each frame is one, and each draw of a classifier.
 
     Returns
     -------
@@ -189,15 +190,24 @@ def passport(
     loaded = load_scene(scene, dict(overrides or {}))
     replay = Replay(loaded, table, gains=options.gains, mendings=options.mendings, threads=options.threads)
     for row in rows:
-        replay.reduction(images[row])
-    resolved = json.dumps(replay.scene.resolved(), sort_keys=True, default=str)
+        with in_file(str(frames / table.name[row])):
+            replay.check(images[row])
+    # the scene names its files, whose contents count
+    files = replay.session.body.content_hash, replay.session.base_camera.detector.description
+    resolved = json.dumps([replay.scene.resolved(), files], sort_keys=True, default=str)
     own_folder(out)
     own_folder(out / PAIRS)
+    draws = len(PLACES) * len(kinds()) * options.draws if len(rows) >= FEWEST_FRAMES else 0
+    steps = itertools.count()
+
+    def step() -> None:
+        advance(next(steps), len(rows) + draws)
+
+    step()
     figures, settings = {}, {}
-    for done, row in enumerate(rows):
-        advance(done, len(rows))
-        name = table.name[row]
-        key = [resolved, table.camera_from_T[row].tobytes().hex(), table.camera_position_T_m[row].tobytes().hex()]
+    for row in rows:
+        name, pose = table.name[row], table.pose(row)
+        key = [resolved, *(repr(np.asarray(value).tolist()) for value in vars(pose).values())]
         key += [
             hashlib.sha256(images[row].tobytes()).hexdigest(),
             repr((options.gains, options.mendings)),
@@ -212,9 +222,9 @@ def passport(
                 write_whole(own(out / PAIRS / f"{name}_{which}.png"), encoded(one.image.astype(np.uint8), ".png"))
             write_json(own(out / PAIRS / f"{name}.json"), kept)
         figures[name], settings[name] = kept["figures"], kept["settings"]
-    advance(len(rows), len(rows))
+        step()
     pairs = [(name, _written(out, name, "real"), _written(out, name, "rendered")) for name in figures]
-    told, pictures = two_sample_test(pairs, draws=options.draws) if len(pairs) >= 4 else ({}, {})
+    told, pictures = two_sample_test(pairs, draws=options.draws, advance=step) if draws else ({}, {})
     result = {
         "vbnfault": __version__,
         "scene": scene,

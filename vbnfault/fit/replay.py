@@ -34,10 +34,10 @@ from ..scene.trajectory import FlownPose, Trajectory
 from .frames import F32, Look, compare, look, shift_between, shifted, similarity_between
 
 _SEARCH_PX = 16  # largest shift, for frames of 512 px
-# Of the neighbours' light in a mean over pixels. Noise of neighbours in the sky of Rosetta's frames correlates by
-# 0.07, which asks for 0.035; limb and ground are sharper and ask for less.
+# This part of a mean over pixels is light of the pixels beside them. Noise of neighbours in the sky of Rosetta's
+# frames correlates by 0.07, which asks for 0.035; limb and ground are sharper and ask for less.
 _LEAK = 0.0325
-# The first of these percentiles that is below this level is metered on.
+# The exposure is metered on the first of these percentiles whose level is below the given one.
 _WHITE, _PERCENTILES = 250, (50.0, 40.0, 30.0, 20.0, 10.0)
 _MOST_BLACK = 1e-3  # of white: more is light. Of 32 frames of Rosetta's the black differs by 4e-4
 
@@ -56,7 +56,7 @@ class Pair:
 def replay_scene(scene: Scene) -> Scene:
     """Return a scene that stores raw mosaics and gives every sample each of its faults.
 
-    Raises InputError for a camera without a monochrome detector file.
+    Raises InputError for a camera without a detector file.
     """
     if not scene.camera.detector:
         raise InputError("camera.detector: is missing; frames are compared with raw images of a sensor file")
@@ -193,6 +193,12 @@ class Replay:
         self.session.scene = self.scene.model_copy(update={"camera": camera})
         self.session.trajectory = trajectory
         return self.session.simulate(row).layers["raw"]
+
+    def check(self, frame: F32) -> None:
+        """Raise InputError for a frame of another size or without a lit body."""
+        self.reduction(frame)
+        if not look(frame).lit.any():
+            raise InputError("the frame shows no lit body")
 
     def reduction(self, frame: F32) -> int:
         """Return by what the camera's image is larger than a frame. Raises InputError if by no whole factor."""

@@ -56,7 +56,7 @@ _RINGS = 10
 _WIDTHS = (0.5, 1.0, 3.0)  # of the kernel, in root mean square distances of training patches
 _PENALTIES = (1e-2, 1e-1, 1.0)
 _FOLDS = 4
-_FEWEST_FRAMES = 4
+FEWEST_FRAMES = 4
 _BOOTSTRAPS = 2000
 _SPOT = 3  # levels of 255 over the median: six times the noise of a sky
 _TREES = 300
@@ -411,13 +411,13 @@ def two_sample_test(
 
     Raises InputError for fewer frames.
     """
-    if len(pairs) < _FEWEST_FRAMES:
-        raise InputError(f"{len(pairs)} frames: a classifier needs at least {_FEWEST_FRAMES}")
+    if len(pairs) < FEWEST_FRAMES:
+        raise InputError(f"{len(pairs)} frames: a classifier needs at least {FEWEST_FRAMES}")
     out: dict[str, dict[str, tuple[float, float, float]]] = {}
     pictures: dict[str, U8] = {}
     for place in PLACES:
         patches = patches_of(pairs, place, size, count, seed)
-        if len(np.unique(patches.frame)) < _FEWEST_FRAMES:
+        if len(np.unique(patches.frame)) < FEWEST_FRAMES:
             continue
         parts, score = examine(patches, place, splits, seed)
         out[place], pictures[place] = parts, confident(patches, score)
