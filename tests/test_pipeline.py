@@ -17,7 +17,7 @@ from conftest import ALL_FAULTS, small_scene
 from vbnfault import pipeline
 from vbnfault.core import frames
 from vbnfault.detector import ThreeColourDetector
-from vbnfault.pipeline import Session, masks
+from vbnfault.pipeline import Session, injection, masks
 from vbnfault.pipeline.development import Development, acting_at, without
 from vbnfault.pipeline.record import to_sample
 from vbnfault.pipeline.resolve import resolve
@@ -456,6 +456,19 @@ def test_the_effect_by_rows_equals_the_effect_of_whole_pictures(frames_: list[Fr
         for name in draws:
             other = development.image(without(draws, name), noisy=False).array
             assert np.array_equal(development.effect(draws, name), (whole != other).any(axis=-1))
+
+
+def test_a_fault_that_some_rows_show_changes_the_whole_image(frames_: list[Frame]) -> None:
+    counts: Counter[str] = Counter()
+    for frame in frames_:
+        development, draws = frame.injection.development, frame.injection.draws
+        for name in injection._seen_on_some_rows(development, draws):
+            least_dn = max(draws[name].fault.effect_level_dn, 2.0)
+            assert development.effect(draws, name, least_dn).any()
+            counts[name] += 1
+        # every eighth row of frames of 48 rows and more shows any fault that darkens the frame as a whole
+        assert "vignetting" not in draws or "vignetting" in injection._seen_on_some_rows(development, draws)
+    assert len(counts) >= 3
 
 
 @contextlib.contextmanager

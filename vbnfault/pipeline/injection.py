@@ -53,7 +53,8 @@ def inject_faults(
     development.image({})  # pixels of the other images are taken from the clean one
     draws = draw_faults(spec, development, commanded, {}, attempt)
     _prepare_signals(development, draws)
-    while invisible := _invisible(development, draws):
+    stored = "mask_effect" in stored_layers(spec.scene, spec.faults)
+    while invisible := _invisible(development, draws, stored=stored):
         draws = {name: draw for name, draw in draws.items() if name not in invisible}
         attempt += 1
         if attempt <= last:
@@ -128,18 +129,41 @@ def _prepare_signals(development: Development, draws: Draws) -> None:
 # --- visibility --------------------------------------------------------------------------------------------
 
 
-def _invisible(development: Development, draws: Draws) -> list[str]:
-    """Return the drawn faults without any effect on the noise-free image, or on the one with noise."""
-    if not draws:
+def _invisible(development: Development, draws: Draws, *, stored: bool) -> list[str]:
+    """Return the drawn faults without any effect on the noise-free image, or on the one with noise.
+
+    `stored` is True if the scene stores all effects. They are then computed anyway, and no row is tried first.
+    """
+    seen = set() if stored else _seen_on_some_rows(development, draws)
+    doubtful = [name for name in draws if name not in seen]
+    if not doubtful:
         return []
     development.image(draws, noisy=False)  # all effects need it
     # without a fault that informs others, their light is computed anew, with much memory
     last = [name for name in draws if informs(draws[name].fault)]
-    invisible = [name for name in draws if name not in last and _is_invisible(development, draws, name)]
+    invisible = [name for name in doubtful if name not in last and _is_invisible(development, draws, name)]
     if last:
         development.forget_steps(draws)
-        invisible += [name for name in last if _is_invisible(development, draws, name)]
+        invisible += [name for name in last if name in doubtful and _is_invisible(development, draws, name)]
     return invisible
+
+
+def _seen_on_some_rows(development: Development, draws: Draws) -> set[str]:
+    """Return drawn faults that every eighth row of the noise-free image shows clearly; others may be seen, too."""
+    rows = slice(development.context.shape[0] // 32, None, 8)
+    overwritten = np.zeros(development.context.shape, bool)[rows]
+    for name in acting_at(draws, "rgbi"):
+        footprint = draws[name].fault.footprint(draws[name].params, development.context)
+        if footprint is None:
+            return set()
+        overwritten |= footprint[rows]
+    seen = set()
+    for name in acting_at(draws, "electrons"):
+        if development.is_local(draws, name) and not informs(draws[name].fault):
+            level = max(draws[name].fault.effect_level_dn, _MORE_THAN_ROUNDING_DN)
+            if (development.effect_on(rows, draws, name, level) & ~overwritten).any():
+                seen.add(name)
+    return seen
 
 
 def _is_invisible(development: Development, draws: Draws, name: str) -> bool:
