@@ -32,10 +32,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     given = parser.parse_args(arguments)
 
     names = sorted(path.name.removesuffix("_real.png") for path in given.pairs.glob("*_real.png"))
-    pairs = [
-        (name, *(read_frame(given.pairs, f"{name}_{which}").astype("uint8") for which in ("real", "rendered")))
-        for name in names
-    ]
+    images = {
+        which: [read_frame(given.pairs, f"{name}_{which}").astype("uint8") for name in names]
+        for which in ("real", "rendered")
+    }
+    pairs = list(zip(images["real"], images["rendered"], strict=True))
     result, pictures = two_sample_test(
         pairs, size=given.size, count=given.patches, splits=given.splits, draws=given.draws, seed=given.seed
     )

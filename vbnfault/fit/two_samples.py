@@ -45,7 +45,7 @@ from scipy import ndimage
 from skimage.feature import local_binary_pattern
 
 from ..core.errors import InputError
-from .frames import look
+from .frames import Look, look
 
 F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
@@ -76,15 +76,14 @@ class Patches:
 
 
 def positions(
-    real: U8, rendered: U8, size: int, place: str, count: int, rng: np.random.Generator
+    real: Look, rendered: Look, size: int, place: str, count: int, rng: np.random.Generator
 ) -> NDArray[np.int64]:
     """Return up to `count` corners (y, x) of patches of a place, spread over the frame, int64[n, 2].
 
     A frame whose sky is clipped to 0 has no sky and no limb to compare.
     """
-    looks = [look(image) for image in (real, rendered)]
-    lit = [one.lit for one in looks]
-    if place != "body" and looks[0].clipped:
+    lit = [one.lit for one in (real, rendered)]
+    if place != "body" and real.clipped:
         return np.zeros((0, 2), dtype=np.int64)
 
     def fraction(mask: NDArray[np.bool_]) -> F64:
@@ -120,14 +119,14 @@ def cut(image: U8, corners: NDArray[np.int64], size: int) -> U8:
     return np.array([image[y : y + size, x : x + size] for y, x in corners], dtype=np.uint8).reshape(-1, size, size)
 
 
-def patches_of(pairs: Sequence[tuple[str, U8, U8]], place: str, size: int, count: int, seed: int) -> Patches:
-    """Return the patches of a place in all pairs, as many real as rendered ones of each frame."""
+def patches_of(pairs: Sequence[tuple[Look, Look]], place: str, size: int, count: int, seed: int) -> Patches:
+    """Return the patches of a place in all pairs (real, rendered), as many real as rendered ones of each frame."""
     images, labels, frames = [], [], []
-    for number, (_, real, rendered) in enumerate(pairs):
+    for number, pair in enumerate(pairs):
         rng = np.random.default_rng([seed, number, PLACES.index(place)])
-        corners = positions(real, rendered, size, place, count, rng)
-        for label, image in ((1, real), (0, rendered)):
-            images.append(cut(image, corners, size))
+        corners = positions(*pair, size, place, count, rng)
+        for label, one in zip((1, 0), pair, strict=True):
+            images.append(cut(one.image.astype(np.uint8), corners, size))
             labels.append(np.full(len(corners), label))
             frames.append(np.full(len(corners), number))
     return Patches(images=np.concatenate(images), label=np.concatenate(labels), frame=np.concatenate(frames))
@@ -377,17 +376,21 @@ def _relabelled(values: F64, frame: NDArray[np.int64], splits: int, seed: int) -
 
 
 def told(
-    pairs: Sequence[tuple[str, U8, U8]], place: str, *, size: int, count: int, splits: int, seed: int, kind: str
-) -> float:
-    """Return the fraction of patches of a place that a classifier tells; patches and halves follow from `seed`."""
+    pairs: Sequence[tuple[Look, Look]], place: str, *, size: int, count: int, splits: int, seed: int
+) -> dict[str, float]:
+    """Return the fraction of patches of a place that each kind of classifier tells.
+
+    Patches and halves follow from `seed`.
+    """
     patches = patches_of(pairs, place, size, count, seed)
     values = np.hstack(list(features(patches.images).values()))
-    trained = halves(patches.frame, splits, seed)
-    return accuracy(score_frames(values, patches.label, patches.frame, trained, kind)[1], patches.frame)[0]
+    label, frame = patches.label, patches.frame
+    trained = halves(frame, splits, seed)
+    return {kind: accuracy(score_frames(values, label, frame, trained, kind)[1], frame)[0] for kind in kinds()}
 
 
 def two_sample_test(
-    pairs: Sequence[tuple[str, U8, U8]],
+    pairs: Sequence[tuple[U8, U8]],
     *,
     size: int = 32,
     count: int = 12,
@@ -401,7 +404,7 @@ def two_sample_test(
     Parameters
     ----------
     pairs
-        Name, real and rendered image, uint8[y, x], aligned; of at least 4 frames.
+        Real and rendered image, uint8[y, x], aligned; of at least 4 frames.
     size, count
         Side of the patches in px, and how many of a place are taken from a frame.
     splits, draws
@@ -415,18 +418,20 @@ def two_sample_test(
         raise InputError(f"{len(pairs)} frames: a classifier needs at least {FEWEST_FRAMES}")
     out: dict[str, dict[str, tuple[float, float, float]]] = {}
     pictures: dict[str, U8] = {}
+    looks = [(look(real), look(rendered)) for real, rendered in pairs]
     for place in PLACES:
-        patches = patches_of(pairs, place, size, count, seed)
+        patches = patches_of(looks, place, size, count, seed)
         if len(np.unique(patches.frame)) < FEWEST_FRAMES:
             continue
         parts, score = examine(patches, place, splits, seed)
         out[place], pictures[place] = parts, confident(patches, score)
+        several = []
+        for k in range(draws):
+            several.append(told(looks, place, size=size, count=count, splits=splits, seed=seed + k))
+            advance()
         for kind in kinds():
-            several = []
-            for k in range(draws):
-                several.append(told(pairs, place, size=size, count=count, splits=splits, seed=seed + k, kind=kind))
-                advance()
-            out[place][f"{kind}, all features"] = float(np.mean(several)), min(several), max(several)
+            fractions = [one[kind] for one in several]
+            out[place][f"{kind}, all features"] = float(np.mean(fractions)), min(fractions), max(fractions)
     return out, pictures
 
 
