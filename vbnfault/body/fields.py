@@ -266,6 +266,7 @@ _FADE = (1.6, 2.8)
 
 _CRATER_WIDTHS_M = (72.0, 36.0, 18.0, 9.0)  # cells; diameters are a third to two thirds of their width
 _CRATER_SHARE_PER_DENSITY = 1534e-6  # fraction of the cells, per crater of 10 m or more in a square kilometre
+_HIDDEN = 3.0  # height over which dust hides relief, over the relief's deviation
 _UNITS_M = (
     (260.0, 0.35),
     (110.0, 0.35),
@@ -339,7 +340,7 @@ class Octaves:
         Relief below the facets lets rock show through thin dust, so the cover grows over its height, or over
         `border_m` where that is larger: over metres of ground and not at a line. Units of 8 to 300 m differ.
         """
-        hidden_m = self._unit * self._roughness.deviation_at(_FADE[1] * self.facet_m)
+        hidden_m = _HIDDEN * self._unit * self._roughness.deviation_at(_FADE[1] * self.facet_m)
         unit = sum(np.float32(a) * self.gradient(w, 680 + k) for k, (w, a) in enumerate(_UNITS_M))
         # deep dust varies, too, by its age and its thickness
         return smooth_step(-1.6, 2.0, np.minimum(above_m / np.hypot(border_m, hidden_m), 1.0) + unit)
