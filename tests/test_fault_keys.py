@@ -34,6 +34,12 @@ COMPANIONS: dict[tuple[str, str], dict[str, Any]] = {
     ("straylight", "scene_diffraction"): {"sources": "scene"},
     ("dust_on_optics", "window_height_mm"): {"surface": -2},
     ("dust_on_optics", "mask_loss"): {"diameter_um": 20.0},
+    ("dust_on_optics", "cover"): {"diameter_um": 20.0},
+    ("dust_on_optics", "cover_um"): {"cover": 0.3, "diameter_um": 20.0},
+    ("straylight", "shadow_depth"): {"shadow_chance": 1.0},
+    ("straylight", "shadow_softness"): {"shadow_chance": 1.0},
+    ("transmission", "sync_rows"): {"fill": "shifted"},
+    ("transmission", "cut_every"): {"cut_rows": 8},
     ("broken_pixels", "clustered_fraction"): {"years": 20.0},
     ("optics_degradation", "filter_size_px"): {"scale_with_resolution": False},
     ("broken_lines", "saturated_weight"): {"count": 20},
@@ -91,11 +97,15 @@ def values(f: dataclasses.Field[Any], files: list[str]) -> list[Any]:
 
 def context(fault: Fault, key: str) -> FaultContext:
     architecture = ARCHITECTURES.get(key, "frame_transfer_ccd")
-    made = make_context(SIZE, sun=(40.0, 24.0), exposure_s=1e-3, architecture=architecture)
+    # the model `surroundings` has no light of a Sun in the frame
+    sun_xy, direction = ((40.0, 24.0), (0.091, -0.091, 1.0))
+    if fault.model == "surroundings":
+        sun_xy, direction = ((85.0, 24.0), (0.6, -0.091, 1.0))
+    made = make_context(SIZE, sun=sun_xy, exposure_s=1e-3, architecture=architecture)
     nodes = spectra.band_nodes_nm(400.0, 700.0, 3)
     made = replace(
         made,
-        sun_direction_C=np.array([0.091, -0.091, 0.9917]),
+        sun_direction_C=np.array(direction) / np.linalg.norm(direction),
         wavelength_nm=nodes,
         sun_irradiance_W_m2_nm=spectra.solar_band_irradiance_W_m2_nm(nodes, 1.0),
         sun_angular_radius_rad=spectra.sun_angular_radius_rad(1.0),
