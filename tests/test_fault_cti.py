@@ -42,8 +42,10 @@ def collected(c: FaultContext, params: dict[str, Any]) -> np.ndarray:
 def test_species() -> None:
     c = context()
     params = make("cti", parallel_per_px=4, serial_per_px=[1, 2]).draw(c, rng())
-    assert [s["release_time_s"] for s in params["parallel"]] == [0.512e-3, 2.048e-3, 8.192e-3]
-    assert [s["release_time_s"] for s in params["serial"]] == [0.5e-6, 2e-6, 8e-6]
+    # the trails behind warm pixels of Hubble's ACS, in transfers: Massey et al. 2010, 2014
+    published = np.array([0.74, 7.7, 37.0])
+    np.testing.assert_allclose([s["release_time_s"] for s in params["parallel"]], published * 1.024e-3)
+    np.testing.assert_allclose([s["release_time_s"] for s in params["serial"]], published * 1e-6)
     assert sum(s["density_per_px"] for s in params["parallel"]) == pytest.approx(4)
     assert 1 <= sum(s["density_per_px"] for s in params["serial"]) <= 2
     altered: Any = make("cti").alter(c.camera, params).detector
@@ -109,6 +111,6 @@ def test_it_shows_in_a_picture() -> None:
         for k in (c.camera, camera)
     )
     change = (after - before)[:, 26:38].mean(axis=1)
-    assert change[40] > 3  # the first of the trail below
+    assert change[40] > 2  # the first of the trail below: an eighth of what is lost, by the three release times
     assert change[24] < -2  # the first row of the square lost most
     assert np.abs(change[:20]).max() < 1

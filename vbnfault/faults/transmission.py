@@ -6,7 +6,7 @@ damaged packet, bits flip independently (binary symmetric channel) and at a high
 that cannot be decoded is full of errors (CCSDS 130.1-G). A line may be lost on the camera's own interface.
 
 Two patterns of flight images are off by default. A compressor with a fixed budget of bits drops the ends of lines
-where the scene is busy: with `cut_rows`, a block of rows, or every second one of it, ends at a ragged edge and is 0
+where the scene is busy: with `cut_rows`, each line of a block, or every second one, ends at a ragged edge and is 0
 beyond, as in images of Cassini's cameras (ISS Data User's Guide; recalled). With `fill = "shifted"` the receiver
 does not notice that packets are missing: all that follows moves up, so that the image is sheared along its lines,
 until the next mark of `sync_rows`.
@@ -72,7 +72,7 @@ class PacketTransmission(Fault):
     cut_rows: Interval = bounds(
         0, 0, limits=(0, 16384), integer=True, unit="px", doc="rows of a block whose lines lose their ends; 0: none"
     )
-    cut_every: int = number(2, limits=(1, 64), integer=True, doc="of these rows, each such one is cut")
+    cut_every: int = number(2, limits=(1, 64), integer=True, doc="of these lines, each such one is cut")
 
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
         """Return the indices of lost packets, damaged packets and lost rows, and the seed of the bit flips.
@@ -105,17 +105,22 @@ class PacketTransmission(Fault):
         if self.fill == "shifted":
             params["sync_rows"] = int(self.sync_rows)
         if cut_rows := self.cut_rows.integer(rng):
-            params["cut"] = self._cut(cut_rows, context.shape, rng)
+            params["cut"] = self._cut(cut_rows, context, rng)
         return params
 
-    def _cut(self, count: int, shape: tuple[int, int], rng: np.random.Generator) -> list[list[int]]:
-        """Return row and first lost column of each cut line; neighbours end within some hundredths of the width."""
-        height, width = shape
-        rows = int(rng.integers(max(height - count, 0), endpoint=True)) + np.arange(0, count, int(self.cut_every))
-        rows = rows[rows < height]
-        steps = np.cumsum(rng.normal(0, _RAGGED * width, len(rows)))
+    def _cut(self, count: int, context: FaultContext, rng: np.random.Generator) -> list[list[int]]:
+        """Return row and first lost column of each cut line; neighbours end within some hundredths of the width.
+
+        With a mosaic a line is a row of its tiles, so that all its colours end together.
+        """
+        height, width = context.shape
+        tile = len(context.camera.mosaic.sensor.pattern.tile)
+        first = int(rng.integers(max(height - count, 0) // tile, endpoint=True)) * tile
+        lines = first + np.arange(0, count, tile * int(self.cut_every))
+        steps = np.cumsum(rng.normal(0, _RAGGED * width, len(lines)))
         columns = np.clip(rng.uniform(*_CUT_FROM) * width + steps, 1, width - 1).astype(int)
-        return [[row, column] for row, column in zip(rows.tolist(), columns.tolist(), strict=True)]
+        rows = (lines[:, None] + np.arange(tile)).tolist()
+        return [[row, int(end)] for line, end in zip(rows, columns, strict=True) for row in line if row < height]
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
         """Return the raw digital numbers that arrive."""
