@@ -97,15 +97,11 @@ def values(f: dataclasses.Field[Any], files: list[str]) -> list[Any]:
 
 def context(fault: Fault, key: str) -> FaultContext:
     architecture = ARCHITECTURES.get(key, "frame_transfer_ccd")
-    # the model `surroundings` has no light of a Sun in the frame
-    sun_xy, direction = ((40.0, 24.0), (0.091, -0.091, 1.0))
-    if fault.model == "surroundings":
-        sun_xy, direction = ((85.0, 24.0), (0.6, -0.091, 1.0))
-    made = make_context(SIZE, sun=sun_xy, exposure_s=1e-3, architecture=architecture)
+    made = make_context(SIZE, sun=(40.0, 24.0), exposure_s=1e-3, architecture=architecture)
     nodes = spectra.band_nodes_nm(400.0, 700.0, 3)
     made = replace(
         made,
-        sun_direction_C=np.array(direction) / np.linalg.norm(direction),
+        sun_direction_C=np.array([0.091, -0.091, 0.9917]),
         wavelength_nm=nodes,
         sun_irradiance_W_m2_nm=spectra.solar_band_irradiance_W_m2_nm(nodes, 1.0),
         sun_angular_radius_rad=spectra.sun_angular_radius_rad(1.0),

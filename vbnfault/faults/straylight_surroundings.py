@@ -1,4 +1,4 @@
-"""Simulate light from outside the field: baffle, deck and insulation, lit by a Sun that is not in the frame.
+"""Simulate light from outside the field: baffle, deck and insulation, lit by the Sun.
 
 Sunlit structure around the front of a camera lies far out of focus. What it sends onto the front element is
 scattered by mount and glass, and reaches the sensor as a smooth veil that is brightest on the side of the Sun.
@@ -18,7 +18,9 @@ so R falls with the angle θ of the Sun from the axis as 1 / tan θ, and is 0 fr
 falls exponentially, by `falloff` from the corner next to the Sun to the one farthest from it. The shadow of the
 baffle's rim may cut off the far part. Its edge is soft, since the rim is out of focus, and bent like the rim.
 
-With the Sun in the frame there is no such veil: models `traced` and `paraxial` have that Sun's light in the lens.
+With the Sun in the frame the tube is lit too; what that Sun's light does inside the lens is left to the models
+`traced` and `paraxial`. A Sun behind the camera lights nothing that faces the lens: the fault then asks for another
+view.
 """
 
 from __future__ import annotations
@@ -118,33 +120,20 @@ class SurroundingsStraylight(Fault):
         return float(self.mask_level_dn)
 
 
-def _towards_sun(context: FaultContext) -> tuple[float, float] | None:
-    """Return tan θ of the Sun, and its azimuth in the image in rad; None if it is in the frame or not before it."""
-    sun = context.sun_before_camera
-    if sun is None or context.sun_visible == 0:
-        return None
-    x, y = np.asarray(sun[:2], dtype=np.float64) / sun[2]
-    height, width = context.shape
-    focal_px = context.camera.focal_length_px
-    if abs(x) * focal_px < width / 2 and abs(y) * focal_px < height / 2:
-        return None
-    return float(np.hypot(x, y)), float(np.arctan2(y, x))
-
-
 def _lit_depth(context: FaultContext) -> float:
     """Return the lit depth of a tube before the lens over that for a Sun at the frame's corner, at most 1."""
-    towards = _towards_sun(context)
-    if towards is None:
+    sun = context.sun_before_camera
+    if sun is None:
         return 0.0
     corner = float(np.hypot(*context.shape)) / 2 / context.camera.focal_length_px
-    return min(corner / towards[0], 1.0) * context.sun_visible
+    return float(min(corner * sun[2] / max(np.hypot(sun[0], sun[1]), 1e-9), 1.0)) * context.sun_visible
 
 
 def _veil_e(params: Params, context: FaultContext) -> F32:
     """Return the electrons of the veil, float32[y, x, channel]."""
     camera, (height, width) = context.camera, context.shape
-    towards = _towards_sun(context)
-    if towards is None or not params["reflectance"]:
+    sun = context.sun_before_camera
+    if sun is None or not params["reflectance"]:
         return np.zeros((height, width, len(camera.detector.channels)), dtype=np.float32)
     nodes, irradiance = context.sunlight
     nm = spectra.fine_nodes_nm(nodes)
@@ -152,7 +141,7 @@ def _veil_e(params: Params, context: FaultContext) -> F32:
     sunlight_e = np.trapezoid(spectrum, nm, axis=1) * camera.exposure_s
     half = np.hypot(height, width) / 2
     y, x = ((np.arange(n, dtype=np.float32) + 0.5 - n / 2) / np.float32(half) for n in (height, width))
-    cos, sin = np.float32(np.cos(towards[1])), np.float32(np.sin(towards[1]))
+    cos, sin = (sun[:2] / max(np.hypot(sun[0], sun[1]), 1e-9)).astype(np.float32)
     # from -1 in the corner farthest from the Sun to 1 in the nearest, and across
     along, across = x * cos + (y * sin)[:, None], (y * cos)[:, None] - x * sin
     veil = np.exp((along - 1) * np.float32(0.5 * np.log(params["falloff"])))
