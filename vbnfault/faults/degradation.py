@@ -10,9 +10,9 @@ filter has a centre. An even bound stands for the next odd size within the inter
 the image, but never below 0.4 px (the smallest filter of the paper at 512 px): a narrower filter hardly blurs.
 
 The paper filters an 8 bit image, in which the Sun is no brighter than white. Signal above white is therefore
-clipped to white before filtering. Otherwise the Sun (10⁵ times white) would be a white square as wide as the filter,
-since it is above white even in the filter's corners. Beyond the frame the image is mirrored about its outermost
-pixels.
+clipped to white before filtering. Otherwise the Sun (10⁵ times white) would be a white square as wide as the
+filter, since it is above white even in the filter's corners. Beyond the frame the image is mirrored about its
+outermost pixels.
 
 Real optics blur light before it saturates. With the paper's order the Sun becomes a grey spot; with `unclipped` it
 stays white and grows to the radius at which the Gaussian has fallen to its 10⁻⁵th part. The filter is then cut at
