@@ -66,6 +66,9 @@ def test_what_follows_a_lost_packet_moves_up_to_the_next_mark() -> None:
     assert np.array_equal(across[block : 2 * block - 76], raw.ravel()[block + 76 : 2 * block])
     assert (across[2 * block - 76 : 2 * block] == 0).all()
     assert np.array_equal(across[2 * block :], raw.ravel()[2 * block :])
+    mask = make("transmission").footprint(PARAMS | {"lost": [10], "fill": "shifted", "sync_rows": 16}, where)
+    assert mask[across.reshape(raw.shape) != raw].all()  # type: ignore[index]
+    assert not mask[40:].any()  # type: ignore[index]
 
 
 def test_lines_lose_their_ends() -> None:
