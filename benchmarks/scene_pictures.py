@@ -2,30 +2,35 @@
 
     python benchmarks/scene_pictures.py --out scenes
     python benchmarks/scene_pictures.py --out scenes landing flares
+    python benchmarks/scene_pictures.py --out docs/figures flown_faults flown_readout
 
 Contact sheets show samples of a dataset with their masks. Their samples are 512 pixels wide, over terrain as coarse
 as quickstart's; the sheets are then shrunk. The figures of `flares`, `navcam67p`, `paper_example`, `physical67p`
-and `rosetta67p` show single samples, rendered at the scene's own size and then shrunk. A figure without colour is
-written as a grey PNG, whose file is smaller.
+and `rosetta67p` show single samples, rendered at the scene's own size and then shrunk. `flown_faults` and
+`flown_readout` show each fault on one frame, for the page `flown_faults`; they get a palette. A figure without
+colour is written as a grey PNG, whose file is smaller.
 """
 
 from __future__ import annotations
 
 import argparse
 import tempfile
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image  # comes with matplotlib
 
 from vbnfault import dataset
 from vbnfault.core.files.images import decoded_image, write_png
+from vbnfault.faults import from_dict
 from vbnfault.output import contact_sheet
 from vbnfault.output.sample_files import annotated
 from vbnfault.pipeline import Session
-from vbnfault.pipeline.spec import Frame
+from vbnfault.pipeline.spec import Draw, Frame
 from vbnfault.scene import config
 
 U8 = NDArray[np.uint8]
@@ -48,6 +53,29 @@ NARROW_PX = {"approach": 700, "earth_observation": 700}  # sheets that pages of 
 FLARES, NAVCAM, PHYSICAL = (1, 2, 3), (2, 7, 13, 15), (7, 4)
 NAVCAM_TILE_PX = 304  # keeps the file below 250 kB
 GAP_PX = 4  # white, between images whose own edges may be black
+# Of the paper's classes: keys of its model and of the physical one, sample of physical67p, and the part that is
+# shown (left, top, side).
+WHOLE = (0, 0, 1024)
+FLOWN: tuple[tuple[str, dict[str, Any], dict[str, Any], int, tuple[int, int, int]], ...] = (
+    ("dust_on_optics", {"model": "gaussian"}, {"model": "defocused"}, 10, WHOLE),
+    ("broken_pixels", {"model": "texture"}, {"model": "hot_pixels", "growth_factor": 200.0}, 10, (300, 200, 256)),
+    ("broken_lines", {"model": "texture"}, {"model": "readout"}, 10, (768, 256, 256)),
+    ("straylight", {"model": "texture"}, {"model": "traced"}, 7, WHOLE),
+    ("vignetting", {"model": "cos4"}, {"model": "lens", "decentre": 0.3, "hood_offset": 0.4}, 10, WHOLE),
+    ("optics_degradation", {"model": "gaussian"}, {"model": "contamination", "haze": 0.1}, 7, WHOLE),
+)
+# Faults of the readout and from beside the field: faults with their keys, scene, sample, part.
+READOUT: tuple[tuple[dict[str, dict[str, Any]], str, int, tuple[int, int, int]], ...] = (
+    ({"cosmic_rays": {"flux_per_cm2_s": 200.0}, "cti": {"parallel_per_px": 8.0}}, "navcam67p", 24, (480, 0, 256)),
+    ({"banding": {"model": "columns", "period_px": 4}}, "navcam67p", 24, (480, 600, 256)),
+    ({"transmission": {"cut_rows": 150, "lost_count": 0, "lost_lines": 0}}, "physical67p", 10, WHOLE),
+    ({"transmission": {"fill": "shifted", "lost_lines": 0}}, "navcam67p", 24, WHOLE),
+    ({"straylight": {"model": "surroundings", "reflectance": 0.01}}, "physical67p", 10, WHOLE),
+    ({"dust_on_optics": {"model": "defocused", "count": 0, "cover": 0.4}}, "physical67p", 10, WHOLE),
+    ({"optics_degradation": {"filter_size_px": 17}}, "physical67p", 7, (768, 0, 256)),
+    ({"optics_degradation": {"filter_size_px": 17, "unclipped": True}}, "physical67p", 7, (768, 0, 256)),
+)
+FLOWN_TILE_PX = 256
 
 
 def frames(scene: str, samples: tuple[int, ...], overrides: dict[str, Any] | None = None) -> list[Frame]:
@@ -129,8 +157,48 @@ def physical67p() -> U8:
     return spaced([[rgb(frame, "image"), rgb(frame, "clean")] for frame in taken], 540)
 
 
+def unharmed(scene: str, sample: int) -> Frame:
+    """Return a finished sample of a packaged scene without faults, with the light of its surroundings."""
+    return frames(scene, (sample,), {"plan.faulty_fraction": 0.0})[0]
+
+
+def harmed(frame: Frame, faults: dict[str, dict[str, Any]], part: tuple[int, int, int], attempt: int) -> U8:
+    """Return a part of a sample's image with the given faults alone, uint8[y, x, 3], stretched by a square root.
+
+    `attempt` tells the draws of one frame apart.
+    """
+    development, draws = frame.injection.development, {}
+    for name, table in faults.items():
+        fault = from_dict(name, table, source="figure")
+        params = fault.draw(development.context, np.random.default_rng(0))
+        draws[name] = Draw(fault=fault, attempt=attempt, params=params)
+    left, top, side = part
+    image = development.image(draws).array[top : top + side, left : left + side, :3]
+    return np.rint(np.sqrt(image * 255.0)).astype(np.uint8)
+
+
+def flown_faults() -> U8:
+    """Draw the six classes of the paper, two rows each of three: the paper's model left, the physical one right."""
+    of, attempt = {sample: unharmed("physical67p", sample) for *_, sample, _ in FLOWN}, count(1)
+    tiles = [
+        harmed(of[sample], {name: keys}, part, next(attempt))
+        for name, *models, sample, part in FLOWN
+        for keys in models
+    ]
+    return spaced([tiles[k : k + 4] for k in range(0, len(tiles), 4)], FLOWN_TILE_PX)
+
+
+def flown_readout() -> U8:
+    """Draw faults of the readout and light from beside the field, each alone."""
+    of, attempt = {key: unharmed(*key) for key in {(scene, sample) for _, scene, sample, _ in READOUT}}, count(1)
+    tiles = [harmed(of[scene, sample], faults, part, next(attempt)) for faults, scene, sample, part in READOUT]
+    return spaced([tiles[k : k + 4] for k in range(0, len(tiles), 4)], FLOWN_TILE_PX)
+
+
 SINGLE = {
     "flares": flares,
+    "flown_faults": flown_faults,
+    "flown_readout": flown_readout,
     "navcam67p": navcam67p,
     "paper_example": paper_example,
     "physical67p": physical67p,
@@ -168,7 +236,11 @@ def main() -> None:
     for scene in given.scenes or known:
         path = given.out / f"{scene}.png"
         figure = sheet(scene) if scene in SHEETS else SINGLE[scene]()
-        write_png(path, without_colour(figure), smallest=True)
+        if scene.startswith("flown"):
+            palette = Image.fromarray(figure).quantize(256, Image.Quantize.MAXCOVERAGE, 2, None, Image.Dither.NONE)
+            palette.save(path, optimize=True)
+        else:
+            write_png(path, without_colour(figure), smallest=True)
         print(f"{path}: {path.stat().st_size / 1e3:.0f} kB", flush=True)
 
 

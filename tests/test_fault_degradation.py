@@ -47,6 +47,24 @@ def test_the_sun_is_clipped_to_white_first() -> None:
     assert np.count_nonzero(blurred[..., 0]) == 17**2
 
 
+def test_the_sun_stays_white_where_light_is_not_clipped() -> None:
+    context = make_context(1024, 128)
+    fault = make("optics_degradation", filter_size_px=17, unclipped=True)
+    params = fault.draw(context, rng())
+    dark = flat_electrons(context, 0.0)
+    bright = dark.array.copy()
+    bright[64, 512] = 1e5 * dark.white_e
+    blurred = fault.apply(dark.with_array(bright), params, context).array / dark.white_e
+    assert blurred[64, 512, 1] == pytest.approx(1e5 / (2 * np.pi * sigma_px(17) ** 2), rel=1e-3)
+    assert blurred[..., 1].sum() == pytest.approx(1e5, rel=1e-5)
+    # a Gaussian falls to white at σ √(2 ln(1e5 / 2πσ²)): a round disc of that radius is white
+    radius = sigma_px(17) * np.sqrt(2 * np.log(1e5 / (2 * np.pi * sigma_px(17) ** 2)))
+    y, x = np.mgrid[-64:64, -512:512]
+    white = blurred[..., 1] >= 1
+    assert white[np.hypot(x, y) < radius - 0.01].all()
+    assert not white[np.hypot(x, y) > radius + 0.01].any()
+
+
 def test_flat_stays_flat() -> None:
     context = make_context(256)
     fault = make("optics_degradation")

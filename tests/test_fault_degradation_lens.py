@@ -15,7 +15,7 @@ from test_faults_kit import flat_electrons, make, make_context, rng
 from vbnfault.core import spectra
 from vbnfault.core.errors import InputError
 from vbnfault.core.quantities import Electrons
-from vbnfault.faults import FaultContext, degradation_lens
+from vbnfault.faults import FaultContext, degradation_lens, planes
 from vbnfault.faults.degradation_lens import browned, colours, haze_kernel, scratch_kernel, stabilised, worn
 from vbnfault.lens import parse_lens
 
@@ -178,9 +178,9 @@ def test_cells_of_several_pixels_tell_as_much(monkeypatch: pytest.MonkeyPatch) -
     quantity = flat_electrons(where).with_array(scene)
     params = NONE | {"haze": 0.3, "haze_knee": 0.03, "scratches": [scratch(25.0)]}
     exact = applied(quantity, params, where)  # two pixels to a cell
-    monkeypatch.setattr(degradation_lens, "_CELLS", 96)
+    monkeypatch.setattr(planes, "_CELLS", 96)
     coarse = applied(quantity, params, where)
-    assert degradation_lens._cell_px(where.frame) == 4
+    assert planes.cell_px(where.frame) == 4
     # a core of 10 px is smoothed by one of 4: at the steps of the scene, where the haze changes by half of it over
     # the core, by a few per cent of the haze
     assert np.abs(coarse - exact).max() < 0.04 * 0.32 * scene.max()

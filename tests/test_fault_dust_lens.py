@@ -509,3 +509,43 @@ def test_mask_holds_the_glow_too(tmp_path: Path) -> None:
 def test_rows_that_a_lens_lacks_are_refused() -> None:
     with pytest.raises(InputError, match=r"surface = 40: nikkor_35_f2p8 has rows 0 to"):
         make("dust_on_optics", model="defocused", lens="nikkor_35_f2p8", surface=40)
+
+
+# --- fine dust on the front --------------------------------------------------------------------------------------
+
+
+def cover(context: FaultContext, light: F64, **keys: Any) -> F64:
+    """Of one channel, in units of white, under a third of the front covered by fine dust and no single grain."""
+    fault = make("dust_on_optics", model="defocused", count=0, cover=1 / 3, **keys)
+    params = json.loads(json.dumps(fault.draw(context, rng())))
+    white = flat_electrons(context, 1.0)
+    after = fault.apply(white.with_array(white.array * light[..., None].astype(np.float32)), params, context)
+    assert fault.footprint(params, context).all()  # type: ignore[union-attr]
+    np.testing.assert_allclose(fault.soft(params, context), 1 / 3, rtol=1e-6)
+    return np.asarray((after.array / white.array)[..., 1], dtype=np.float64)
+
+
+def test_fine_dust_dims_a_field_and_dims_a_point_more() -> None:
+    context = thin_context()
+    np.testing.assert_allclose(cover(context, np.full((200, 200), 0.5)), 0.5 * 2 / 3, rtol=1e-4)
+    point = np.zeros((200, 200))
+    point[100, 100] = 1e4
+    found = cover(context, point)
+    # Babinet: (1 - c)² stays, c (1 - c) is diffracted, nearly all of it within the frame
+    halo = found.sum() - 1e4 * (2 / 3) ** 2
+    assert halo == pytest.approx(1e4 * 2 / 9, rel=0.05)
+    assert found[100, 100] == pytest.approx(1e4 * (2 / 3) ** 2, rel=0.1)
+
+
+def test_finer_dust_has_a_wider_halo() -> None:
+    context = thin_context()
+    point = np.zeros((200, 200))
+    point[100, 100] = 1e4
+    distance_mm = np.hypot(*(np.mgrid[:200, :200] - 100)) * PITCH_UM * 1e-3
+    for diameter_um in (5.0, 10.0, 20.0):
+        found = cover(context, point, cover_um=diameter_um)
+        # a disc diffracts 1 - J0² - J1² of its light within x = k a sin θ: 84 % within the first dark ring at 3.83;
+        # grains of unlike sizes blur the rings
+        ring_mm = FOCAL_MM * 3.83 / (np.pi * diameter_um * 1e3 / 587.6)
+        inside = found[distance_mm <= ring_mm].sum() - 1e4 * (2 / 3) ** 2
+        assert inside / (1e4 * 2 / 9) == pytest.approx(0.84, abs=0.08)

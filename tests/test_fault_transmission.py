@@ -51,6 +51,44 @@ def test_lost_packets_in_closed_form() -> None:
     assert np.array_equal(rows[10:12], raw[[9, 9]])
 
 
+def test_what_follows_a_lost_packet_moves_up_to_the_next_mark() -> None:
+    where = context()
+    raw = noisy("raw", where).array + 1
+    expected = raw.ravel().copy()
+    block = 16 * SIZE
+    expected[200 : block - 100], expected[block - 100 : block] = raw.ravel()[300:block], 0
+    lost = after(where, raw, lost=[2, 40], fill="shifted", sync_rows=16)
+    assert np.array_equal(lost.ravel()[: 3 * block], expected[: 3 * block])
+    assert (lost.ravel()[4000:] == 0).all()
+    # a packet that lies across a mark: 24 pixels of it are missing before, 76 behind
+    across = after(where, raw, lost=[10], fill="shifted", sync_rows=16).ravel()
+    assert np.array_equal(across[1000:block], np.zeros(24, np.uint16))
+    assert np.array_equal(across[block : 2 * block - 76], raw.ravel()[block + 76 : 2 * block])
+    assert (across[2 * block - 76 : 2 * block] == 0).all()
+    assert np.array_equal(across[2 * block :], raw.ravel()[2 * block :])
+    mask = make("transmission").footprint(PARAMS | {"lost": [10], "fill": "shifted", "sync_rows": 16}, where)
+    assert mask[across.reshape(raw.shape) != raw].all()  # type: ignore[index]
+    assert not mask[40:].any()  # type: ignore[index]
+
+
+def test_lines_lose_their_ends() -> None:
+    where = context(size=256)
+    fault = make("transmission", cut_rows=100, lost_count=0, damaged_count=0, lost_lines=0)
+    params = fault.draw(where, rng(3))
+    raw = noisy("raw", where).array + 1
+    gone = fault.apply(RawMosaic(array=raw), params, where).array == 0  # type: ignore[union-attr]
+    rows = np.flatnonzero(gone.any(axis=1))
+    # every second row of Bayer's tiles, of two lines each
+    assert len(rows) == 50
+    assert (rows % 4 == rows[0] + np.arange(50) % 2 - rows[0] // 4 * 4).all()
+    ends = gone[rows].argmax(axis=1)
+    assert all(gone[row, end:].all() and not gone[row, :end].any() for row, end in zip(rows, ends, strict=True))
+    # a walk of steps of 2 % of the width
+    steps = np.diff(ends[::2])
+    assert 0 < np.abs(steps).max() < 5 * 0.02 * 256
+    assert fault.footprint(params, where)[gone].all()  # type: ignore[index]
+
+
 def test_nodes_send_in_turn() -> None:
     where = context(nodes=4)
     raw = noisy("raw", where).array + 1

@@ -10,12 +10,18 @@ filter has a centre. An even bound stands for the next odd size within the inter
 the image, but never below 0.4 px (the smallest filter of the paper at 512 px): a narrower filter hardly blurs.
 
 The paper filters an 8 bit image, in which the Sun is no brighter than white. Signal above white is therefore
-clipped to white before filtering. Otherwise the Sun (10⁵ times white) would flood the frame through the tails of
-the filter. Beyond the frame the image is mirrored about its outermost pixels.
+clipped to white before filtering. Otherwise the Sun (10⁵ times white) would be a white square as wide as the
+filter, since it is above white even in the filter's corners. Beyond the frame the image is mirrored about its
+outermost pixels.
+
+Real optics blur light before it saturates. With the paper's order the Sun becomes a grey spot; with `unclipped` it
+stays white and grows to the radius at which the Gaussian has fallen to its 10⁻⁵th part. The filter is then cut at
+six standard deviations, so that the cut does not show.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,6 +35,7 @@ from .fields import Interval, Severity, bounds, flag
 from .planes import by_channel
 
 _LEAST_SIGMA_PX = 0.4
+_CUT_SIGMA = 6.0  # of the filter of light that is not clipped: the Sun is 10⁵ times white, exp(-6²/2) is 1.5e-8
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,6 +57,11 @@ class GaussianDegradation(Fault):
         3, 17, limits=(1, 1001), integer=True, unit="px", doc="size of the square filter; odd sizes are drawn"
     )
     scale_with_resolution: bool = flag(True, doc="filter size refers to a 1024 px wide image and scales with it")
+    unclipped: bool = flag(
+        False,
+        doc="whether light is blurred before it saturates, as by real optics, so that the Sun stays white; false: "
+        "as in the paper",
+    )
 
     def validate(self) -> None:
         """Raise ValueError if the interval contains no odd size."""
@@ -61,18 +73,21 @@ class GaussianDegradation(Fault):
         lo, hi = _odd_bounds(self.filter_size_px)
         size = 2 * int(rng.integers(lo // 2, hi // 2, endpoint=True)) + 1
         scale = context.scale if self.scale_with_resolution else 1.0
-        return {
-            "filter_size_px": size,
-            "kernel_px": size if scale == 1 else max(3, 2 * round((size * scale - 1) / 2) + 1),
-            "sigma_px": max(float(sigma_px(size) * scale), _LEAST_SIGMA_PX),
-        }
+        kernel_px = size if scale == 1 else max(3, 2 * round((size * scale - 1) / 2) + 1)
+        sigma = max(float(sigma_px(size) * scale), _LEAST_SIGMA_PX)
+        params: Params = {"filter_size_px": size, "kernel_px": kernel_px, "sigma_px": sigma}
+        if self.unclipped:  # so that the stored parameters of other scenes stay as they are
+            params |= {"kernel_px": 2 * math.ceil(_CUT_SIGMA * sigma) + 1, "unclipped": True}
+        return params
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
-        """Return the expected electrons, first clipped to white, then filtered."""
+        """Return the expected electrons after the filter; first clipped to white, unless `unclipped` is set."""
         taps = cv2.getGaussianKernel(params["kernel_px"], params["sigma_px"], cv2.CV_32F)
-        clipped = by_channel(np.minimum, quantity.array, quantity.white_e)
-        blurred = cv2.sepFilter2D(clipped, -1, taps, taps, borderType=cv2.BORDER_REFLECT_101)
-        return quantity.with_array(blurred.reshape(clipped.shape))
+        light = quantity.array
+        if not params.get("unclipped"):
+            light = by_channel(np.minimum, light, quantity.white_e)
+        blurred = cv2.sepFilter2D(light, -1, taps, taps, borderType=cv2.BORDER_REFLECT_101)
+        return quantity.with_array(blurred.reshape(light.shape))
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
         """Return the whole image as bool[y, x]."""

@@ -27,10 +27,9 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
@@ -44,7 +43,7 @@ from ..lens.straylight.scatter import Harvey
 from .context import FaultContext, Params
 from .contract import LensFault
 from .fields import Interval, Severity, bounds, choice, number
-from .planes import times
+from .planes import cell_px, strewn, times
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -52,7 +51,6 @@ F64 = NDArray[np.float64]
 _REFERENCE_NM = 400.0  # λ0 of browning
 _STREAK_NM = 550.0  # wavelength that sets the width of streaks
 _STABILISED = 0.01  # browning of stabilised glass over that of ordinary glass
-_CELLS = 256  # cells along the longer side of a frame, on which scattered light is computed
 _SOFT_CELLS = 0.7  # least standard deviation of a streak's width, in cells
 _FINE = 8  # samples of a cell along each axis, near the middle of a kernel
 
@@ -127,7 +125,10 @@ class Contamination(LensFault):
         lost = params["haze"] + sum(s["share"] for s in params["scratches"])
         out = times(quantity.array, passes * (1 - lost))
         if lost:
-            out += _strewn(quantity.array, quantity.white_e, passes, params, context)
+            # all twins share the transform of the kernel
+            waves = partial(context.once, _kernel_waves, params)
+            scattered = passes.astype(np.float32)
+            out += strewn(quantity.array, quantity.white_e, waves, cell_px(context.frame), scattered)
         return quantity.with_array(out)
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
@@ -241,17 +242,12 @@ def scratch_kernel(
     return fan
 
 
-def _cell_px(frame: ImageFrame) -> int:
-    """Return the side of a cell in px."""
-    return max(1, round(max(frame.width_px, frame.height_px) / _CELLS))
-
-
 def kernel(params: Params, frame: ImageFrame, shape: tuple[int, int]) -> F32:
     """Return the fractions of a cell's light that scatter to all cells of a periodic grid, float32[y, x].
 
     Entry [0, 0] is the cell itself.
     """
-    cell = _cell_px(frame) * frame.pixel_pitch_um * 1e-3 / frame.lens.focal_length_mm
+    cell = cell_px(frame) * frame.pixel_pitch_um * 1e-3 / frame.lens.focal_length_mm
     y, x = (fft.fftfreq(n, 1 / n).astype(np.float32) * np.float32(cell) for n in shape)
     out = (
         params["haze"]
@@ -282,40 +278,3 @@ def kernel(params: Params, frame: ImageFrame, shape: tuple[int, int]) -> F32:
 def _kernel_waves(params: Params, context: FaultContext, shape: tuple[int, int]) -> NDArray[np.complex64]:
     """Return the Fourier transform of `kernel`."""
     return np.asarray(fft.rfft2(kernel(params, context.frame, shape)))
-
-
-def _strewn(array: F32, white_e: F32, passes: F64, params: Params, context: FaultContext) -> F32:
-    """Return the scattered light that reaches the sensor, float32[y, x, channel].
-
-    `passes` is the fraction of it that worn coatings and browned glass let through, float64[channel].
-    """
-    frame = context.frame
-    step = _cell_px(frame)
-    height, width, channels = array.shape
-    rows, columns = -(-height // step), -(-width // step)
-    below, right = rows * step - height, columns * step - width
-    whole = cv2.copyMakeBorder(array, 0, below, 0, right, cv2.BORDER_REPLICATE) if below or right else array
-    cells = cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA).reshape(rows, columns, channels)
-    # the grid has twice the size of the frame, so no two cells of the frame meet across its periodic edge
-    shape = (fft.next_fast_len(2 * rows, real=True), fft.next_fast_len(2 * columns, real=True))
-    top, left = (shape[0] - rows) // 2, (shape[1] - columns) // 2
-    around = cv2.copyMakeBorder(
-        np.minimum(cells, white_e),
-        top,
-        shape[0] - rows - top,
-        left,
-        shape[1] - columns - left,
-        cv2.BORDER_REFLECT,
-    ).reshape(*shape, channels)
-    around[top : top + rows, left : left + columns] = cells
-    planes = np.ascontiguousarray(np.moveaxis(around, -1, 0))
-    # all twins share the transform of the kernel
-    waves = context.once(_kernel_waves, params, shape)
-    spread = fft.irfft2(fft.rfft2(planes) * waves, s=shape)
-    inner = np.moveaxis(spread[:, top - 1 : top + rows + 1, left - 1 : left + columns + 1], 0, -1)
-    inner = np.maximum(np.ascontiguousarray(inner), np.float32(0)) * passes.astype(np.float32)
-    if step == 1:
-        return inner[1:-1, 1:-1]
-    finer = np.empty(((rows + 2) * step, (columns + 2) * step, channels), np.float32)
-    cv2.resize(inner, finer.shape[1::-1], dst=finer, interpolation=cv2.INTER_LINEAR)
-    return finer[step : step + height, step : step + width]

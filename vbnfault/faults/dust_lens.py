@@ -24,19 +24,27 @@ from the Sun's irradiance E☉ through the transmittance T of the lens, with dΩ
 (the form of Peterson 2004, Proc. SPIE 5178, 184, for a single grain). Other pixels receive nothing from the grain.
 Grains on the front are therefore bright discs near the Sun, with the outlines of their shadows.
 
-Left out are the glow of grains on the window, which is lost in the Sun's own image, and the light that reaches
-grains behind the first surface from outside the beam of the Sun's image.
+After a touchdown a cover of fine dust lies on the front besides. Grains that are spread evenly and cover the
+fraction c of the front take the fraction c of the light, and diffract as much of what passes (Babinet): the direct
+image has (1 - c)², a halo c (1 - c), both together 1 - c. The halo is that of the grains' mean diameter. ONC-T and
+ONC-W1 of Hayabusa2 lost sensitivity and contrast after the first touchdown on Ryugu (Kouyama et al. 2021, Icarus
+360, 114353), and ONC-T went on doing so for more than a year (Yamada et al. 2023, Earth Planets Space 75, 36).
+
+Left out are the glow of fine dust under a Sun outside the frame, that of grains on the window, which is lost in
+the Sun's own image, and the light that reaches grains behind the first surface from outside the beam of the Sun's
+image.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy import fft
 from scipy.special import j1
 
 from ..lens import RealLens, load_lens
@@ -50,7 +58,7 @@ from ..lens.straylight.particles import DUST_INDEX
 from .context import FaultContext, Params
 from .contract import LensFault
 from .fields import Interval, Severity, bounds, number
-from .planes import reaches, times
+from .planes import cell_px, reaches, strewn, times
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -94,6 +102,10 @@ class DefocusedDust(LensFault):
     window_height_mm: Interval = bounds(
         0.3, 1.0, limits=(1e-3, 100), unit="mm", doc="of the window's dusty side above the sensor"
     )
+    cover: Interval = bounds(
+        0.0, 0.0, limits=(0, 0.9), doc="fraction of the front under fine dust, as after a touchdown; 0: none"
+    )
+    cover_um: float = number(30.0, limits=(1, 1000), unit="µm", doc="mean diameter of this fine dust; assumed")
     mask_loss: float = number(
         0.01,
         limits=(1e-4, 1),
@@ -124,7 +136,7 @@ class DefocusedDust(LensFault):
         across = rng.uniform(-0.5, 0.5, (2, count))
         size_mm = np.array([[frame.width_px], [frame.height_px]]) * frame.pixel_pitch_um * 1e-3
         x, y = np.where(on_window, across * size_mm, radius * np.stack([np.cos(turn), np.sin(turn)]))
-        return {
+        params: Params = {
             "lens": self.lens,
             "surface": row,
             "window_height_mm": float(height),
@@ -135,10 +147,18 @@ class DefocusedDust(LensFault):
             "transmission": np.round(self.transmission.uniform(rng, count), 4).tolist(),
             "mask_loss": float(self.mask_loss),
         }
+        if cover := self.cover.uniform(rng):  # so that the stored parameters of other scenes stay as they are
+            params |= {"cover": cover, "cover_um": float(self.cover_um)}
+        return params
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
         """Return the expected electrons times the transmission of all grains, plus their glow."""
-        out = times(quantity.array, context.once(_shadows, params).transmission)
+        out, cover = times(quantity.array, context.once(_shadows, params).transmission), params.get("cover", 0.0)
+        if cover:
+            waves = partial(context.once, _halo_waves, params)
+            diffracted = np.full(1, cover * (1 - cover), np.float32)
+            halo = strewn(out, quantity.white_e, waves, cell_px(context.frame), diffracted)
+            out = out * np.float32((1 - cover) ** 2) + halo
         light = context.once(_glow, params)
         return quantity.with_array(out if light is None else out + light)
 
@@ -147,7 +167,7 @@ class DefocusedDust(LensFault):
 
         The glow counts if it reaches the level in any channel.
         """
-        dark = context.once(_shadows, params).transmission <= np.float32(1 - params["mask_loss"])
+        dark = self.soft(params, context) >= np.float32(params["mask_loss"])
         light = context.once(_glow, params)
         if light is None:
             return np.asarray(dark)
@@ -156,7 +176,9 @@ class DefocusedDust(LensFault):
 
     def soft(self, params: Params, context: FaultContext) -> F32:
         """Return the fraction of the light that the grains remove, float32[y, x]. Their glow does not count."""
-        return np.float32(1) - context.once(_shadows, params).transmission
+        return np.float32(1) - context.once(_shadows, params).transmission * np.float32(
+            1 - params.get("cover", 0.0)
+        )
 
 
 # --- geometry --------------------------------------------------------------------------------------------------
@@ -379,6 +401,17 @@ def _lobe_table(x: F64) -> F64:
     far = x >= _SMOOTH
     out[far] = values[-1] * (_SMOOTH / x[far]) ** 3
     return out
+
+
+def _halo_waves(params: Params, context: FaultContext, shape: tuple[int, int]) -> NDArray[np.complex64]:
+    """Return the Fourier transform of the light that fine dust diffracts into the cells around, sum 1."""
+    frame = context.frame
+    cell = cell_px(frame) * frame.pixel_pitch_um * 1e-3 / frame.lens.focal_length_mm
+    y, x = (np.fft.fftfreq(n, 1 / n) * cell for n in shape)
+    sine = np.sin(np.arctan(np.hypot(x, y[:, None])))
+    lobe_of = _lobe_table(np.pi * params["cover_um"] * 1e3 / D_NM * sine.ravel()).reshape(shape)
+    waves: NDArray[np.complex64] = fft.rfft2((lobe_of / lobe_of.sum()).astype(np.float32))
+    return waves
 
 
 def _glow(params: Params, context: FaultContext) -> F32 | None:

@@ -8,11 +8,15 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy import fft
 
 from ..camera import Camera
 from ..core.quantities import LUMINANCE
+from ..lens.image_frame import ImageFrame
 
 F32 = NDArray[np.float32]
+
+_CELLS = 256  # cells along the longer side of a frame, on which scattered light is computed
 
 
 def times(array: F32, factor: NDArray[Any]) -> F32:
@@ -78,3 +82,49 @@ def scale_by_intensity(
         np.rint(value, out=value)
         out[..., channel] = np.clip(value, 0, 255, out=value)
     return out
+
+
+def cell_px(frame: ImageFrame) -> int:
+    """Return the side in px of the cells on which scattered light is computed."""
+    return max(1, round(max(frame.width_px, frame.height_px) / _CELLS))
+
+
+def strewn(
+    array: F32,
+    white_e: F32,
+    waves: Callable[[tuple[int, int]], NDArray[np.complex64]],
+    step: int,
+    passes: NDArray[np.float32],
+) -> F32:
+    """Return the light float32[y, x, channel] after a convolution with a wide kernel, in cells of `step` px.
+
+    `waves` returns the Fourier transform of the kernel on a periodic grid of cells of a shape; `passes` is the
+    fraction of the scattered light that arrives, float32[1] or float32[channel]. Around the frame, the light is
+    taken to be its mirror image, clipped to white.
+    """
+    height, width, channels = array.shape
+    rows, columns = -(-height // step), -(-width // step)
+    below, right = rows * step - height, columns * step - width
+    whole = cv2.copyMakeBorder(array, 0, below, 0, right, cv2.BORDER_REPLICATE) if below or right else array
+    cells = cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA).reshape(rows, columns, channels)
+    # the grid has twice the size of the frame, so no two cells of the frame meet across its periodic edge
+    shape = (fft.next_fast_len(2 * rows, real=True), fft.next_fast_len(2 * columns, real=True))
+    top, left = (shape[0] - rows) // 2, (shape[1] - columns) // 2
+    around = cv2.copyMakeBorder(
+        np.minimum(cells, white_e),
+        top,
+        shape[0] - rows - top,
+        left,
+        shape[1] - columns - left,
+        cv2.BORDER_REFLECT,
+    ).reshape(*shape, channels)
+    around[top : top + rows, left : left + columns] = cells
+    planes = np.ascontiguousarray(np.moveaxis(around, -1, 0))
+    spread = fft.irfft2(fft.rfft2(planes) * waves(shape), s=shape)
+    inner = np.moveaxis(spread[:, top - 1 : top + rows + 1, left - 1 : left + columns + 1], 0, -1)
+    inner = np.maximum(np.ascontiguousarray(inner), np.float32(0)) * passes
+    if step == 1:
+        return inner[1:-1, 1:-1]
+    finer = np.empty(((rows + 2) * step, (columns + 2) * step, channels), np.float32)
+    cv2.resize(inner, finer.shape[1::-1], dst=finer, interpolation=cv2.INTER_LINEAR)
+    return finer[step : step + height, step : step + width]

@@ -5,6 +5,12 @@ arrives as zeros, or the receiver repeats the last packet that arrived. A burst 
 damaged packet, bits flip independently (binary symmetric channel) and at a high rate: links are coded, and a packet
 that cannot be decoded is full of errors (CCSDS 130.1-G). A line may be lost on the camera's own interface.
 
+Two patterns of flight images are off by default. A compressor with a fixed budget of bits drops the ends of lines
+where the scene is busy: with `cut_rows`, each line of a block, or every second one, ends at a ragged edge and is 0
+beyond, as in images of Cassini's cameras (ISS Data User's Guide; recalled). With `fill = "shifted"` the receiver
+does not notice that packets are missing: all that follows moves up, so that the image is sheared along its lines,
+until the next mark of `sync_rows`.
+
 The image is made from the data that arrive, so demosaicing spreads the errors. Sizes and numbers are assumed. Space
 packets carry at most 65 536 bytes of data (CCSDS 133.0-B).
 """
@@ -21,10 +27,13 @@ from numpy.typing import ArrayLike, NDArray
 from ..detector.readout import last_before, transmission_order
 from .context import FaultContext, Params
 from .contract import Fault
-from .fields import Interval, Severity, bounds, choice
+from .fields import Interval, Severity, bounds, choice, number
 
 Raw = NDArray[np.uint16]
 Mask = NDArray[np.bool_]
+
+_CUT_FROM = (0.3, 0.9)  # column, over the width, at which the first cut line ends; assumed
+_RAGGED = 0.02  # step from one cut line's end to the next one's, over the width; assumed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,9 +62,17 @@ class PacketTransmission(Fault):
     lost_lines: Interval = bounds(0, 3, limits=(0, 10_000), integer=True, doc="rows lost one by one; assumed")
     fill: str = choice(
         "drawn",
-        ("drawn", "zero", "previous"),
-        doc="what lost packets and rows show: 0, the last that arrived, or either with equal chance",
+        ("drawn", "zero", "previous", "shifted"),
+        doc="what lost packets and rows show: 0, the last that arrived, or either with equal chance; shifted: what "
+        "follows moves up to the next mark, lost rows are 0",
     )
+    sync_rows: int = number(
+        64, limits=(1, 16384), integer=True, unit="px", doc="rows between two marks, for fill = 'shifted'; assumed"
+    )
+    cut_rows: Interval = bounds(
+        0, 0, limits=(0, 16384), integer=True, unit="px", doc="rows of a block whose lines lose their ends; 0: none"
+    )
+    cut_every: int = number(2, limits=(1, 64), integer=True, doc="of these lines, each such one is cut")
 
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
         """Return the indices of lost packets, damaged packets and lost rows, and the seed of the bit flips.
@@ -74,7 +91,7 @@ class PacketTransmission(Fault):
         lost = np.cumsum(change[:-1]) > 0
         arrived = rng.permutation(np.flatnonzero(~lost))
         rows = rng.permutation(context.shape[0])[: self.lost_lines.integer(rng)]
-        return {
+        params: Params = {
             "packet_px": packet_px,
             "nodes": int(detector.sensor.readout.nodes),
             "bits": int(detector.sensor.readout.bits),
@@ -85,6 +102,25 @@ class PacketTransmission(Fault):
             "lines": sorted(rows.tolist()),
             "fill": ("zero", "previous")[int(rng.integers(2))] if self.fill == "drawn" else self.fill,
         }
+        if self.fill == "shifted":
+            params["sync_rows"] = int(self.sync_rows)
+        if cut_rows := self.cut_rows.integer(rng):
+            params["cut"] = self._cut(cut_rows, context, rng)
+        return params
+
+    def _cut(self, count: int, context: FaultContext, rng: np.random.Generator) -> list[list[int]]:
+        """Return row and first lost column of each cut line; neighbours end within some hundredths of the width.
+
+        With a mosaic a line is a row of its tiles, so that all its colours end together.
+        """
+        height, width = context.shape
+        tile = len(context.camera.mosaic.sensor.pattern.tile)
+        first = int(rng.integers(max(height - count, 0) // tile, endpoint=True)) * tile
+        lines = first + np.arange(0, count, tile * int(self.cut_every))
+        steps = np.cumsum(rng.normal(0, _RAGGED * width, len(lines)))
+        columns = np.clip(rng.uniform(*_CUT_FROM) * width + steps, 1, width - 1).astype(int)
+        rows = (lines[:, None] + np.arange(tile)).tolist()
+        return [[row, int(end)] for line, end in zip(rows, columns, strict=True) for row in line if row < height]
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
         """Return the raw digital numbers that arrive."""
@@ -112,12 +148,15 @@ def _arrived(raw: Raw, params: Params) -> tuple[Raw, Mask]:
     stream[damaged[inside]] ^= flips[inside]
     hit[damaged[inside]] = flips[inside] != 0
     repeats, inside = params["fill"] == "previous", lost < raw.size
-    shown = np.zeros(lost.shape, dtype=np.uint16)
-    if repeats:
-        source = last_before(np.asarray(params["lost"], dtype=np.intp))
-        shown[source >= 0] = stream[_positions(source[source >= 0], params["packet_px"])]
-    stream[lost[inside]] = shown[inside]
-    hit[lost[inside]] = True
+    if params["fill"] == "shifted":
+        _close_up(stream, hit, lost[inside], params["sync_rows"] * raw.shape[1])
+    else:
+        shown = np.zeros(lost.shape, dtype=np.uint16)
+        if repeats:
+            source = last_before(np.asarray(params["lost"], dtype=np.intp))
+            shown[source >= 0] = stream[_positions(source[source >= 0], params["packet_px"])]
+        stream[lost[inside]] = shown[inside]
+        hit[lost[inside]] = True
     out, region = np.empty_like(raw), np.empty(raw.shape, dtype=np.bool_)
     out.ravel()[order], region.ravel()[order] = stream, hit
     lines = np.asarray(params["lines"], dtype=np.intp)
@@ -125,7 +164,21 @@ def _arrived(raw: Raw, params: Params) -> tuple[Raw, Mask]:
     arrived = source >= 0 if repeats else np.zeros(len(lines), dtype=np.bool_)
     out[lines[~arrived]], out[lines[arrived]] = 0, out[source[arrived]]
     region[lines] = True
+    for row, column in params.get("cut", ()):
+        out[row, column:], region[row, column:] = 0, True
     return out, region
+
+
+def _close_up(stream: Raw, hit: Mask, lost: NDArray[np.intp], block_px: int) -> None:
+    """Let the pixels behind lost ones move up within blocks of `block_px`, in place; 0 where none is left."""
+    arrives = np.ones(len(stream), dtype=np.bool_)
+    arrives[lost] = False
+    for start in np.unique(lost // block_px) * block_px:
+        block = slice(int(start), int(start) + block_px)
+        left, first = stream[block][arrives[block]], int(np.argmin(arrives[block]))
+        hit[block][first:] = True
+        stream[block] = 0
+        stream[block][: len(left)] = left
 
 
 def _positions(packets: ArrayLike, packet_px: int) -> NDArray[np.intp]:
