@@ -86,6 +86,18 @@ class Points:
         (value,) = self._run(_craters, width_m, key, count, fraction)
         return np.float32(width_m) * value
 
+    def impacts(
+        self, width_m: float, key: int, count: int, *law: float
+    ) -> tuple[Float32, Float32]:
+        """Return the height of craters in metres, and where the freshest are bright, float32[count] each.
+
+        A cell of this width holds at most one sphere, with a diameter of a third to two thirds of the width. `law`
+        is the fraction of the cells that hold one, the exponent of their cumulative size law in space, the power
+        of a uniform number that gives the depth over a fresh crater's, and the fraction of level floors.
+        """
+        height, bright = self._run(_impacts, width_m, key, count, *law)
+        return np.float32(width_m) * height, bright
+
     def clods(self, width_m: float, key: int, count: int, fraction: float) -> Float32:
         """Return the height above the ground of half-buried stones, float32[count] in metres.
 
@@ -99,7 +111,7 @@ class Points:
         """Evaluate a kernel at the first `count` positions, in units of `unit_m`, on the axes of its octave."""
         d = backend()
         if count == 0:
-            return tuple(np.zeros(0, dtype=np.float32) for _ in range(3))[: 3 if kernel is _blocks else 1]
+            return tuple(np.zeros(0, dtype=np.float32) for _ in range(_OUTPUTS.get(kernel, 1)))
         # With opaque values, one compiled kernel serves all octaves.
         matrix = octave_rotation(key & 0xFFFF) / unit_m
         rows = [[d.dr.opaque(d.Float64, float(v)) for v in row] for row in matrix]
@@ -242,6 +254,34 @@ def _craters(d: Any, q: list[Any], word: Any, fraction: Any) -> tuple[Any, ...]:
     return (total,)
 
 
+def _impacts(d: Any, q: list[Any], word: Any, *law: Any) -> tuple[Any, ...]:
+    """Return the sum of the craters' heights at positions in cells, and where the freshest are bright."""
+    words, f = _split(d, [x - 0.5 for x in q])
+    fraction, index, wear, ponds = law
+    total, bright = d.Float(0), d.Float(0)
+    for i, j, k, h in _corners(words, word):
+        h = _mix(d, h)
+        g = _mix(d, h + 0x9E3779B9)
+        offset = [f[axis] - (step + _unit(d, h, 10 * axis)) for axis, step in enumerate((i, j, k))]
+        distance = d.dr.sqrt(offset[0] * offset[0] + offset[1] * offset[1] + offset[2] * offset[2])
+        # the radius inverts N(>= R) ~ R^-index; what lies beyond 1.5 radii may be in no cell of the eight
+        radius = (1.0 / 6) * d.dr.power(1 - (1 - d.dr.power(2.0, -index)) * _unit(d, g, 0), -1 / index)
+        x = distance / radius
+        occupied = d.Float(_mix(d, g) >> 8) * 2.0**-24 < fraction  # few cells are: ten bits are too coarse
+        fresh = d.dr.power(_unit(d, g, 20) + 0.5 / 1024, wear)
+        # a fresh crater is a parabola 0.4 radii deep, a worn one rounded and without a rim
+        hollow = d.dr.maximum(1 - x * x, 0)
+        bowl = 0.32 * d.dr.lerp(hollow * hollow, hollow, fresh)
+        bowl = d.dr.select(_unit(d, g, 10) < ponds, d.dr.minimum(bowl, 0.2), bowl)
+        skirt = d.dr.maximum(3 - 2 * x, 0)
+        rim = 0.08 * fresh * d.dr.select(x < 1, x * x, skirt * skirt)
+        present = occupied & (x < 1.5)
+        total = total + d.dr.select(present, radius * fresh * (rim - bowl), 0)
+        newest = d.dr.maximum(8 * fresh - 7, 0)
+        bright = bright + d.dr.select(present, newest * d.dr.minimum(3 - 2 * x, 1), 0)
+    return total, bright
+
+
 def _clods(d: Any, q: list[Any], word: Any, fraction: Any) -> tuple[Any, ...]:
     """Return the height of the highest stone at positions in cells."""
     words, f = _split(d, [x - 0.5 for x in q])
@@ -258,6 +298,8 @@ def _clods(d: Any, q: list[Any], word: Any, fraction: Any) -> tuple[Any, ...]:
         highest = d.dr.maximum(highest, d.dr.select(_unit(d, g, 20) < fraction, dome, 0))
     return (highest,)
 
+
+_OUTPUTS = {_blocks: 3, _impacts: 2}  # arrays that a kernel returns, if not one
 
 # --- fields on a mesh -------------------------------------------------------------------------------------------
 
@@ -392,13 +434,24 @@ class Octaves:
             total += self._full(part, shows)
         return total
 
+    def impacts(self, width_m: float, stream: int, *law: float) -> tuple[Float32, Float32]:
+        """Return the height in metres and the brightness of craters on cells of one width, see `Points.impacts`."""
+        shows = width_m / 4  # as a wavelength; the smallest bowls are a third of the cell wide
+        both = self._points.impacts(width_m, noise_key(self.seed, stream), self._count(shows), *law)
+        height, bright = (self._full(part, shows) for part in both)
+        return height, bright
+
+    def stones(self, width_m: float, stream: int, fraction: float) -> Float32:
+        """Return the height of half-buried stones in a fraction of the cells of one width, metres."""
+        shows = 0.7 * width_m
+        part = self._points.clods(width_m, noise_key(self.seed, stream), self._count(shows), fraction)
+        return self._full(part, shows)
+
     def clods(self) -> Float32:
         """Return the height of half-buried stones of all sizes, metres."""
         highest = np.zeros(len(self.facet_m), dtype=np.float32)
         for number, width in enumerate(_CLOD_CELLS_M):
-            shows = 0.7 * width
-            part = self._points.clods(width, noise_key(self.seed, 160 + number), self._count(shows), 0.55)
-            highest = np.maximum(highest, self._full(part, shows))
+            highest = np.maximum(highest, self.stones(width, 160 + number, 0.55))
         return highest
 
     def ledge(self, thickness_m: float, reach_m: float, hard: Float32, index: NDArray, inside: Float32) -> Float32:
