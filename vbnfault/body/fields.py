@@ -67,13 +67,17 @@ class Points:
         (value,) = self._run(_planes, width_m, key, count)
         return value
 
-    def blocks(self, width_m: float, key: int, count: int) -> tuple[Float32, Float32, Float32]:
+    def blocks(
+        self, width_m: float, key: int, count: int, kernel: str = "blocks"
+    ) -> tuple[Float32, Float32, Float32]:
         """Evaluate a pattern of cells about one width across; each cell has its own random level and tilt.
+
+        With the kernel "stones", no cell is cut.
 
         Returns three arrays, float32[count]: the value of the cell's tilted plane (standard deviation about 0.4),
         that of the second nearest cell, and the distance to the border between the two in metres.
         """
-        level, other, gap = self._run(_blocks, width_m, key, count)
+        level, other, gap = self._run(_PATTERNS[kernel], width_m, key, count)
         return level, other, np.float32(width_m) * gap
 
     def craters(self, width_m: float, key: int, count: int, fraction: float) -> Float32:
@@ -146,6 +150,12 @@ def _split(d: Any, q: list[Any]) -> tuple[list[list[Any]], list[Any]]:
     return words, fractions
 
 
+def _nearest_cells(d: Any, q: list[Any]) -> tuple[list[list[Any]], list[Any]]:
+    """Return what `_split` does for the two cells on each axis nearest to a point: positions are 0.5 to 1.5 in them."""
+    words, f = _split(d, [x - 0.5 for x in q])
+    return words, [x + 0.5 for x in f]
+
+
 def _corners(words: list[list[Any]], word: Any) -> list[tuple[int, int, int, Any]]:
     """Return offsets and combined hash word of the eight cells around each point."""
     return [
@@ -199,9 +209,22 @@ def _planes(d: Any, q: list[Any], word: Any) -> tuple[Any, ...]:
     return (total,)
 
 
+def _stones(d: Any, q: list[Any], word: Any) -> tuple[Any, ...]:
+    """Return what `_blocks` does, with the nearest cells found everywhere."""
+    return _cells(d, *_nearest_cells(d, q), word)
+
+
 def _blocks(d: Any, q: list[Any], word: Any) -> tuple[Any, ...]:
-    """Return the planes of the two nearest cells and the distance to their border, in cells."""
-    words, f = _split(d, [x - 0.5 for x in q])
+    """Return the planes of the two nearest cells and the distance to their border, in cells.
+
+    At half of the points one of the two is missed, which cuts blocks along planes. The ground of comets was chosen
+    with these cuts, so they stay.
+    """
+    return _cells(d, *_split(d, [x - 0.5 for x in q]), word)
+
+
+def _cells(d: Any, words: list[list[Any]], f: list[Any], word: Any) -> tuple[Any, ...]:
+    """Return the planes of the two nearest of eight cells and the distance to their border, in cells."""
     nearest, second = d.Float(9), d.Float(9)
     level, other = d.Float(0), d.Float(0)
     near = [d.Float(0)] * 3
@@ -256,7 +279,7 @@ def _craters(d: Any, q: list[Any], word: Any, fraction: Any) -> tuple[Any, ...]:
 
 def _impacts(d: Any, q: list[Any], word: Any, *law: Any) -> tuple[Any, ...]:
     """Return the sum of the craters' heights at positions in cells, and where the freshest are bright."""
-    words, f = _split(d, [x - 0.5 for x in q])
+    words, f = _nearest_cells(d, q)
     fraction, index, wear, ponds = law
     total, bright = d.Float(0), d.Float(0)
     for i, j, k, h in _corners(words, word):
@@ -265,7 +288,7 @@ def _impacts(d: Any, q: list[Any], word: Any, *law: Any) -> tuple[Any, ...]:
         offset = [f[axis] - (step + _unit(d, h, 10 * axis)) for axis, step in enumerate((i, j, k))]
         distance = d.dr.sqrt(offset[0] * offset[0] + offset[1] * offset[1] + offset[2] * offset[2])
         # the radius inverts N(>= R) ~ R^-index; what lies beyond 1.5 radii may be in no cell of the eight
-        radius = (1.0 / 6) * d.dr.power(1 - (1 - d.dr.power(2.0, -index)) * _unit(d, g, 0), -1 / index)
+        radius = (1.0 / 6) * d.dr.power(1 - (1 - d.dr.power(d.Float(2), -index)) * _unit(d, g, 0), -1 / index)
         x = distance / radius
         occupied = d.Float(_mix(d, g) >> 8) * 2.0**-24 < fraction  # few cells are: ten bits are too coarse
         fresh = d.dr.power(_unit(d, g, 20) + 0.5 / 1024, wear)
@@ -299,7 +322,8 @@ def _clods(d: Any, q: list[Any], word: Any, fraction: Any) -> tuple[Any, ...]:
     return (highest,)
 
 
-_OUTPUTS = {_blocks: 3, _impacts: 2}  # arrays that a kernel returns, if not one
+_PATTERNS = {"blocks": _blocks, "stones": _stones}
+_OUTPUTS = {_blocks: 3, _stones: 3, _impacts: 2}  # arrays that a kernel returns, if not one
 
 # --- fields on a mesh -------------------------------------------------------------------------------------------
 
@@ -407,10 +431,10 @@ class Octaves:
                 total += size * np.float32(angularity**0.5) * self.planes(wavelength, stream + k)
         return total
 
-    def blocks(self, width_m: float, height_m: float, stream: int) -> Float32:
+    def blocks(self, width_m: float, height_m: float, stream: int, kernel: str = "blocks") -> Float32:
         """Return the height of blocks of that width, each at its own level, with cracks between them, metres."""
         count = self._count(width_m)
-        level, other, gap = self._points.blocks(width_m, noise_key(self.seed, stream), count)
+        level, other, gap = self._points.blocks(width_m, noise_key(self.seed, stream), count, kernel)
         step = np.float32(height_m) * (other - level)
         # A step narrower than two facets, or steeper than 60°, would have an edge like a saw.
         ramp = np.maximum(0.06 * width_m, 1.8 * self.facet_m[:count]).astype(np.float32)
@@ -436,22 +460,18 @@ class Octaves:
 
     def impacts(self, width_m: float, stream: int, *law: float) -> tuple[Float32, Float32]:
         """Return the height in metres and the brightness of craters on cells of one width, see `Points.impacts`."""
-        shows = width_m / 4  # as a wavelength; the smallest bowls are a third of the cell wide
+        shows = width_m / 6  # half of the smallest bowls: with fewer facets they would be dots
         both = self._points.impacts(width_m, noise_key(self.seed, stream), self._count(shows), *law)
         height, bright = (self._full(part, shows) for part in both)
         return height, bright
-
-    def stones(self, width_m: float, stream: int, fraction: float) -> Float32:
-        """Return the height of half-buried stones in a fraction of the cells of one width, metres."""
-        shows = 0.7 * width_m
-        part = self._points.clods(width_m, noise_key(self.seed, stream), self._count(shows), fraction)
-        return self._full(part, shows)
 
     def clods(self) -> Float32:
         """Return the height of half-buried stones of all sizes, metres."""
         highest = np.zeros(len(self.facet_m), dtype=np.float32)
         for number, width in enumerate(_CLOD_CELLS_M):
-            highest = np.maximum(highest, self.stones(width, 160 + number, 0.55))
+            shows = 0.7 * width
+            part = self._points.clods(width, noise_key(self.seed, 160 + number), self._count(shows), 0.55)
+            highest = np.maximum(highest, self._full(part, shows))
         return highest
 
     def ledge(self, thickness_m: float, reach_m: float, hard: Float32, index: NDArray, inside: Float32) -> Float32:

@@ -43,7 +43,7 @@ _LEVEL_DEG = (8.0, 22.0)  # fine material levels slopes up to the first, and non
 _STONES_STAY_DEG = (33.0, 48.0)
 _REGIONS = 2.5  # size of rough and smooth regions, in longest octaves
 _LARGEST_STONE, _MOST_STONE_M = 5.0, 20.0  # width of the largest stones of rubble, in the smallest boulders
-_STONE_HEIGHT = 0.3  # per unit of their random level, over their width
+_STONE_HEIGHT = 0.4  # per unit of their random level, over their width
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,8 +123,10 @@ def surface(
     slope_deg: Float32,
     low_m: float,
     spec: PatchSpec,
-) -> tuple[Float32, Float32, Float32]:
-    """Return the height in metres, the fine material in [0, 1], and where fresh craters are bright, float32[n] each.
+) -> tuple[Float32, Float32, Float32, Float32]:
+    """Return height without and with rubble in metres, fine material in [0, 1], and brightness of fresh craters.
+
+    Each is float32[n].
 
     Parameters
     ----------
@@ -140,11 +142,11 @@ def surface(
     shortest = max(1.8 * float(noise.facet_m[0]), 0.05)
     region = 0.5 + 0.9 * smooth_step(-1.0, 1.2, noise.gradient(_REGIONS * noise.longest_m, 210))
     rough = spec.relief * region * noise.fractal(noise.longest_m, shortest, 0, spec.angularity)
-    rough += _rubble(noise, kind.rubble, spec.min_boulder_m)
     pits, bright = craters(noise, crater_law(spec.craters_per_km2, kind), kind.ponds)
     fine = _fine(noise, elevation_m, slope_deg, low_m, kind)
     height = (1 - 0.93 * fine) * rough + (1 - 0.8 * fine) * pits
-    return np.asarray(height, dtype=np.float32), fine, bright
+    rubble = (1 - fine) * _rubble(noise, kind.rubble, spec.min_boulder_m)
+    return height, height + rubble, fine, bright
 
 
 def _fine(noise: Octaves, elevation_m: Float64, slope_deg: Float32, low_m: float, spec: Regolith) -> Float32:
@@ -161,22 +163,28 @@ def _rubble(noise: Octaves, amount: float, smallest_boulder_m: float) -> Float32
     highest = np.zeros(len(noise.facet_m), dtype=np.float32)
     if not amount:
         return highest
+    highest -= np.inf
     width = min(_LARGEST_STONE * smallest_boulder_m, _MOST_STONE_M)
     bent = noise.bent(np.column_stack([0.3 * width * noise.gradient(2 * width, 250 + axis) for axis in range(3)]))
     number = 0
     while width > 1.6 * float(noise.facet_m[0]):
-        highest = np.maximum(highest, bent.blocks(width, amount * _STONE_HEIGHT * width, 260 + number))
+        height = amount * _STONE_HEIGHT * width
+        highest = np.maximum(highest, bent.blocks(width, height, 260 + number, "stones"))
         width, number = width / 1.7, number + 1
-    return highest
+    return np.where(np.isfinite(highest), highest, np.float32(0))
 
 
-def brightness(noise: Octaves, slope_deg: Float32, fine: Float32, bright: Float32) -> Float32:
-    """Return how far the albedo departs from its mean, in units of its contrast, float32[n] from -1 to 1.5."""
+def brightness(noise: Octaves, slope_deg: Float32, fine: Float32, bright: Float32, rubble: float) -> Float32:
+    """Return how far the albedo departs from its mean, in units of its contrast, float32[n] from -1 to 1.5.
+
+    Rubble has no weathered cover that could slide off its slopes.
+    """
     units = sum(np.float32(0.08) * noise.gradient(width, 680 + k) for k, width in enumerate(_UNITS_M))
-    fresh = smooth_step(*_BRIGHT_DEG, slope_deg)
+    fresh = (1 - rubble) * smooth_step(*_BRIGHT_DEG, slope_deg)
     return np.clip(units + 1.2 * fresh + 0.9 * bright - 0.2 * fine, -1, 1.5).astype(np.float32)
 
 
-def stony(slope_deg: Float32, fine: Float32) -> Float32:
-    """Return the density of boulders over that of level, bare ground, float32[n]."""
-    return np.asarray((1 - 0.95 * fine) * (1 - smooth_step(*_STONES_STAY_DEG, slope_deg)), dtype=np.float32)
+def stony(slope_deg: Float32, fine: Float32, rubble: float) -> Float32:
+    """Return the density of boulders over that of level, bare ground, float32[n]; on heaps they lie steeper."""
+    low, high = (slope + 15 * rubble for slope in _STONES_STAY_DEG)
+    return np.asarray((1 - 0.95 * fine) * (1 - smooth_step(low, high, slope_deg)), dtype=np.float32)

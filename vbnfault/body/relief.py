@@ -56,6 +56,7 @@ _BARE_DEG = (30.0, 44.0)  # slopes below the first are loose ground, slopes abov
 _CLIFF_DEG = (38.0, 52.0)
 _GRAVITY_STEP_M = 250.0  # step of the differences that give the gradient of gravity
 _GRAVITY_REACH_M = 1500.0  # gravity is linear up to this distance from the site
+_GRAVITY_REACH = 0.33  # and, where it is sampled elsewhere, up to this distance in mean radii of the body
 
 _STEEPEST = 1.5  # tangent of the relief's largest slope against the model
 _SLUMPS, _SLUMP_STEPS = 4, 25
@@ -187,13 +188,12 @@ def _of_regolith(
     assert spec.regolith is not None
     low_m = float(np.quantile(body.places[2], spec.regolith.smooth)) if spec.regolith.smooth else 0.0
     slope = _slope_deg(points, normals, faces, up)[order]
-    height, fine, bright = regolith.surface(noise, elevation[order], slope, low_m, spec)
-    height_m = _slumped(points, faces, height[rank].astype(np.float64))
-    slope = _slope_deg(points + height_m[:, None] * normals, normals, faces, up)
+    broad, height, fine, bright = regolith.surface(noise, elevation[order], slope, low_m, spec)
+    slope = _slope_deg(points + broad[rank].astype(np.float64)[:, None] * normals, normals, faces, up)
     return Ground(
-        height_m=height_m,
-        dust=regolith.brightness(noise, slope[order], fine, bright)[rank],
-        talus=regolith.stony(slope, fine[rank]),
+        height_m=_slumped(points, faces, height[rank].astype(np.float64)),
+        dust=regolith.brightness(noise, slope[order], fine, bright, spec.regolith.rubble)[rank],
+        talus=regolith.stony(slope, fine[rank], spec.regolith.rubble),
     )
 
 
@@ -238,12 +238,13 @@ def _vertical(body: Body, site: Site, points: Float64) -> tuple[Float64, Float64
 
 
 def _vertical_anywhere(body: Body, site: Site, points: Float64) -> tuple[Float64, Float64]:
-    """Return what `_vertical` does, beyond 1.5 km of the site from gravity at places all over the body.
+    """Return what `_vertical` does, far from the site from gravity at places all over the body.
 
-    Between the three nearest of these, potentials are extrapolated by the gravity at each.
+    Far is a third of the body's radius, or 1.5 km. Between the three nearest of these, potentials are extrapolated by the gravity at each.
     """
     up, elevation = _vertical(body, site, points)
-    far = np.einsum("ni,ni->n", points, points) > _GRAVITY_REACH_M**2
+    reach_m = min(_GRAVITY_REACH_M, _GRAVITY_REACH * (body.volume_m3 / (4 / 3 * np.pi)) ** (1 / 3))
+    far = np.einsum("ni,ni->n", points, points) > reach_m**2
     if far.any():
         place, gravity, level = body.places
         distance, near = cKDTree(place).query(points[far] + site.position_T_m, k=3)
