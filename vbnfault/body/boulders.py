@@ -32,8 +32,8 @@ _EDGE_FACETS = 2.4
 _EDGE_POWER = -0.3
 # Within this distance of the site, edges shrink in proportion to the distance, but not below this fraction.
 _CLOSE_M, _CLOSEST = 50.0, 0.45
-# Factors on the edge length, tried until the triangles fit the budget. Only in regolith are stones so many that coarse
-# ones are better than none.
+# Factors on the edge length, tried until the triangles fit the budget. Only in regolith are stones so many that
+# coarse ones are better than none.
 _COARSER, _COARSEST = (1.0, 1.2, 1.45, 1.75, 2.1), (2.6, 3.2, 4.0, 5.0)
 _FLAT_LEVELS = 2  # up to this level, triangles are the rock's fracture planes and are shaded flat
 _RING = 12  # directions in which the ground around a rock is sampled
@@ -41,8 +41,8 @@ _LOWEST_CORNERS = 8
 _CORNERS_AT_ONCE = 1 << 14  # of rocks that a thread cuts; the temporaries then fit the processor's cache
 # Fraction of a rock's height that lies below the lowest ground around it, on a comet and in regolith
 _BURIED, _SUNK = (0.10, 0.40), (0.20, 0.50)
-# Albedos of boulders in units of the contrast: two kinds (DellaGiustina et al. 2020, Nat. Astron. 5, 31, for Bennu), the
-# fraction of the brighter one, and the deviation within a kind
+# Albedos of boulders in units of the contrast: two kinds (on Bennu: DellaGiustina et al. 2020, Science 370,
+# eabc3660), the fraction of the brighter one, and the deviation within a kind
 _KINDS, _BRIGHT_KIND, _KIND_SIGMA = (-0.35, 0.8), 0.3, 0.25
 
 
@@ -134,9 +134,7 @@ def _strewn(
     bearing = smallest < spec.largest_boulder_m
     favour = np.zeros(len(faces))
     favour[bearing] = _favour(ground, normals[bearing], faces[bearing], spec)
-    law = SizeLaw(
-        per_m2=1e-6 * spec.boulders_per_km2, index=spec.boulder_index, largest_m=spec.largest_boulder_m
-    )
+    law = SizeLaw(per_m2=1e-6 * spec.boulders_per_km2, index=spec.boulder_index, largest_m=spec.largest_boulder_m)
     diameter, face, position, least = scatter(points, faces, favour, smallest, law, rng)
 
     coarser = _COARSER if spec.regolith is None else _COARSER + _COARSEST

@@ -90,9 +90,7 @@ class Points:
         (value,) = self._run(_craters, width_m, key, count, fraction)
         return np.float32(width_m) * value
 
-    def impacts(
-        self, width_m: float, key: int, count: int, *law: float
-    ) -> tuple[Float32, Float32]:
+    def impacts(self, width_m: float, key: int, count: int, *law: float) -> tuple[Float32, Float32]:
         """Return the height of craters in metres, and where the freshest are bright, float32[count] each.
 
         A cell of this width holds at most one sphere, with a diameter of a third to two thirds of the width. `law`
@@ -151,7 +149,7 @@ def _split(d: Any, q: list[Any]) -> tuple[list[list[Any]], list[Any]]:
 
 
 def _nearest_cells(d: Any, q: list[Any]) -> tuple[list[list[Any]], list[Any]]:
-    """Return what `_split` does for the two cells on each axis nearest to a point: positions are 0.5 to 1.5 in them."""
+    """Return what `_split` does, for the two nearest cells on each axis: positions are 0.5 to 1.5 in them."""
     words, f = _split(d, [x - 0.5 for x in q])
     return words, [x + 0.5 for x in f]
 

@@ -7,17 +7,17 @@ Heights are added along the model's normal, as in `relief`. The ground consists 
 - fine material that levels low and gentle ground: ponds on Eros, the Muses Sea on Itokawa;
 - rubble: stones too small to be boulders of their own, heaped on each other.
 
-The albedo differs from its mean by units of the ground, is higher on steep ground, from which weathered material has
-slid, and in the freshest craters.
+The albedo differs from its mean by units of the ground, is higher on steep ground, from which weathered material
+has slid, and in the freshest craters.
 
 References
 ----------
-Gault 1970, Radio Science 5, 273: at geometric saturation, craters number 1.54 D^-2; at equilibrium between those that
-form and those that are worn away, 1 to 10 % of that. Pike 1977, in Impact and Explosion Cratering, 489: fresh simple
-craters are a fifth as deep as wide, with rims of 4 % of the diameter. Fassett & Thomson 2014, JGR Planets 119, 2255:
-wear by diffusion rounds and fills them until nothing is left. Murchie et al. 2002, Icarus 155, 145: steep walls on
-Eros are up to a third brighter. Miyamoto et al. 2007, Science 316, 1011: fine material gathers where the potential
-is low.
+Gault 1970, Radio Science 5, 273: at geometric saturation, craters number 1.54 D^-2; at equilibrium between those
+that form and those that are worn away, 1 to 10 % of that. Pike 1977, in Impact and Explosion Cratering, 489: fresh
+simple craters are a fifth as deep as wide, with rims of 4 % of the diameter. Fassett & Thomson 2014, JGR Planets
+119, 2255: wear by diffusion rounds and fills them until nothing is left. Murchie et al. 2002, Icarus 155, 145:
+steep walls on Eros are up to a third brighter. Miyamoto et al. 2007, Science 316, 1011: fine material gathers where the
+potential is low.
 """
 
 from __future__ import annotations

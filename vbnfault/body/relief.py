@@ -75,7 +75,7 @@ class Ground:
     height_m
         float64[n], along the model's normal.
     dust
-        float32[n] in [0, 1]; 1 is covered by dust. Of regolith: how far the albedo departs from its mean, -1 to 1.5.
+        float32[n] in [0, 1]; 1 is covered by dust. Of regolith: deviation of the albedo from its mean, -1 to 1.5.
     talus
         float32[n] in [0, 1]; 1 is debris at the foot of a cliff. Of regolith: the density of boulders.
     """
@@ -182,7 +182,7 @@ def _of_regolith(
     vertical: tuple[Float64, Float64],
     spec: PatchSpec,
 ) -> Ground:
-    """Return the ground of asteroids and moons; `sorting` is the order of the points in `noise`, and its inverse."""
+    """Return the ground of asteroids and moons; `sorting`: order of the points in `noise`, and its inverse."""
     points, normals, faces = mesh
     (order, rank), (up, elevation) = sorting, vertical
     assert spec.regolith is not None
@@ -240,7 +240,8 @@ def _vertical(body: Body, site: Site, points: Float64) -> tuple[Float64, Float64
 def _vertical_anywhere(body: Body, site: Site, points: Float64) -> tuple[Float64, Float64]:
     """Return what `_vertical` does, far from the site from gravity at places all over the body.
 
-    Far is a third of the body's radius, or 1.5 km. Between the three nearest of these, potentials are extrapolated by the gravity at each.
+    Far is a third of the body's radius, or 1.5 km. Potentials are extrapolated from the three nearest places by the
+    gravity at each.
     """
     up, elevation = _vertical(body, site, points)
     reach_m = min(_GRAVITY_REACH_M, _GRAVITY_REACH * (body.volume_m3 / (4 / 3 * np.pi)) ** (1 / 3))

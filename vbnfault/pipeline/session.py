@@ -281,7 +281,9 @@ class Session:
             regolith = Regolith(**table.regolith.model_dump())
             if self.scene.body.shape != "ellipsoid":  # larger ones are in the shape
                 edge_m = mean_edge_m(self.body.vertices_m, self.body.faces)
-                regolith = replace(regolith, largest_crater_m=min(regolith.largest_crater_m, _CRATER_EDGES * edge_m))
+                regolith = replace(
+                    regolith, largest_crater_m=min(regolith.largest_crater_m, _CRATER_EDGES * edge_m)
+                )
                 keys["largest_boulder_m"] = min(table.largest_boulder_m, _BOULDER_EDGES * edge_m)
             keys["regolith"] = regolith
             near_m.append(table.radius_m)

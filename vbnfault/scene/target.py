@@ -222,7 +222,10 @@ class RegolithTable(Table):
     )
     ponds: float = Field(0.0, ge=0, le=1, description="fraction of the craters that have level floors")
     smooth: float = Field(
-        0.0, ge=0, le=0.9, description="fraction of the body, the lowest, that fine material levels where it is gentle"
+        0.0,
+        ge=0,
+        le=0.9,
+        description="fraction of the body, the lowest, that fine material levels where it is gentle",
     )
     rubble: float = Field(
         0.0, ge=0, le=1, description="fraction of the places of small stones that hold one; 1: heaps everywhere"
