@@ -4,8 +4,9 @@
     python benchmarks/flight_replay.py --frames FOLDER --out replay --rows 0,5,18 --set render.bounces=1
 
 FOLDER holds `poses.csv` (the columns of `[trajectory]`) and for each row an image NAME.png of 8 or 16 bits.
-`flight_eros.toml` and `flight_bennu.toml` are scenes for frames of other cameras. `vbnfault.fit` says how the images
-come about and what each figure means; `vbnfault passport` makes a page of them and keeps a part back. `replay.json` holds all figures, `sheet.png` the pairs real | rendered at full size, and `pairs` the aligned
+`flight_eros.toml` and `flight_bennu.toml` are scenes for frames of other cameras. `vbnfault.fit` says how the
+images come about and what each figure means; `vbnfault passport` makes a page of them and keeps a part back.
+`replay.json` holds all figures, `sheet.png` the pairs real | rendered at full size, and `pairs` the aligned
 images, which `flight_classifier.py` tries to tell apart.
 """
 

@@ -13,11 +13,11 @@ has slid, and in the freshest craters.
 References
 ----------
 Gault 1970, Radio Science 5, 273: at geometric saturation, craters number 1.54 D^-2; at equilibrium between those
-that form and those that are worn away, 1 to 10 % of that. Pike 1977, in Impact and Explosion Cratering, 489: fresh
-simple craters are a fifth as deep as wide, with rims of 4 % of the diameter. Fassett & Thomson 2014, JGR Planets
-119, 2255: wear by diffusion rounds and fills them until nothing is left. Murchie et al. 2002, Icarus 155, 145:
-steep walls on Eros are up to a third brighter. Miyamoto et al. 2007, Science 316, 1011: fine material gathers where the
-potential is low.
+that form and those that are worn away, 1 to 10 % of that. Pike 1977, in Impact and Explosion Cratering, 489:
+fresh simple craters are a fifth as deep as wide, with rims of 4 % of the diameter. Fassett & Thomson 2014, JGR
+Planets 119, 2255: wear by diffusion rounds and fills them until nothing is left. Murchie et al. 2002, Icarus 155,
+145: steep walls on Eros are up to a third brighter. Miyamoto et al. 2007, Science 316, 1011: fine material
+gathers where the potential is low.
 """
 
 from __future__ import annotations
