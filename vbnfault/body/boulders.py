@@ -208,7 +208,8 @@ def _favour(ground: GroundMesh, normals: Float64, faces: Int32, spec: PatchSpec)
     close = place.gradient(23.0, noise_key(spec.seed, 9002), count) / GRADIENT_STD
     cluster = np.exp(1.0 * broad.astype(np.float64) + 0.6 * close)
     if spec.regolith is not None:
-        return cluster ** (1 - 0.7 * spec.regolith.rubble) * talus.mean(axis=1)  # rubble lies everywhere
+        spread = cluster ** (1 - 0.7 * spec.regolith.rubble)  # rubble lies everywhere
+        return np.asarray(spread * talus.mean(axis=1), dtype=np.float64)
     cover = 0.15 + 0.6 * (1 - dust.mean(axis=1))
     if spec.fractured is None:
         cover = cover + 7.0 * talus.mean(axis=1)

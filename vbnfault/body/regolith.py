@@ -171,7 +171,7 @@ def _rubble(noise: Octaves, amount: float, smallest_boulder_m: float) -> Float32
         height = amount * _STONE_HEIGHT * width
         highest = np.maximum(highest, bent.blocks(width, height, 260 + number, "stones"))
         width, number = width / 1.7, number + 1
-    return np.where(np.isfinite(highest), highest, np.float32(0))
+    return np.asarray(np.where(np.isfinite(highest), highest, 0), dtype=np.float32)
 
 
 def brightness(noise: Octaves, slope_deg: Float32, fine: Float32, bright: Float32, rubble: float) -> Float32:
@@ -181,7 +181,7 @@ def brightness(noise: Octaves, slope_deg: Float32, fine: Float32, bright: Float3
     """
     units = sum(np.float32(0.08) * noise.gradient(width, 680 + k) for k, width in enumerate(_UNITS_M))
     fresh = (1 - rubble) * smooth_step(*_BRIGHT_DEG, slope_deg)
-    return np.clip(units + 1.2 * fresh + 0.9 * bright - 0.2 * fine, -1, 1.5).astype(np.float32)
+    return np.asarray(np.clip(units + 1.2 * fresh + 0.9 * bright - 0.2 * fine, -1, 1.5), dtype=np.float32)
 
 
 def stony(slope_deg: Float32, fine: Float32, rubble: float) -> Float32:
