@@ -3,9 +3,10 @@
     python benchmarks/flight_replay.py --frames FOLDER --shape SHAPE --out replay
     python benchmarks/flight_replay.py --frames FOLDER --out replay --rows 0,5,18 --set render.bounces=1
 
-FOLDER holds `poses.csv` (the columns of `[trajectory]`) and for each row an 8-bit image NAME.png. `vbnfault.fit`
-says how the images come about and what each figure means; `vbnfault passport` makes a page of them and keeps a part
-back. `replay.json` holds all figures, `sheet.png` the pairs real | rendered at full size, and `pairs` the aligned
+FOLDER holds `poses.csv` (the columns of `[trajectory]`) and for each row an image NAME.png of 8 or 16 bits.
+`flight_eros.toml` and `flight_bennu.toml` are scenes for frames of other cameras. `vbnfault.fit` says how the
+images come about and what each figure means; `vbnfault passport` makes a page of them and keeps a part back.
+`replay.json` holds all figures, `sheet.png` the pairs real | rendered at full size, and `pairs` the aligned
 images, which `flight_classifier.py` tries to tell apart.
 """
 
@@ -26,7 +27,7 @@ import vbnfault
 from vbnfault.cli import options
 from vbnfault.fit.frames import read_frame
 from vbnfault.fit.passport import OF_PAIRS, STATISTICS
-from vbnfault.fit.replay import Pair, Replay
+from vbnfault.fit.replay import Pair, Replay, step_of
 from vbnfault.scene.trajectory import load_trajectory
 
 # Rosetta's camera has two gains: three frames in a row have 1.9 times the noise of the others at a brightness
@@ -51,10 +52,12 @@ def sheet(pairs: Sequence[Pair], across: int = 3) -> NDArray[np.uint8]:
 
 
 def write_pair(folder: Path, pair: Pair) -> None:
-    """Write NAME_real.png and NAME_rendered.png, aligned, in 8 bits."""
+    """Write NAME_real.png and NAME_rendered.png, aligned, in as many bits as the frame has, 8 or 16."""
     folder.mkdir(parents=True, exist_ok=True)
     for which, one in (("real", pair.real), ("rendered", pair.rendered)):
-        cv2.imwrite(str(folder / f"{pair.name}_{which}.png"), one.image.astype(np.uint8))
+        step = step_of(pair.real.image)
+        image = np.round(one.image / step).astype(np.uint8 if step == 1 else np.uint16)
+        cv2.imwrite(str(folder / f"{pair.name}_{which}.png"), image)
 
 
 def table(figures: Sequence[Mapping[str, float]]) -> list[str]:

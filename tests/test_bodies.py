@@ -66,6 +66,7 @@ ALBEDO = {
     "moon": (550.0, 0.12),
     "ceres": (550.0, 0.094),
     "phobos": (538.0, 0.068),
+    "didymos": (550.0, 0.15),
 }
 
 
@@ -330,8 +331,8 @@ def test_an_unknown_name_gets_the_nearest_and_a_name_of_ones_own_is_free() -> No
     assert config.parse_scene({"title": "t", "body": {"name": "Benu", "density_kg_m3": 1e3}}, source="t").body.name
     vertices, faces = ellipsoid((2500.0, 1336.0, 1336.0))  # volume and length of the nucleus of 67P
     body = Body(name="", vertices_m=vertices, faces=faces)
-    warning = assemble.values_of_another_body(scene_of("Didymos"), body)
-    assert "body.name = 'Didymos': no packaged body (67p, bennu," in warning
+    warning = assemble.values_of_another_body(scene_of("Apophis"), body)
+    assert "body.name = 'Apophis': no packaged body (67p, bennu," in warning
 
 
 def test_another_shape_is_told_what_it_has_of_the_named_body(tmp_path: Path) -> None:

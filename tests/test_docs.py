@@ -275,21 +275,23 @@ def test_figures_are_small() -> None:
 
 # Numbers without a unit: counts, fractions, ratios, exponents, and coefficients of formulas.
 _DIMENSIONLESS = """
-    adc_bits angularity antiblooming apron asymmetry axis bands binning bits blade_rounding blades boulder_index
-    bounces
+    adc_bits albedo_contrast angularity antiblooming apron asymmetry axis bands binning bits blade_rounding blades
+    boulder_index bounces
     camera_axes classes_per_sample coefficients coherent_amplitude coherent_width conic contour_scarps
-    dark_nonuniformity
-    dead_fraction default_material distance_exponent dsnu_freedom dust_contrast eccentricity exposure_stops f_number
+    crater_depth crater_index dark_nonuniformity
+    dead_fraction default_material distance_exponent dsnu_freedom dust_contrast eccentricity
+    equilibrium exposure_stops f_number
     faulty_fraction fill_power gain grain_albedo halo_index hot_clustered_fraction hot_offset_fraction hurst
     individuals
     intermittency internal_transmittance_10mm iso iso_power joints k leak limb log10_scale max_samples_per_pixel
     max_triangles max_tries max_views metering_level min_lit_fraction missing_codes n nadir nd neutral
-    node_gains noise_fraction of_sunlight optical_depth porosity_factor prnu prnu_column prnu_low prnu_row
+    node_gains noise_fraction of_sunlight optical_depth ponds porosity_factor prnu prnu_column prnu_low prnu_row
     quantum_efficiency_peak random random_jet_strength random_jets reflectance relief rts_per_interaction
-    rts_fraction samples samples_per_pixel scarps seed shadow_hiding_amplitude shadow_hiding_width shard_samples
-    sharpen shutter_transmission single_scattering_albedo site sites size_power slope_parameter strata strength
-    stretch
-    stuck_bits stuck_fraction sun sun_facing_nominal_fraction sunlit_fraction test tile train transmission
+    rts_fraction rubble samples samples_per_pixel scarps seed shadow_hiding_amplitude shadow_hiding_width
+    shard_samples sharpen shutter_transmission single_scattering_albedo site sites size_power slope_parameter smooth
+    strata strength stretch stuck_bits stuck_fraction
+    sun sun_facing_nominal_fraction sunlit_fraction test tile train
+    transmission
     trap_fraction val value variants_per_view vd wing_index
 """
 

@@ -17,3 +17,4 @@ from .sites import local_level as local_level
 from .sites import site_at as site_at
 from .spec import Fractured as Fractured
 from .spec import PatchSpec as PatchSpec
+from .spec import Regolith as Regolith

@@ -32,12 +32,18 @@ _EDGE_FACETS = 2.4
 _EDGE_POWER = -0.3
 # Within this distance of the site, edges shrink in proportion to the distance, but not below this fraction.
 _CLOSE_M, _CLOSEST = 50.0, 0.45
-_COARSER = (1.0, 1.2, 1.45, 1.75, 2.1)  # factors on the edge length, tried until the triangles fit the budget
+# Factors on the edge length, tried until the triangles fit the budget. Only in regolith are stones so many that
+# coarse ones are better than none.
+_COARSER, _COARSEST = (1.0, 1.2, 1.45, 1.75, 2.1), (2.6, 3.2, 4.0, 5.0)
 _FLAT_LEVELS = 2  # up to this level, triangles are the rock's fracture planes and are shaded flat
 _RING = 12  # directions in which the ground around a rock is sampled
 _LOWEST_CORNERS = 8
 _CORNERS_AT_ONCE = 1 << 14  # of rocks that a thread cuts; the temporaries then fit the processor's cache
-_BURIED = (0.10, 0.40)  # fraction of a rock's height that lies below the lowest ground around it
+# Fraction of a rock's height that lies below the lowest ground around it, on a comet and in regolith
+_BURIED, _SUNK = (0.10, 0.40), (0.20, 0.50)
+# Albedos of boulders in units of the contrast: two kinds (on Bennu: DellaGiustina et al. 2020, Science 370,
+# eabc3660), the fraction of the brighter one, and the deviation within a kind
+_KINDS, _BRIGHT_KIND, _KIND_SIGMA = (-0.35, 0.8), 0.3, 0.25
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -50,6 +56,8 @@ class Boulders:
         float64[n, 3] in L and int32[m, 3], outward winding; boulder after boulder.
     flat
         bool[m]: the face is shaded with its own normal.
+    shade
+        float32[n]: how far the albedo of the boulder departs from the ground's mean, see `Patch.dust`.
     diameter_m, position_m
         float64[k] largest diameters, and float64[k, 3] centres in L.
     smallest_m
@@ -61,6 +69,7 @@ class Boulders:
     vertices_m: Float64
     faces: Int32
     flat: NDArray[np.bool_]
+    shade: NDArray[np.float32]
     diameter_m: Float64
     position_m: Float64
     smallest_m: Float64
@@ -122,13 +131,14 @@ def _strewn(
     centre = face_centres(points, faces)
     distance = np.sqrt(np.einsum("ni,ni->n", centre, centre))
     smallest = smallest_at(distance, spec.min_boulder_m, spec.boulder_near_m)
-    bearing = smallest < LARGEST_M
+    bearing = smallest < spec.largest_boulder_m
     favour = np.zeros(len(faces))
     favour[bearing] = _favour(ground, normals[bearing], faces[bearing], spec)
-    law = SizeLaw(per_m2=1e-6 * spec.boulders_per_km2, index=spec.boulder_index)
+    law = SizeLaw(per_m2=1e-6 * spec.boulders_per_km2, index=spec.boulder_index, largest_m=spec.largest_boulder_m)
     diameter, face, position, least = scatter(points, faces, favour, smallest, law, rng)
 
-    level = _levels(diameter, ground.facet_m[faces[face, 0]], distance[face], budget)
+    coarser = _COARSER if spec.regolith is None else _COARSER + _COARSEST
+    level = _levels(diameter, ground.facet_m[faces[face, 0]], distance[face], budget, coarser)
     # The cut is at the same multiple of the smallest diameter everywhere, so the size law holds above it.
     order = np.argsort(-diameter / least, kind="stable")
     fits = np.cumsum(20 * 4 ** level[order]) <= budget
@@ -139,22 +149,26 @@ def _strewn(
     kept = kept[np.argsort(level[kept], kind="stable")]
 
     vertices, triangles, flat, positions, start = [np.empty((0, 3))], [np.empty((0, 3), np.int64)], [], [], 0
+    buried, shades = _BURIED if spec.regolith is None else _SUNK, [np.empty(0, np.float32)]
+    shade = np.zeros(len(diameter), np.float32) if spec.regolith is None else _kinds(len(diameter), rng)
     for k in range(_LEVELS + 1):
         group = kept[level[kept] == k]
         if len(group):
             rocks, sphere_faces, centres = _rocks(
-                k, diameter[group], position[group], normals[face[group]], points, tree.result(), rng
+                k, diameter[group], position[group], normals[face[group]], points, tree.result(), rng, buried
             )
             offsets = start + np.arange(len(group))[:, None, None] * rocks.shape[1]
             vertices.append(rocks.reshape(-1, 3))
             triangles.append((sphere_faces[None] + offsets).reshape(-1, 3))
             flat.append(np.full(len(triangles[-1]), k <= _FLAT_LEVELS))
             positions.append(centres)
+            shades.append(np.repeat(shade[group], rocks.shape[1]))
             start += len(vertices[-1])
     return Boulders(
         vertices_m=np.concatenate(vertices),
         faces=np.concatenate(triangles).astype(np.int32),
         flat=np.concatenate([np.empty(0, bool), *flat]),
+        shade=np.concatenate(shades),
         diameter_m=diameter[kept],
         position_m=np.concatenate([np.empty((0, 3)), *positions]),
         smallest_m=least[kept],
@@ -162,7 +176,15 @@ def _strewn(
     )
 
 
-def _levels(diameter_m: Float64, facet_m: Float64, distance_m: Float64, budget: int) -> NDArray[np.int64]:
+def _kinds(count: int, rng: np.random.Generator) -> NDArray[np.float32]:
+    """Return how far the albedos of dark and bright boulders depart from the mean, float32[count]."""
+    kind = np.where(rng.random(count) < _BRIGHT_KIND, _KINDS[1], _KINDS[0])
+    return np.clip(kind + _KIND_SIGMA * rng.normal(size=count), -1, 1.5).astype(np.float32)
+
+
+def _levels(
+    diameter_m: Float64, facet_m: Float64, distance_m: Float64, budget: int, factors: tuple[float, ...]
+) -> NDArray[np.int64]:
     """Return the level of detail of each boulder, int64[k], coarser ones if the budget asks for it.
 
     Coarser rocks are better than fewer rocks. A single rock takes at most 6 % of the budget.
@@ -170,7 +192,7 @@ def _levels(diameter_m: Float64, facet_m: Float64, distance_m: Float64, budget: 
     edge = _EDGE_FACETS * facet_m * np.maximum(diameter_m / 0.5, 1.0) ** _EDGE_POWER
     edge *= np.clip(distance_m / _CLOSE_M, _CLOSEST, 1.0)
     finest = min(_LEVELS, max(1, int(np.log2(max(0.06 * budget / 20, 1.0)) / 2)))
-    for coarser in _COARSER:
+    for coarser in factors:
         level = np.clip(np.ceil(np.log2(0.53 * diameter_m / (coarser * edge))), 0, finest).astype(np.int64)
         if np.sum(20 * 4**level) <= budget:
             break
@@ -185,6 +207,9 @@ def _favour(ground: GroundMesh, normals: Float64, faces: Int32, spec: PatchSpec)
     broad = place.gradient(110.0, noise_key(spec.seed, 9001), count) / GRADIENT_STD
     close = place.gradient(23.0, noise_key(spec.seed, 9002), count) / GRADIENT_STD
     cluster = np.exp(1.0 * broad.astype(np.float64) + 0.6 * close)
+    if spec.regolith is not None:
+        spread = cluster ** (1 - 0.7 * spec.regolith.rubble)  # rubble lies everywhere
+        return np.asarray(spread * talus.mean(axis=1), dtype=np.float64)
     cover = 0.15 + 0.6 * (1 - dust.mean(axis=1))
     if spec.fractured is None:
         cover = cover + 7.0 * talus.mean(axis=1)
@@ -200,19 +225,20 @@ def _favour(ground: GroundMesh, normals: Float64, faces: Int32, spec: PatchSpec)
 
 @dataclass(frozen=True, kw_only=True)
 class SizeLaw:
-    """Describe the size law N(>= D) = per_m2 · (D / 7 m)^-index boulders per m², cut off above 45 m."""
+    """Describe the size law N(>= D) = per_m2 · (D / 7 m)^-index boulders per m², cut off above `largest_m`."""
 
     per_m2: float = 1e-6 * PER_KM2
     index: float = INDEX
+    largest_m: float = LARGEST_M
 
     def above(self, diameter_m: ArrayLike) -> Float64:
         """Return the number per square metre from `diameter_m` up to the largest diameter; 0 beyond that."""
-        d = np.minimum(np.asarray(diameter_m, dtype=np.float64), LARGEST_M)
-        return self.per_m2 * ((d / REFERENCE_M) ** -self.index - (LARGEST_M / REFERENCE_M) ** -self.index)
+        d = np.minimum(np.asarray(diameter_m, dtype=np.float64), self.largest_m)
+        return self.per_m2 * ((d / REFERENCE_M) ** -self.index - (self.largest_m / REFERENCE_M) ** -self.index)
 
     def draw(self, smallest_m: Float64, u: Float64) -> Float64:
-        """Return the diameters at quantiles u in [0, 1) of the law from `smallest_m` to 45 m."""
-        truncated = 1.0 - (smallest_m / LARGEST_M) ** self.index
+        """Return the diameters at quantiles u in [0, 1) of the law from `smallest_m` to the largest."""
+        truncated = 1.0 - (smallest_m / self.largest_m) ** self.index
         return np.asarray(smallest_m * (1.0 - u * truncated) ** (-1.0 / self.index))
 
     def paved_m(self, density: Float64) -> Float64:
@@ -310,6 +336,7 @@ def _rocks(
     ground: Float64,
     tree: cKDTree,
     rng: np.random.Generator,
+    buried: tuple[float, float],
 ) -> tuple[Float64, Int32, Float64]:
     """Return rocks of one level of detail: float64[k, v, 3], their common faces and their centres float64[k, 3].
 
@@ -341,7 +368,7 @@ def _rocks(
     along = np.einsum("nvi,ni->nv", rock, normal)
     low, high = along.min(axis=1), along.max(axis=1)
     lowest = _lowest_ground(position, normal, 0.5 * diameter, ground, tree)
-    lift = lowest - low - rng.uniform(*_BURIED, count) * (high - low)
+    lift = lowest - low - rng.uniform(*buried, count) * (high - low)
     centre = position + lift[:, None] * normal
     for _ in range(3):  # lower the rock until its lowest corners are in the ground beside them
         corners = rock + centre[:, None, :]

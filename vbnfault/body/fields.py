@@ -67,13 +67,17 @@ class Points:
         (value,) = self._run(_planes, width_m, key, count)
         return value
 
-    def blocks(self, width_m: float, key: int, count: int) -> tuple[Float32, Float32, Float32]:
+    def blocks(
+        self, width_m: float, key: int, count: int, kernel: str = "blocks"
+    ) -> tuple[Float32, Float32, Float32]:
         """Evaluate a pattern of cells about one width across; each cell has its own random level and tilt.
+
+        With the kernel "stones", no cell is cut.
 
         Returns three arrays, float32[count]: the value of the cell's tilted plane (standard deviation about 0.4),
         that of the second nearest cell, and the distance to the border between the two in metres.
         """
-        level, other, gap = self._run(_blocks, width_m, key, count)
+        level, other, gap = self._run(_PATTERNS[kernel], width_m, key, count)
         return level, other, np.float32(width_m) * gap
 
     def craters(self, width_m: float, key: int, count: int, fraction: float) -> Float32:
@@ -85,6 +89,16 @@ class Points:
         """
         (value,) = self._run(_craters, width_m, key, count, fraction)
         return np.float32(width_m) * value
+
+    def impacts(self, width_m: float, key: int, count: int, *law: float) -> tuple[Float32, Float32]:
+        """Return the height of craters in metres, and where the freshest are bright, float32[count] each.
+
+        A cell of this width holds at most one sphere, with a diameter of a third to two thirds of the width. `law`
+        is the fraction of the cells that hold one, the exponent of their cumulative size law in space, the power
+        of a uniform number that gives the depth over a fresh crater's, and the fraction of level floors.
+        """
+        height, bright = self._run(_impacts, width_m, key, count, *law)
+        return np.float32(width_m) * height, bright
 
     def clods(self, width_m: float, key: int, count: int, fraction: float) -> Float32:
         """Return the height above the ground of half-buried stones, float32[count] in metres.
@@ -99,7 +113,7 @@ class Points:
         """Evaluate a kernel at the first `count` positions, in units of `unit_m`, on the axes of its octave."""
         d = backend()
         if count == 0:
-            return tuple(np.zeros(0, dtype=np.float32) for _ in range(3))[: 3 if kernel is _blocks else 1]
+            return tuple(np.zeros(0, dtype=np.float32) for _ in range(_OUTPUTS.get(kernel, 1)))
         # With opaque values, one compiled kernel serves all octaves.
         matrix = octave_rotation(key & 0xFFFF) / unit_m
         rows = [[d.dr.opaque(d.Float64, float(v)) for v in row] for row in matrix]
@@ -132,6 +146,12 @@ def _split(d: Any, q: list[Any]) -> tuple[list[list[Any]], list[Any]]:
         words.append([cell * d.UInt32(prime), (cell + 1) * d.UInt32(prime)])
         fractions.append(d.Float(x - floor))
     return words, fractions
+
+
+def _nearest_cells(d: Any, q: list[Any]) -> tuple[list[list[Any]], list[Any]]:
+    """Return what `_split` does, for the two nearest cells on each axis: positions are 0.5 to 1.5 in them."""
+    words, f = _split(d, [x - 0.5 for x in q])
+    return words, [x + 0.5 for x in f]
 
 
 def _corners(words: list[list[Any]], word: Any) -> list[tuple[int, int, int, Any]]:
@@ -187,9 +207,22 @@ def _planes(d: Any, q: list[Any], word: Any) -> tuple[Any, ...]:
     return (total,)
 
 
+def _stones(d: Any, q: list[Any], word: Any) -> tuple[Any, ...]:
+    """Return what `_blocks` does, with the nearest cells found everywhere."""
+    return _cells(d, *_nearest_cells(d, q), word)
+
+
 def _blocks(d: Any, q: list[Any], word: Any) -> tuple[Any, ...]:
-    """Return the planes of the two nearest cells and the distance to their border, in cells."""
-    words, f = _split(d, [x - 0.5 for x in q])
+    """Return the planes of the two nearest cells and the distance to their border, in cells.
+
+    At half of the points one of the two is missed, which cuts blocks along planes. The ground of comets was chosen
+    with these cuts, so they stay.
+    """
+    return _cells(d, *_split(d, [x - 0.5 for x in q]), word)
+
+
+def _cells(d: Any, words: list[list[Any]], f: list[Any], word: Any) -> tuple[Any, ...]:
+    """Return the planes of the two nearest of eight cells and the distance to their border, in cells."""
     nearest, second = d.Float(9), d.Float(9)
     level, other = d.Float(0), d.Float(0)
     near = [d.Float(0)] * 3
@@ -242,6 +275,34 @@ def _craters(d: Any, q: list[Any], word: Any, fraction: Any) -> tuple[Any, ...]:
     return (total,)
 
 
+def _impacts(d: Any, q: list[Any], word: Any, *law: Any) -> tuple[Any, ...]:
+    """Return the sum of the craters' heights at positions in cells, and where the freshest are bright."""
+    words, f = _nearest_cells(d, q)
+    fraction, index, wear, ponds = law
+    total, bright = d.Float(0), d.Float(0)
+    for i, j, k, h in _corners(words, word):
+        h = _mix(d, h)
+        g = _mix(d, h + 0x9E3779B9)
+        offset = [f[axis] - (step + _unit(d, h, 10 * axis)) for axis, step in enumerate((i, j, k))]
+        distance = d.dr.sqrt(offset[0] * offset[0] + offset[1] * offset[1] + offset[2] * offset[2])
+        # the radius inverts N(>= R) ~ R^-index; what lies beyond 1.5 radii may be in no cell of the eight
+        radius = (1.0 / 6) * d.dr.power(1 - (1 - d.dr.power(d.Float(2), -index)) * _unit(d, g, 0), -1 / index)
+        x = distance / radius
+        occupied = d.Float(_mix(d, g) >> 8) * 2.0**-24 < fraction  # few cells are: ten bits are too coarse
+        fresh = d.dr.power(_unit(d, g, 20) + 0.5 / 1024, wear)
+        # a fresh crater is a parabola 0.4 radii deep, a worn one rounded and without a rim
+        hollow = d.dr.maximum(1 - x * x, 0)
+        bowl = 0.32 * d.dr.lerp(hollow * hollow, hollow, fresh)
+        bowl = d.dr.select(_unit(d, g, 10) < ponds, d.dr.minimum(bowl, 0.2), bowl)
+        skirt = d.dr.maximum(3 - 2 * x, 0)
+        rim = 0.08 * fresh * d.dr.select(x < 1, x * x, skirt * skirt)
+        present = occupied & (x < 1.5)
+        total = total + d.dr.select(present, radius * fresh * (rim - bowl), 0)
+        newest = d.dr.maximum(8 * fresh - 7, 0)
+        bright = bright + d.dr.select(present, newest * d.dr.minimum(3 - 2 * x, 1), 0)
+    return total, bright
+
+
 def _clods(d: Any, q: list[Any], word: Any, fraction: Any) -> tuple[Any, ...]:
     """Return the height of the highest stone at positions in cells."""
     words, f = _split(d, [x - 0.5 for x in q])
@@ -258,6 +319,9 @@ def _clods(d: Any, q: list[Any], word: Any, fraction: Any) -> tuple[Any, ...]:
         highest = d.dr.maximum(highest, d.dr.select(_unit(d, g, 20) < fraction, dome, 0))
     return (highest,)
 
+
+_PATTERNS = {"blocks": _blocks, "stones": _stones}
+_OUTPUTS = {_blocks: 3, _stones: 3, _impacts: 2}  # arrays that a kernel returns, if not one
 
 # --- fields on a mesh -------------------------------------------------------------------------------------------
 
@@ -366,10 +430,10 @@ class Octaves:
                 total += size * np.float32(angularity**0.5) * self.planes(wavelength, stream + k)
         return total
 
-    def blocks(self, width_m: float, height_m: float, stream: int) -> Float32:
+    def blocks(self, width_m: float, height_m: float, stream: int, kernel: str = "blocks") -> Float32:
         """Return the height of blocks of that width, each at its own level, with cracks between them, metres."""
         count = self._count(width_m)
-        level, other, gap = self._points.blocks(width_m, noise_key(self.seed, stream), count)
+        level, other, gap = self._points.blocks(width_m, noise_key(self.seed, stream), count, kernel)
         step = np.float32(height_m) * (other - level)
         # A step narrower than two facets, or steeper than 60°, would have an edge like a saw.
         ramp = np.maximum(0.06 * width_m, 1.8 * self.facet_m[:count]).astype(np.float32)
@@ -392,6 +456,13 @@ class Octaves:
             part = self._points.craters(width, noise_key(self.seed, 400 + k), self._count(shows), fraction)
             total += self._full(part, shows)
         return total
+
+    def impacts(self, width_m: float, stream: int, *law: float) -> tuple[Float32, Float32]:
+        """Return the height in metres and the brightness of craters on cells of one width, see `Points.impacts`."""
+        shows = width_m / 6  # half of the smallest bowls: with fewer facets they would be dots
+        both = self._points.impacts(width_m, noise_key(self.seed, stream), self._count(shows), *law)
+        height, bright = (self._full(part, shows) for part in both)
+        return height, bright
 
     def clods(self) -> Float32:
         """Return the height of half-buried stones of all sizes, metres."""

@@ -62,7 +62,8 @@ class Patch:
     face_is_flat
         bool[m]: the face is shaded with its own normal (small boulders); the others are smooth.
     dust
-        float32[n] in [0, 1] at each vertex: 1 where dust covers the ground, 0 on bare ground and boulders.
+        float32[n] in [0, 1] at each vertex: 1 where dust covers the ground, 0 on bare ground and boulders. With
+        `regolith`: how far the albedo departs from its mean, -1 to 1.5 in units of `albedo_contrast`.
     boulder_diameter_m, boulder_position_L_m
         float32[k] largest diameter, and float32[k, 3] centre of each boulder.
     boulder_smallest_m
@@ -138,7 +139,7 @@ def build_patch(body: Body, site: Site, spec: PatchSpec) -> Patch:
         faces=all_faces.astype(np.int32),
         face_is_boulder=np.arange(len(all_faces)) >= len(faces),
         face_is_flat=np.concatenate([np.zeros(len(faces), dtype=bool), stones.flat]),
-        dust=np.concatenate([ground.dust, np.zeros(len(stones.vertices_m), dtype=np.float32)]),
+        dust=np.concatenate([ground.dust, stones.shade]),
         boulder_diameter_m=stones.diameter_m.astype(np.float32),
         boulder_position_L_m=stones.position_m.astype(np.float32),
         boulder_smallest_m=stones.smallest_m.astype(np.float32),
@@ -152,7 +153,7 @@ def _with_scarps(body: Body, site: Site, model: Surface, limit: EdgeLimit, spec:
     """Return points, normals and faces of the model, refined as far as its scarps need, with `spec.scarps`."""
     edge_m = mean_edge_m(body.vertices_m, body.faces)
     finest_m = scarps.finest_facet_m(edge_m)
-    if not spec.scarps or limit.facet_m > scarps.COARSEST * edge_m:
+    if not spec.scarps or spec.regolith is not None or limit.facet_m > scarps.COARSEST * edge_m:
         return model
     if limit.facet_m < finest_m:
         # the same facets where they are coarser than this
@@ -167,7 +168,7 @@ def _with_scarps(body: Body, site: Site, model: Surface, limit: EdgeLimit, spec:
 # --- patches on disk --------------------------------------------------------------------------------------------
 
 PATCHES = ArrayFiles(kind="patch", content="terrain")
-_GROUND = ("fields", "noise", "relief", "fractured", "roughness", "scarps")
+_GROUND = ("fields", "noise", "relief", "fractured", "regolith", "roughness", "scarps")
 _SOURCES = (*_GROUND, "refine", "boulders", "patch", "gravity", "geometry")
 _ARRAYS = tuple(name for name in Patch.__dataclass_fields__ if name != "site")
 

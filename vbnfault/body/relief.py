@@ -16,12 +16,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.spatial import cKDTree
 
-from . import fractured
+from . import fractured, regolith
 from .body import Body
 from .fields import Octaves, smooth_max, smooth_step
 from .geometry import Float64, Int32, in_blocks, vertex_normals
-from .gravity import GRAVITATIONAL_CONSTANT
 from .noise import Float32
 from .roughness import Roughness
 from .scarps import form
@@ -56,6 +56,7 @@ _BARE_DEG = (30.0, 44.0)  # slopes below the first are loose ground, slopes abov
 _CLIFF_DEG = (38.0, 52.0)
 _GRAVITY_STEP_M = 250.0  # step of the differences that give the gradient of gravity
 _GRAVITY_REACH_M = 1500.0  # gravity is linear up to this distance from the site
+_GRAVITY_REACH = 0.33  # and, where it is sampled elsewhere, up to this distance in mean radii of the body
 
 _STEEPEST = 1.5  # tangent of the relief's largest slope against the model
 _SLUMPS, _SLUMP_STEPS = 4, 25
@@ -74,9 +75,9 @@ class Ground:
     height_m
         float64[n], along the model's normal.
     dust
-        float32[n] in [0, 1]; 1 is covered by dust.
+        float32[n] in [0, 1]; 1 is covered by dust. Of regolith: deviation of the albedo from its mean, -1 to 1.5.
     talus
-        float32[n] in [0, 1]; 1 is debris at the foot of a cliff.
+        float32[n] in [0, 1]; 1 is debris at the foot of a cliff. Of regolith: the density of boulders.
     """
 
     height_m: Float64
@@ -111,7 +112,8 @@ def add_relief(
         Wavelength of the longest octave; longer relief belongs to the model.
     """
     points, normals, faces = mesh
-    up, elevation = _vertical(body, site, points)
+    vertical = _vertical if spec.regolith is None else _vertical_anywhere
+    up, elevation = vertical(body, site, points)
     if spec.relief == 0:
         slope = _slope_deg(points, normals, faces, up)
         return Ground(
@@ -124,6 +126,8 @@ def add_relief(
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
     noise = Octaves(points[order] + site.position_T_m, facet_m[order], spec.seed, roughness, longest_m)
+    if spec.regolith is not None:
+        return _of_regolith(body, mesh, noise, (order, rank), (up, elevation), spec)
     scale: Float64 | float = spec.relief
     if spec.intermittency:
         slope = _slope_deg(points, normals, faces, up)[order]
@@ -170,6 +174,29 @@ def add_relief(
     return Ground(height_m=height_m, dust=dust, talus=talus)
 
 
+def _of_regolith(
+    body: Body,
+    mesh: tuple[Float64, Float64, Int32],
+    noise: Octaves,
+    sorting: tuple[NDArray[np.intp], NDArray[np.intp]],
+    vertical: tuple[Float64, Float64],
+    spec: PatchSpec,
+) -> Ground:
+    """Return the ground of asteroids and moons; `sorting`: order of the points in `noise`, and its inverse."""
+    points, normals, faces = mesh
+    (order, rank), (up, elevation) = sorting, vertical
+    assert spec.regolith is not None
+    low_m = float(np.quantile(body.places[2], spec.regolith.smooth)) if spec.regolith.smooth else 0.0
+    slope = _slope_deg(points, normals, faces, up)[order]
+    broad, height, fine, bright = regolith.surface(noise, elevation[order], slope, low_m, spec)
+    slope = _slope_deg(points + broad[rank].astype(np.float64)[:, None] * normals, normals, faces, up)
+    return Ground(
+        height_m=_slumped(points, faces, height[rank].astype(np.float64)),
+        dust=regolith.brightness(noise, slope[order], fine, bright, spec.regolith.rubble)[rank],
+        talus=regolith.stony(slope, fine[rank], spec.regolith.rubble),
+    )
+
+
 def _unevenness(body: Body, noise: Octaves, slope_deg: Float32, strength: float) -> Float64:
     """Return the factor on the relief at the points of `noise`, float64[n]: the ground is rough here, smooth there.
 
@@ -207,9 +234,31 @@ def _vertical(body: Body, site: Site, points: Float64) -> tuple[Float64, Float64
     at_site = float(body.gravity.evaluate(centre).potential_m2_s2[0])
     at_site += 0.5 * body.omega_rad_s**2 * float(centre[0] ** 2 + centre[1] ** 2)
     potential = at_site + np.einsum("ni,ni->n", near, gravity[0] + 0.5 * bend)
-    radius = (3 * body.volume_m3 / (4 * np.pi)) ** (1 / 3)
-    mean_gravity = 4 / 3 * np.pi * GRAVITATIONAL_CONSTANT * body.density_kg_m3 * radius
-    return up, -potential / mean_gravity
+    return up, -potential / body.mean_gravity_m_s2
+
+
+def _vertical_anywhere(body: Body, site: Site, points: Float64) -> tuple[Float64, Float64]:
+    """Return what `_vertical` does, far from the site from gravity at places all over the body.
+
+    Far is a third of the body's radius, or 1.5 km. Potentials are extrapolated from the three nearest places by the
+    gravity at each.
+    """
+    up, elevation = _vertical(body, site, points)
+    reach_m = min(_GRAVITY_REACH_M, _GRAVITY_REACH * (body.volume_m3 / (4 / 3 * np.pi)) ** (1 / 3))
+    far = np.einsum("ni,ni->n", points, points) > reach_m**2
+    if far.any():
+        place, gravity, level = body.places
+        distance, near = cKDTree(place).query(points[far] + site.position_T_m, k=3)
+        weight = 1 / np.maximum(distance, 1e-3) ** 2
+        weight /= weight.sum(axis=1)[:, None]
+        pull, height = np.zeros((len(near), 3)), np.zeros(len(near))
+        for k in range(3):
+            g, off = gravity[near[:, k]], points[far] + site.position_T_m - place[near[:, k]]
+            pull += weight[:, k, None] * g
+            height += weight[:, k] * (level[near[:, k]] - np.einsum("ni,ni->n", g, off) / body.mean_gravity_m_s2)
+        up[far] = -pull / np.maximum(np.sqrt(np.einsum("ni,ni->n", pull, pull)), 1e-30)[:, None]
+        elevation[far] = height
+    return up, elevation
 
 
 def _slope_deg(points: Float64, normals: Float64, faces: Int32, up: Float64) -> Float32:

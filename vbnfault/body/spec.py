@@ -40,12 +40,46 @@ class Fractured:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Regolith:
+    """Shape the ground as that of asteroids and moons: craters of all sizes, regolith, rubble, smooth low plains.
+
+    Attributes
+    ----------
+    crater_index
+        Exponent of the cumulative size law of craters, until they reach equilibrium.
+    crater_depth
+        Mean depth over diameter; fresh craters have 0.2.
+    largest_crater_m
+        Larger craters belong to the shape model.
+    equilibrium
+        Fraction of geometric saturation that the number of craters does not exceed.
+    ponds
+        Fraction of the craters that have level floors.
+    smooth
+        Fraction of the body, the lowest, that fine material levels where it is gentle.
+    rubble
+        Fraction of the places of small stones that hold one; 1: heaps without any ground between.
+    albedo_contrast
+        Scale by which the albedo of units of the ground and of boulders departs from its mean, over the mean.
+    """
+
+    crater_index: float = 2.0
+    crater_depth: float = 0.12
+    largest_crater_m: float = 300.0
+    equilibrium: float = 0.05
+    ponds: float = 0.0
+    smooth: float = 0.0
+    rubble: float = 0.0
+    albedo_contrast: float = 0.1
+
+
+@dataclass(frozen=True, kw_only=True)
 class PatchSpec:
     """Set how far and how finely a patch is refined, and what lies on it.
 
     The cumulative size law of boulders is N(>= D) = boulders_per_km2 · (D / 7 m)^-boulder_index over the whole
-    patch; the defaults are those of 67P (Pajola et al. 2015). Diameters of craters are 3 to 48 m, with a cumulative
-    index of 2.
+    patch; the defaults are those of 67P (Pajola et al. 2015). Without `regolith`, diameters of craters are
+    3 to 48 m, with a cumulative index of 2.
 
     Attributes
     ----------
@@ -76,8 +110,13 @@ class PatchSpec:
     angularity
         Part of the variance of the relief longer than 20 m that is of planes which meet in edges; the rest is of
         rounded waves.
+    largest_boulder_m
+        Diameter of the largest boulder.
     fractured
         Layered and jointed rock; None: rounded relief.
+    regolith
+        Ground of asteroids and moons in place of a comet's; `fractured`, `scarps` and `contour_scarps` do not count
+        then. None: a comet's.
     """
 
     seed: int
@@ -95,4 +134,6 @@ class PatchSpec:
     contour_scarps: float = 0.0
     intermittency: float = 0.0
     angularity: float = 0.0
+    largest_boulder_m: float = 45.0
     fractured: Fractured | None = None
+    regolith: Regolith | None = None

@@ -71,11 +71,15 @@ def replay_scene(scene: Scene) -> Scene:
 
 @dataclass(frozen=True, kw_only=True)
 class Display:
-    """Turn digital numbers into levels, as the frames show them: 255 times a power of the fraction of white."""
+    """Turn digital numbers into levels, as the frames show them: 255 times a power of the fraction of white.
+
+    `step` is the distance of levels that a frame tells apart: 1 with 8 bits, 1/257 with 16.
+    """
 
     bias_dn: float
     top_dn: float
     stretch: float
+    step: float = 1.0
 
     def developed(self, raw: NDArray[Any], factor: int, black_dn: float = 0.0) -> F32:
         """Return a raw image stretched, then reduced by a whole factor, in levels of 0 to 255, float32[y, x].
@@ -85,7 +89,8 @@ class Display:
         above = np.clip(raw.astype(np.float32) - np.float32(self.bias_dn - black_dn), 0, None)
         shown = np.minimum((above / np.float32(self.top_dn - self.bias_dn)) ** np.float32(self.stretch), 1)
         shown[raw >= self.top_dn] = 1
-        return np.floor(255 * _reduced(shown, factor) + np.float32(0.5))
+        step = np.float32(self.step)
+        return step * np.floor(255 / step * _reduced(shown, factor) + np.float32(0.5))
 
     def fraction(self, level: float) -> float:
         """Return the fraction of white that a level stands for."""
@@ -152,6 +157,7 @@ class Replay:
         Raises InputError for a frame whose size is no whole fraction of the camera's.
         """
         real, factor = look(frame), self.reduction(frame)
+        self.display = replace(self.display, step=step_of(frame))
         trajectory, search_px = self.trajectory, max(4, round(_SEARCH_PX * frame.shape[1] / 512))
         percentile, brightness = metered_on(real)
         settings: dict[str, Any] = {
@@ -210,6 +216,11 @@ class Replay:
                 "many or a whole fraction of them"
             )
         return factor
+
+
+def step_of(frame: F32) -> float:
+    """Return the distance of the levels that a frame of 0 to 255 tells apart: 1 with 8 bits, 1/257 with 16."""
+    return 1.0 if np.array_equal(frame, np.round(frame)) else 1 / 257
 
 
 def nearest_gain(real: Look, rendered: Look, gains: Sequence[float]) -> float:

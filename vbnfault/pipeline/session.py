@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..body import Body, Fractured, Patch, PatchSpec, Site, Sites, cached_patch, choose_sites
+from ..body import Body, Fractured, Patch, PatchSpec, Regolith, Site, Sites, cached_patch, choose_sites
+from ..body.geometry import mean_edge_m
 from ..body.refine import GROWTH_POWER
 from ..camera import Camera
 from ..core import tables
@@ -39,6 +40,8 @@ _STEEPEST_DETAIL = 0.12
 # Leaving out the smallest boulders is usual: the packaged scenes keep at least a quarter of those that are drawn. A
 # smaller fraction than this one means that the ground takes nearly all triangles.
 _FEWEST_KEPT = 0.05
+# A shape file holds craters and boulders that are wider than so many of its edges.
+_CRATER_EDGES, _BOULDER_EDGES = 2.0, 1.0
 
 
 def simulate(
@@ -273,6 +276,16 @@ class Session:
         near_m = []  # boulders lie as near as that
         if table.fractured is not None:
             keys["fractured"] = Fractured(**table.fractured.model_dump())
+            near_m.append(table.radius_m)
+        if table.regolith is not None:
+            regolith = Regolith(**table.regolith.model_dump())
+            if self.scene.body.shape != "ellipsoid":  # larger ones are in the shape
+                edge_m = mean_edge_m(self.body.vertices_m, self.body.faces)
+                regolith = replace(
+                    regolith, largest_crater_m=min(regolith.largest_crater_m, _CRATER_EDGES * edge_m)
+                )
+                keys["largest_boulder_m"] = min(table.largest_boulder_m, _BOULDER_EDGES * edge_m)
+            keys["regolith"] = regolith
             near_m.append(table.radius_m)
         if detail is not None:
             keys |= {"facet_m": detail.facet_m, "radius_m": detail.radius_m, "min_boulder_m": detail.boulder_m}

@@ -18,6 +18,8 @@ _MOST_ROWS = 10_000
 # Relief that is higher than this fraction of the shortest semi-axis would fold the surface over itself.
 _MOST_RELIEF = 0.1
 Wavelength = Annotated[float, Field(gt=0, le=1e5)]
+# Pits of comets lie on cells of four sizes alone, which are then full.
+_MOST_PITS = 600
 SemiAxis = Annotated[float, Field(gt=0, le=1e9)]
 
 
@@ -202,6 +204,37 @@ class FracturedTable(Table):
     )
 
 
+class RegolithTable(Table):
+    """Shape the ground as on asteroids and moons: craters of all sizes, regolith, rubble, smooth low plains."""
+
+    crater_index: float = Field(
+        2.0, ge=0.5, le=5, description="of the cumulative size law of craters, until they reach equilibrium"
+    )
+    crater_depth: float = Field(0.12, ge=0.02, le=0.18, description="mean depth over diameter; fresh craters: 0.2")
+    largest_crater_m: float = Field(
+        300.0,
+        ge=1,
+        le=1e5,
+        description="larger ones belong to the shape; a shape file holds those of two of its edges or more",
+    )
+    equilibrium: float = Field(
+        0.05, ge=0.001, le=0.2, description="most craters, over those of geometric saturation (Gault 1970)"
+    )
+    ponds: float = Field(0.0, ge=0, le=1, description="fraction of the craters that have level floors")
+    smooth: float = Field(
+        0.0,
+        ge=0,
+        le=0.9,
+        description="fraction of the body, the lowest, that fine material levels where it is gentle",
+    )
+    rubble: float = Field(
+        0.0, ge=0, le=1, description="fraction of the places of small stones that hold one; 1: heaps everywhere"
+    )
+    albedo_contrast: float = Field(
+        0.1, ge=0, le=0.6, description="scale by which the albedos of ground and boulders depart from the mean"
+    )
+
+
 class PatchTable(Table):
     """Set how far and how finely the terrain around a site is refined."""
 
@@ -240,13 +273,19 @@ class PatchTable(Table):
         le=1,
         description="part of the variance of relief over 20 m that is of planes which meet in edges; 0: none",
     )
-    craters_per_km2: float = Field(60.0, ge=0, le=600, description="of 10 m or more")
+    craters_per_km2: float = Field(60.0, ge=0, le=1e5, description="of 10 m or more; 600 at most without regolith")
     boulders: bool = Field(True, description="whether boulders lie on the ground")
     min_boulder_m: float = Field(0.25, ge=0.05, le=1000, description="diameter of the smallest near the site")
     boulder_index: float = Field(3.6, ge=0.5, le=6, description="of the cumulative size law; Pajola et al. 2015")
     boulders_per_km2: float = Field(98.0, ge=0, le=1e5, description="of 7 m or more; Pajola et al. 2015")
+    largest_boulder_m: float = Field(45.0, ge=0.1, le=1000, description="diameter of the largest")
     fractured: FracturedTable | None = Field(
         None, description="layered and jointed rock in place of rounded relief"
+    )
+    regolith: RegolithTable | None = Field(
+        None,
+        description="ground of asteroids and moons in place of a comet's; fractured, scarps, contour_scarps and "
+        "intermittency do not count then",
     )
 
     @model_validator(mode="after")
@@ -254,4 +293,8 @@ class PatchTable(Table):
         if self.preset not in ("", "none") and named_body(self.preset) is None:
             known = ", ".join(packaged_bodies())
             raise ValueError(f"preset = {self.preset!r}: must be 'none' or one of {known}")
+        if self.regolith is None and self.craters_per_km2 > _MOST_PITS:
+            raise ValueError(
+                f"craters_per_km2 = {self.craters_per_km2:g}: must be at most {_MOST_PITS} without [patch.regolith]"
+            )
         return self
