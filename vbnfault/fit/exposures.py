@@ -275,11 +275,16 @@ def variance_estimate(total: float, degrees: float, less: float, method: str) ->
 
 
 def covariance_estimate(pair: Sequence[NDArray[Any]], method: str = "") -> Estimate:
-    """Return the covariance of two samples of mean 0, at least 0."""
+    """Return the covariance of two samples of mean 0, at least 0.
+
+    A large one is distributed as a variance, whose degrees of freedom follow from its error (Satterthwaite 1946).
+    """
     a, b = (one.astype(np.float64) for one in pair)
     shared = float((a * b).mean())
     error = math.sqrt((float((a**2).mean() * (b**2).mean()) + shared**2) / len(a))
-    return Estimate.normal(shared, error, method)
+    if shared < 3 * error:
+        return Estimate.normal(shared, error, method)
+    return variance_estimate(shared, 2 * (shared / error) ** 2, 0.0, method)
 
 
 def count_estimate(count: int, of: float, method: str) -> Estimate:
@@ -334,6 +339,20 @@ def smoothed_pixels(image: F32) -> F32:
     out[:edge] = out[-edge:] = 0
     out[:, :edge] = out[:, -edge:] = 0
     return np.asarray(out, dtype=np.float32)
+
+
+def smooth_surface(image: F32) -> F32:
+    """Return the polynomial of fourth degree in x and y that fits an image best, float32[y, x]."""
+    y, x = (np.linspace(-1, 1, size) for size in image.shape)
+    step = max(min(image.shape) // 64, 1)
+    powers = [(i, j) for i in range(5) for j in range(5 - i)]
+
+    def terms(y: F64, x: F64) -> F64:
+        return np.array([np.outer(y**i, x**j) for i, j in powers])
+
+    design = terms(y[::step], x[::step]).reshape(len(powers), -1).T
+    best, *_ = np.linalg.lstsq(design, image[::step, ::step].ravel(), rcond=None)
+    return np.asarray(np.tensordot(best, terms(y, x), 1), dtype=np.float32)
 
 
 def planes_of(image: NDArray[Any], tile: tuple[int, int]) -> list[F32]:
@@ -422,7 +441,7 @@ def group_of(frames: Sequence[Exposure], good: Mask) -> Group:
         in_time=in_time,
         row_noise=row_noise,
         patterns=patterns,
-        map_dn=mean,
+        map_dn=np.where(quiet | ~good, mean, stack.min(axis=0)),
         halves_dn=halves,
         quiet=quiet,
     )

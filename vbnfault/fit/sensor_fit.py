@@ -45,6 +45,7 @@ from .exposures import (
     noise_before_rounding,
     ordinary_pixels,
     planes_of,
+    smooth_surface,
     smoothed_pixels,
     variance_estimate,
 )
@@ -54,7 +55,8 @@ from .ordinary import fit_ordinary, fit_point_spread, tile_of
 # flat is saturated where its variance is below this fraction of the line's.
 _LINEAR, _UNSATURATED, _BRIGHT, _COLLAPSED = 0.7, 0.9, 0.1, 0.3
 _SAME_LEVEL = 0.05  # largest relative difference of the means of two flats that make a pair
-_LAMP = 1e-3  # relative scatter of light that is called constant; the fit's own scatter decides where it is larger
+# Relative scatter of light that is called constant, and the least variance over its own: few levels may scatter less
+_LAMP, _STEADIEST = 1e-3, 0.25
 _CLIPPED = 1e-4  # fraction of pixels at the largest number
 _DEAD, _HOT = 0.5, 8.0  # response below which a pixel is dead; deviations above which one is hot
 _LEAST_DRIFT_DN = 0.02  # assumed where darks show none
@@ -77,6 +79,28 @@ _NEEDS = {
 }
 
 
+@dataclass(frozen=True, kw_only=True)
+class Bend:
+    """Hold the arc of the integral non-linearity, `inl_quadratic_dn`, over the range above black, and its error."""
+
+    quadratic_dn: float = 0.0
+    error_dn: float = 0.0
+    range_dn: float = 1.0
+
+    def straight(self, signal_dn: Any) -> F64:
+        """Return signals without the arc."""
+        out = given = np.asarray(signal_dn, dtype=np.float64)
+        for _ in range(4):
+            u = np.clip(out / self.range_dn, 0, 1)
+            out = given - 4 * self.quadratic_dn * u * (1 - u)
+        return out
+
+    def slope(self, straight_dn: Any) -> F64:
+        """Return by how much the observed signal rises with the straight one, at straight signals."""
+        u = np.clip(np.asarray(straight_dn, dtype=np.float64) / self.range_dn, 0, 1)
+        return 1 + 4 * self.quadratic_dn * (1 - 2 * u) / self.range_dn
+
+
 @dataclass(kw_only=True, eq=False)
 class SensorFit:
     """Collect what is fitted, by the keys of the sensor file.
@@ -91,6 +115,7 @@ class SensorFit:
     is_assumed: bool  # nobody gave the base
     estimates: dict[str, Estimate] = field(default_factory=dict)
     hot_rate_e_s: tuple[float, float] = (0.0, 0.0)
+    bend: Bend = Bend()
     transfer: Transfer | None = None
 
     def add(self, key: str, estimate: Estimate) -> None:
@@ -155,7 +180,8 @@ def fit_sensor(exposures: Sequence[Exposure], sensor: str | None = None, stretch
     flats = None
     if kinds["flat"]:
         black = fit.known("readout.bias_dn")
-        flats = Flats.of(kinds["flat"], black[0] if black else 0.0, fit.tile)
+        error_dn = math.hypot(darks.drift_dn, darks.bias_error_dn) if darks else _LEAST_DRIFT_DN
+        flats = Flats.of(kinds["flat"], black[0] if black else 0.0, error_dn, fit.tile)
     _fit_gain(fit, darks, flats)
     if kinds["frame"] and stretch is None and "readout.gain_dn_per_e" in fit.estimates:
         kinds["frame"] = []  # darks and flats tell more
@@ -223,6 +249,7 @@ class Point:
     signal_dn: float
     variance_dn2: float
     relative: float
+    signal_error_dn: float
     is_dark: bool = False
     plane: int = 0
     exposure_s: float | None = None
@@ -298,7 +325,8 @@ class Darks:
             rows = one.row_noise.value * math.sqrt(2 / (repeats * len(one.quiet)))
             rounding = (one.in_time - ROUNDING_DN2 - noise) / 2  # the correction is of one bias, which drifts
             yield Point(
-                signal_dn=mean - self.bias_dn,
+                signal_dn=self.rate_dn_s * one.exposure_s,
+                signal_error_dn=0.0 if math.isnan(self.rate_error_dn_s) else self.rate_error_dn_s * one.exposure_s,
                 variance_dn2=noise,
                 relative=math.hypot(error, rows, rounding) / noise,
                 is_dark=True,
@@ -312,7 +340,9 @@ def _fit_dark_patterns(fit: SensorFit, darks: Darks) -> None:
     gain = fit.known("readout.gain_dn_per_e")
     if gain is None:
         return
-    per_e, relative = gain[0], gain[1] / gain[0]
+    # near black the response has the slope of its arc
+    slope, range_dn = float(fit.bend.slope(0.0)), fit.bend.range_dn
+    per_e, relative = gain[0] * slope, math.hypot(gain[1] / gain[0], 4 * fit.bend.error_dn / range_dn)
     if len(darks.groups) > 1:
         _fit_dark_current(fit, darks, per_e, relative)
     one = next((one for one in darks.groups if one.row_noise), None)
@@ -341,7 +371,7 @@ def _fit_dark_current(fit: SensorFit, darks: Darks, per_e: float, relative: floa
     rises = rise_dn(first, last)
     if first.halves_dn and last.halves_dn and rate.low > 0:
         quiet = first.quiet & last.quiet
-        counted, rough = inside(quiet), [smoothed_pixels(np.where(quiet, one, 0)) for one in rises]
+        counted, rough = inside(quiet), [smoothed_pixels(one * quiet) for one in rises]
         shared = covariance_estimate([one[counted] for one in rough], f"covariance of {means}")
         span_dn = darks.rate_dn_s * (last.exposure_s - first.exposure_s)
         spread = shared.root().over(span_dn, darks.rate_error_dn_s / darks.rate_dn_s)
@@ -388,23 +418,31 @@ def _fit_hot_pixels(fit: SensorFit, darks: Darks, per_e: float, means: str) -> N
     count = len(rates) + beyond
     method = f"{count} of {hot.size} pixels are brighter by {least_e_s:.4g} e/s, {means}"
     fit.add("individual.hot_fraction", count_estimate(count, hot.size, method))
-    fit.hot_rate_e_s = least_e_s, most_e_s
+    fit.hot_rate_e_s = least_e_s, 10 * most_e_s
     if len(rates) < 3 or most_e_s < 1.01 * least_e_s:
         return
-    # likelihood of a power law from the least rate to the largest; of pixels that always saturate it is known that
-    # they exceed a rate, and the law then has no end
-    span = math.log(most_e_s / least_e_s)
     logs = float(np.log(rates_e_s[hot] / least_e_s).sum()) / (len(rates) - 1)
 
+    def beyond_end(power: float) -> float:
+        """Return (end / least rate)^-power of a law of which the largest of a sample has the rank 1 / (n + 1)."""
+        return 0.0 if beyond else max((count + 1) * (most_e_s / least_e_s) ** -power - 1, 1e-12 * count) / count
+
     def steepness(power: float) -> float:
-        return 1 / power - (0.0 if beyond else span / math.expm1(power * span)) - logs
+        """Return the derivative of the likelihood of a power law from the least rate to its end.
+
+        Pixels that saturate in all exposures exceed a rate, and the law then has no end.
+        """
+        end = beyond_end(power)
+        return (1 - (math.log(1 / end) * end / (1 - end) if end else 0.0)) / power - logs
 
     low, high = 0.02, 5.0
     power = high if steepness(high) > 0 else low if steepness(low) < 0 else optimize.brentq(steepness, low, high)
-    # Fisher's information of one pixel; the end of the law lowers it
-    information = 1 / power**2 - (0.0 if beyond else (span / (2 * math.sinh(power * span / 2))) ** 2)
+    end = beyond_end(power)
+    information = (1 - (math.log(1 / end) ** 2 * end / (1 - end) ** 2 if end else 0.0)) / power**2  # Fisher's
     error = 1 / math.sqrt(len(rates) * max(information, 1e-6))
     fit.add(_HOT_POWER, Estimate.normal(power, error, f"likelihood of rates, {method}", 0.01))
+    if end:
+        fit.hot_rate_e_s = least_e_s, min(least_e_s * end ** (-1 / power), 10 * most_e_s)
 
 
 # --- flats --------------------------------------------------------------------------------------------------------
@@ -420,8 +458,8 @@ class Flats:
     bias_dn: float
 
     @classmethod
-    def of(cls, frames: Sequence[Exposure], bias_dn: float, tile: tuple[int, int]) -> Flats:
-        """Return pairs of frames of one exposure whose means differ by at most 5 %."""
+    def of(cls, frames: Sequence[Exposure], bias_dn: float, error_dn: float, tile: tuple[int, int]) -> Flats:
+        """Return pairs of frames of one exposure whose means differ by at most 5 %; bias has an error."""
         means = {id(one): float(one.image.mean(dtype=np.float64)) for one in frames}
         ordered = sorted(frames, key=lambda one: (one.exposure_s or 0.0, means[id(one)]))
         top = max(float(one.image.max()) for one in frames)
@@ -435,11 +473,11 @@ class Flats:
             for plane, pair in enumerate(zip(planes_of(a.image, tile), planes_of(b.image, tile), strict=True)):
                 clipped.append(max(float((one >= top).mean()) for one in pair))
                 images.append((pair[0] - np.float32(bias_dn), pair[1] - np.float32(bias_dn)))
-                points.append(_pair_point(images[-1], plane, a.exposure_s))
+                points.append(_pair_point(images[-1], error_dn, plane, a.exposure_s))
         return cls(points=tuple(points), images=tuple(images), clipped=tuple(clipped), bias_dn=bias_dn)
 
     def below(self, fraction: float) -> list[int]:
-        """Return the indices of pairs below a fraction of saturation, or else of the largest signal, and unclipped."""
+        """Return the indices of unclipped pairs below a fraction of saturation, or else of the largest signal."""
         brightest = max(self.points, key=lambda one: one.signal_dn)
         return [
             k
@@ -448,7 +486,7 @@ class Flats:
         ]
 
 
-def _pair_point(pair: tuple[F32, F32], plane: int, exposure_s: float | None) -> Point:
+def _pair_point(pair: tuple[F32, F32], error_dn: float, plane: int, exposure_s: float | None) -> Point:
     """Return signal and variance in time of two flats; where they differ by 6 deviations, a particle hit."""
     a, b = (one.astype(np.float64) for one in pair)
     ratio = float(a.mean() / b.mean()) if min(a.mean(), b.mean()) > 0 else 1.0
@@ -459,49 +497,26 @@ def _pair_point(pair: tuple[F32, F32], plane: int, exposure_s: float | None) -> 
         signal_dn=float((a[quiet].mean() + b[quiet].mean()) / 2),
         variance_dn2=float(rest[quiet].var(ddof=1)) / (1 + ratio**2) - ROUNDING_DN2,
         relative=math.sqrt(2 / quiet.sum()),
+        signal_error_dn=error_dn,
         plane=plane,
         exposure_s=exposure_s,
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class Bend:
-    """Hold the arc of the integral non-linearity, `inl_quadratic_dn`, over the range above black, and its error."""
-
-    quadratic_dn: float = 0.0
-    error_dn: float = 0.0
-    range_dn: float = 1.0
-
-    def straight(self, signal_dn: Any) -> F64:
-        """Return signals without the arc."""
-        out = given = np.asarray(signal_dn, dtype=np.float64)
-        for _ in range(4):
-            u = np.clip(out / self.range_dn, 0, 1)
-            out = given - 4 * self.quadratic_dn * u * (1 - u)
-        return out
-
-    def slope(self, straight_dn: Any) -> F64:
-        """Return by how much the observed signal rises with the straight one, at straight signals."""
-        u = np.clip(np.asarray(straight_dn, dtype=np.float64) / self.range_dn, 0, 1)
-        return 1 + 4 * self.quadratic_dn * (1 - 2 * u) / self.range_dn
-
-
 def _fit_gain(fit: SensorFit, darks: Darks | None, flats: Flats | None) -> None:
     """Add gain and read noise by photon transfer of darks and flats, and what else flats tell."""
     bend, points = Bend(), list(darks.points()) if darks else []
-    drift_dn = darks.drift_dn if darks else _LEAST_DRIFT_DN
     black = fit.known("readout.bias_dn")
     if flats is not None:
         if black is not None:
-            error_dn = darks.bias_error_dn if darks else 0.0
-            bend = _fit_bend(fit, flats, fit.top_dn - black[0], math.hypot(drift_dn, error_dn))
+            bend = _fit_bend(fit, flats, fit.top_dn - black[0])
         points += [flats.points[k] for k in flats.below(_LINEAR)]
     if len({(one.is_dark, one.plane, round(one.signal_dn, 1)) for one in points}) < 2:
         return
-    best, covariance, transfer = photon_transfer(points, bend, drift_dn)
+    best, covariance, transfer = photon_transfer(points, bend)
     # what an error of the arc makes of the gain
     bent = replace(bend, quadratic_dn=bend.quadratic_dn + bend.error_dn)
-    by_bend = photon_transfer(points, bent, drift_dn)[0] - best if bend.error_dn else np.zeros(2)
+    by_bend = photon_transfer(points, bent)[0] - best if bend.error_dn else np.zeros(2)
     covariance = covariance + np.outer(by_bend, by_bend)
     offset, gain = (float(one) for one in best)
     errors = np.sqrt(np.diag(covariance))
@@ -510,7 +525,7 @@ def _fit_gain(fit: SensorFit, darks: Darks | None, flats: Flats | None) -> None:
     lit = sum(not one.is_dark for one in points)
     method = f"photon transfer of {lit} pairs of flats and {len(points) - lit} exposures of darks"
     fit.add("readout.gain_dn_per_e", Estimate.normal(gain, float(errors[1]), method))
-    fit.transfer = transfer
+    fit.transfer, fit.bend = transfer, bend
     if darks is not None and len(points) > lit:
         rows = next((one.row_noise.value for one in darks.groups if one.row_noise), 0.0)
         # of (offset - rows) / gain², whose errors are correlated
@@ -524,7 +539,7 @@ def _fit_gain(fit: SensorFit, darks: Darks | None, flats: Flats | None) -> None:
         _fit_flat_patterns(fit, flats, bend, darks)
 
 
-def _fit_bend(fit: SensorFit, flats: Flats, range_dn: float, drift_dn: float) -> Bend:
+def _fit_bend(fit: SensorFit, flats: Flats, range_dn: float) -> Bend:
     """Add the arc of the response, from flats of constant light at several exposures, and return it."""
     used = [flats.points[k] for k in flats.below(_UNSATURATED) if flats.points[k].exposure_s]
     planes, times = sorted({one.plane for one in used}), {one.exposure_s for one in used}
@@ -534,12 +549,12 @@ def _fit_bend(fit: SensorFit, flats: Flats, range_dn: float, drift_dn: float) ->
     u = np.clip(y / range_dn, 0, 1)
     light = np.array([[one.exposure_s if one.plane == plane else 0.0 for plane in planes] for one in used])
     design = np.column_stack([light, 4 * u * (1 - u)]).astype(np.float64)
-    errors = np.hypot(_LAMP * y, max(drift_dn, 0.05))
+    errors = np.hypot(_LAMP * y, [one.signal_error_dn for one in used])
     weighted = design / errors[:, None]
     best, *_ = np.linalg.lstsq(weighted, y / errors, rcond=None)
     # planes of one pair share the scatter of the lamp and the drift
     degrees = max(len(used) // len(planes) - 2, 1)
-    scatter = max(float((((y - design @ best) / errors) ** 2).sum()) / degrees, 1e-3)
+    scatter = max(float((((y - design @ best) / errors) ** 2).sum()) / degrees, _STEADIEST)
     error = math.sqrt(float(np.linalg.inv(weighted.T @ weighted)[-1, -1]) * scatter)
     error *= float(stats.t.ppf(0.975, degrees)) / TWO_SIDED
     method = f"signals of {len(used)} pairs of flats over their exposures"
@@ -547,16 +562,16 @@ def _fit_bend(fit: SensorFit, flats: Flats, range_dn: float, drift_dn: float) ->
     return Bend(quadratic_dn=float(best[-1]), error_dn=error, range_dn=range_dn)
 
 
-def photon_transfer(points: Sequence[Point], bend: Bend, drift_dn: float) -> tuple[F64, F64, Transfer]:
+def photon_transfer(points: Sequence[Point], bend: Bend) -> tuple[F64, F64, Transfer]:
     """Return offset in DN² and gain in DN/e of the line of variances over signals, their covariance, the points."""
     signal = bend.straight([one.signal_dn for one in points])
     variance = np.array([one.variance_dn2 for one in points]) / bend.slope(signal) ** 2
-    relative, lit = np.array([(one.relative, not one.is_dark) for one in points]).T
+    relative, signal_error = np.array([(one.relative, one.signal_error_dn) for one in points]).T
     design = np.column_stack([np.ones_like(signal), signal])
     expected, best = np.maximum(variance, LEAST_VARIANCE_DN2), np.zeros(2)
     for _ in range(4):
         # errors from the line and not from the variances, whose weights would favour low ones
-        errors = np.hypot(relative * expected, lit * drift_dn * best[1])
+        errors = np.hypot(relative * expected, signal_error * best[1])
         weighted = design / errors[:, None]
         best, *_ = np.linalg.lstsq(weighted, variance / errors, rcond=None)
         expected = np.maximum(design @ best, LEAST_VARIANCE_DN2)
@@ -595,6 +610,7 @@ def _fit_flat_patterns(fit: SensorFit, flats: Flats, bend: Bend, darks: Darks) -
     if not used or dark is None:
         return
     offsets = planes_of(dark.map_dn, fit.tile)  # their noise is in both flats of a pair
+    cool = [one > 0 for one in planes_of(darks.good, fit.tile)]  # light of hot pixels is no response
     last = {flats.points[k].plane: k for k in sorted(used, key=lambda k: flats.points[k].signal_dn)}
     shared, dead, pixels = [], 0, 0
     for k in used:
@@ -605,9 +621,8 @@ def _fit_flat_patterns(fit: SensorFit, flats: Flats, bend: Bend, darks: Darks) -
         response = mean / local
         if last[point.plane] == k:
             dead, pixels = dead + int((response < _DEAD).sum()), pixels + response.size
-        quiet = ordinary_pixels(response, 1e-4)
-        # the shade of the light is no property of the pixels
-        shade = cv2.blur(local, (31, 31))
+        quiet = ordinary_pixels(response, 1e-4) & cool[point.plane]
+        shade = smooth_surface(local)  # of the light, which is no property of the pixels
         rough = [smoothed_pixels(np.where(quiet, one, local) / shade)[inside(quiet)] for one in pair]
         straight = float(bend.straight(point.signal_dn))
         steeper = (
