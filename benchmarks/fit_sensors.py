@@ -228,10 +228,8 @@ def coverage(count: int, first: int, takes: str) -> str:
             widths[key].append((value.high - value.low) / abs(true[key] or math.nan))
             off[key].append((value.value - true[key]) / max((value.high - value.low) / 3.92, 1e-12))
             if not held[key][-1]:
-                print(
-                    f"  {seed}: {key}: true {true[key]:.5g}, fitted {value.value:.5g} ({value.low:.5g} to {value.high:.5g})",
-                    flush=True,
-                )
+                fitted = f"{value.value:.5g} ({value.low:.5g} to {value.high:.5g})"
+                print(f"  {seed}: {key}: true {true[key]:.5g}, fitted {fitted}", flush=True)
         for key in fit.missing:
             missing[key] += 1
     lines = [f"{'key':<34}{'held':>10}{'width / value':>15}{'median of errors':>18}{'not fitted':>12}"]

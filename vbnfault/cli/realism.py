@@ -99,16 +99,17 @@ def fit(
     ] = None,
     plot: Annotated[Path | None, local_path("PNG of the photon transfer to write.", unset="none")] = None,
 ) -> None:
-    """Fit a sensor to a camera's own frames: gain, noise, dark current, patterns, defects and response, each with an
-    interval of 95 %, and what could not be fitted and why. A folder may hold frames.csv with the frames' exposures.
+    """Fit a sensor to a camera's own frames: gain, noise, dark current, patterns, defects and response, each with
+    an interval of 95 %, and what could not be fitted. A folder may hold frames.csv with the frames' exposures.
     """
     from ..core.files.whole_files import write_whole, writing
     from ..fit.exposures import read_exposures
     from ..fit.sensor_fit import draw_transfer, fit_sensor, sensor_text
 
     check_written("", {"--out": out, "--plot": plot})
-    given = {"dark": darks, "flat": flats, "star": stars, "frame": frames}
-    exposures = read_exposures({kind: paths or [] for kind, paths in given.items()})
+    exposures = read_exposures(
+        {"dark": darks or [], "flat": flats or [], "star": stars or [], "frame": frames or []}
+    )
     result = fit_sensor(exposures, sensor, stretch)
     text = sensor_text(result)
     if plot is not None:

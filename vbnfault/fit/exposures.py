@@ -277,14 +277,17 @@ def variance_estimate(total: float, degrees: float, less: float, method: str) ->
 def covariance_estimate(pair: Sequence[NDArray[Any]], method: str = "") -> Estimate:
     """Return the covariance of two samples of mean 0, at least 0.
 
-    A large one is distributed as a variance, whose degrees of freedom follow from its error (Satterthwaite 1946).
+    The interval holds every covariance from which that of the samples is at most 1.96 of *its* standard errors away
+    (a score interval): √(((A + c)(B + c) + c²) / n), with the variances A and B of what the samples do not share.
     """
     a, b = (one.astype(np.float64) for one in pair)
-    shared = float((a * b).mean())
-    error = math.sqrt((float((a**2).mean() * (b**2).mean()) + shared**2) / len(a))
-    if shared < 3 * error:
-        return Estimate.normal(shared, error, method)
-    return variance_estimate(shared, 2 * (shared / error) ** 2, 0.0, method)
+    shared, count = float((a * b).mean()), len(a)
+    own = [max(float((one**2).mean()) - shared, 0.0) for one in (a, b)]
+    z2 = TWO_SIDED**2
+    square, linear = count - 2 * z2, 2 * count * shared + z2 * sum(own)
+    root = math.sqrt(max(linear**2 - 4 * square * (count * shared**2 - z2 * math.prod(own)), 0.0))
+    low, high = (max((linear + sign * root) / (2 * square), 0.0) for sign in (-1, 1))
+    return Estimate(value=max(shared, 0.0), low=low, high=high, method=method)
 
 
 def count_estimate(count: int, of: float, method: str) -> Estimate:

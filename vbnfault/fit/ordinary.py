@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy import optimize, stats
 from scipy.special import ndtr
 
-from ..detector.noise import poisson_quantile
+from ..detector.noise import draw_normals, poisson
 from ..detector.sensor import Sensor
 from .exposures import F32, F64, OUTLIER, TWO_SIDED, Estimate, Exposure, Mask, Transfer, planes_of
 from .replay import Display, reduced
@@ -144,7 +144,11 @@ class SkyModel:
     def __init__(self, show: Callable[[F32], F32], sensor: Sensor, black_dn: float, factor: int) -> None:
         self.show, self.black_dn, self.top_dn = show, black_dn, sensor.readout.top_dn
         rng, size = np.random.default_rng(0), (_SIMULATED_PX * factor,) * 2
-        self.noise = rng.standard_normal((2, 2, *size), dtype=np.float32)  # of two frames: shot, read
+        self.noise = [
+            (draw_normals(size, rng), draw_normals(size, rng).values()) for _ in range(2)
+        ]  # of two frames
+        # levels of real sky have all fractions of a step
+        self.ramp = np.tile(np.linspace(0.85, 1.15, size[1], dtype=np.float32), (size[0], 1))
         freedom = sensor.individual.dsnu_freedom
         self.fixed = rng.standard_normal(size, dtype=np.float32)
         if freedom is not None:
@@ -156,7 +160,7 @@ class SkyModel:
         for signal_dn in signals_dn:
             pair = []
             for shot, read in self.noise:
-                electrons = poisson_quantile(np.full(shot.shape, signal_dn / per_e, np.float32), shot)
+                electrons = poisson(self.ramp * np.float32(signal_dn / per_e), shot)
                 electrons += read * np.float32(read_e) + self.fixed * np.float32(dsnu_e)
                 raw = np.clip(np.rint(electrons * np.float32(per_e) + np.float32(self.black_dn)), 0, self.top_dn)
                 pair.append(Blocks.of(self.show(raw)))
@@ -207,8 +211,9 @@ def fit_ordinary(
     show = (lambda raw: raw) if stretch is None else (lambda raw: display.developed(raw, factor))
     planes = [sky_noise(one, 0.0 if stretch else black_dn) for one in blocks]
     model = SkyModel(show, sensor, black_dn + offset_dn * (stretch is not None), factor)
-    most = top if stretch is None else display.top_dn
-    signals = np.concatenate([[0.0], np.geomspace(0.3, max(most - black_dn, 10.0), 15)])
+    highest = max((float(one.level.max()) for one in planes if len(one.level)), default=0.0)
+    most_dn = highest - black_dn if stretch is None else display.fraction(highest) * (display.top_dn - black_dn)
+    signals = np.concatenate([[0.0], np.geomspace(0.3, max(1.5 * most_dn, 3.0), 12)])
     found, transfer = _fitted_noise(planes, model, signals, len(frames))
     out |= found
     if transfer is not None and len(planes) == 1:

@@ -55,7 +55,7 @@ from .ordinary import fit_ordinary, fit_point_spread, tile_of
 # flat is saturated where its variance is below this fraction of the line's.
 _LINEAR, _UNSATURATED, _BRIGHT, _COLLAPSED = 0.7, 0.9, 0.1, 0.3
 _SAME_LEVEL = 0.05  # largest relative difference of the means of two flats that make a pair
-# Relative scatter of light that is called constant, and the least variance over its own: few levels may scatter less
+# Relative scatter of light that is called constant, and the least variance over it: a few levels may scatter less
 _LAMP, _STEADIEST = 1e-3, 0.25
 _CLIPPED = 1e-4  # fraction of pixels at the largest number
 _DEAD, _HOT = 0.5, 8.0  # response below which a pixel is dead; deviations above which one is hot
@@ -623,7 +623,8 @@ def _fit_flat_patterns(fit: SensorFit, flats: Flats, bend: Bend, darks: Darks) -
             dead, pixels = dead + int((response < _DEAD).sum()), pixels + response.size
         quiet = ordinary_pixels(response, 1e-4) & cool[point.plane]
         shade = smooth_surface(local)  # of the light, which is no property of the pixels
-        rough = [smoothed_pixels(np.where(quiet, one, local) / shade)[inside(quiet)] for one in pair]
+        filled = [np.where(quiet, one, local).astype(np.float32) for one in pair]
+        rough = [smoothed_pixels(one / shade)[inside(quiet)] for one in filled]
         straight = float(bend.straight(point.signal_dn))
         steeper = (
             straight * float(bend.slope(straight)) / point.signal_dn
