@@ -6,17 +6,18 @@
 
 Each sensor is drawn from wide ranges. It takes six darks of three exposures, twelve flats of six levels up to
 saturation under a lamp that varies by 0.1 %, and two star fields, with hits of particles; or, with `--ordinary`, 20
-frames of a lit body with a glow. With `--frames`, real ones are fitted, and signals as theirs are shown by the fitted
-and by the given sensor, to compare noise and columns.
+frames of a lit body with a glow. With `--frames`, real ones are fitted, and signals as theirs are shown by the
+fitted and by the given sensor, to compare noise and columns.
 """
 
 from __future__ import annotations
 
 import argparse
 import math
+import tempfile
 from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -217,10 +218,10 @@ def coverage(count: int, first: int, takes: str) -> str:
     for seed in range(first, first + count):
         one = hidden(seed)
         frames = list(ordinary(one) if takes == "ordinary" else calibration(one))
-        path = Path(f"/tmp/hidden_{seed}.toml")
-        path.write_text(one.base())
-        fit = fit_sensor(frames, str(path))
-        path.unlink()
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "base.toml"
+            path.write_text(one.base())
+            fit = fit_sensor(frames, str(path))
         parse_sensor(parse_toml(sensor_text(fit), "fitted"), source="fitted")
         true = truth(one, fit)
         for key, value in fit.estimates.items():
@@ -241,13 +242,59 @@ def coverage(count: int, first: int, takes: str) -> str:
     return "\n".join(lines)
 
 
+def compared(folder: Path, name: str, stretch: float) -> str:
+    """Return how noisy every second frame is as a given and as the fitted sensor show its smoothed signal."""
+    frames = read_exposures({"frame": [folder]})
+    fit = fit_sensor(frames, name, stretch)
+    fitted = parse_sensor(parse_toml(sensor_text(fit), "fitted"), source="fitted")
+    lines = [f"{key:<34}{one.value:>10.4g}  {one.low:.4g} to {one.high:.4g}" for key, one in fit.estimates.items()]
+    ratios = {"fitted": defaultdict(list), name: defaultdict(list)}
+    for which, sensor in (("fitted", fitted), (name, load_sensor(name))):
+        device, readout = Device(sensor, 1), sensor.readout
+        display = Display(bias_dn=readout.bias_dn, top_dn=readout.top_dn, stretch=stretch)
+        dark_dn = device.raw(np.zeros(device.shape, np.float32), 0.43).mean(axis=1, keepdims=True) - readout.bias_dn
+        for number, frame in enumerate(frames[::2]):
+            real = look(frame.image)
+            if real.clipped:
+                continue
+            smooth = ndimage.gaussian_filter(np.asarray(frame.image, np.float32), 2.0)
+            factor = device.shape[0] // smooth.shape[0]
+            signal = (smooth / 255) ** (1 / stretch) * (display.top_dn - display.bias_dn)
+            light = np.maximum(np.kron(signal, np.ones((factor, factor))) - dark_dn, 0)
+            rngs = [np.random.default_rng([number, k]) for k in range(3)]
+            noise = MosaicNoise.draw(device.shape, *rngs)
+            raw = device.raw((light / readout.system_gain_dn_per_e).astype(np.float32), 0.43, noise)
+            shown = look(display.developed(raw, factor))
+            values = [sky_figures(one, real.lit) | body_figures(one, np.array([1.0, 0.0])) for one in (real, shown)]
+            for key in ("noise", "column", "noise_lit"):
+                ratios[which][key].append(values[1][key] / values[0][key])
+            away = ndimage.distance_transform_edt(~real.lit)
+            for low, high in ((4, 6), (6, 8), (8, 10), (10, 14)):
+                part = (away > 5) & (smooth >= low) & (smooth < high)
+                if part.sum() > 2000:
+                    rough = [one.image - ndimage.median_filter(one.image, 5) for one in (real, shown)]
+                    spread = [np.std(one[part & (np.abs(one) < 4)]) for one in rough]
+                    ratios[which][f"noise at {low} to {high}"].append(spread[1] / spread[0])
+    lines.append(f"{'simulated over real, median':<34}{'fitted':>10}{name:>18}")
+    for key in ratios["fitted"]:
+        medians = [f"{np.nanmedian(ratios[which][key]):.3f}" for which in ("fitted", name)]
+        lines.append(f"{key:<34}{medians[0]:>10}{medians[1]:>18}")
+    return "\n".join(lines)
+
+
 def main() -> None:
     """Print the table, or the comparison of real frames."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sensors", type=int, default=50)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--ordinary", action="store_true")
+    parser.add_argument("--frames", type=Path)
+    parser.add_argument("--sensor", default="rosetta_navcam")
+    parser.add_argument("--stretch", type=float, default=0.5)
     options = parser.parse_args()
+    if options.frames is not None:
+        print(compared(options.frames, options.sensor, options.stretch))
+        return
     print(coverage(options.sensors, options.first, "ordinary" if options.ordinary else "calibration"))
 
 

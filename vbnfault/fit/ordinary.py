@@ -25,12 +25,14 @@ from .replay import Display, reduced
 
 # Immerkær 1996, doi 10.1006/cviu.1996.0060: levels that change linearly, and those of rows and columns, cancel
 _LAPLACE = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], dtype=np.float32) / 6
-_BLOCK_PX, _LEVELS, _FEWEST_BLOCKS, _SIMULATED_PX = 16, 12, 8, 256
+_BLOCK_PX, _LEVELS, _FEWEST_BLOCKS, _SIMULATED_PX = 16, 8, 8, 256
 _QUANTILES = 0.25, 0.5  # of the variances of blocks of one level: the lower one is free of texture for longer
 # of a block's variance: the kernel makes neighbours correlate, Σρ² = (70/36)²
 _BLOCK_DEGREES = (_BLOCK_PX**2 - 1) / (70 / 36) ** 2
+_TEXTURED = 0.2  # relative difference of these quantiles above which blocks show more than noise
 _SMOOTH = 2.0  # blocks of up to so many times the variance of their level count as smooth
 _MODEL_ERROR = 0.01  # of a simulated variance: that of a quantile of its 256 blocks
+_PROCESSING_ERROR = 0.25  # of a simulated shared pattern: processed frames may share more than offsets of pixels
 _COLUMN_PX, _FEWEST_ROWS, _FEWEST_COLUMNS = 15, 32, 32
 _STAR_PX, _APART_PX, _FEWEST_STARS, _MOST_STARS, _STAR_SIGMAS = 5, 8, 5, 100, 12.0
 _CORE_PX = (0.3, 4.0)
@@ -89,12 +91,13 @@ class SkyNoise:
 def sky_noise(blocks: Sequence[Blocks], black: float) -> SkyNoise:
     """Return noise and shared pattern of frames of different scenes."""
     heights = [np.where(np.isfinite(b.variance), np.sqrt(np.maximum(b.level - black, 0)), np.nan) for b in blocks]
-    low, high = (float(one) for one in np.nanpercentile(heights, (0.2, 99.5)))
-    edges = np.linspace(low, high, _LEVELS + 1)
+    # where most blocks are, and over all levels
+    dense = np.nanpercentile(heights, (0.2, 3, 10, 25, 50, 75, 90, 97, 99.5))
+    edges = np.unique(np.append(dense, np.linspace(float(dense[0]), float(dense[-1]), _LEVELS + 1)))
     place = [np.searchsorted(edges, one) - 1 for one in heights]  # NaN lies beyond the last
     smooth = [np.zeros(len(one), dtype=bool) for one in place]
     rows = []
-    for k in range(_LEVELS):
+    for k in range(len(edges) - 1):
         values = []
         for one, where, calm in zip(blocks, place, smooth, strict=True):
             chosen = np.flatnonzero(where == k)
@@ -105,13 +108,17 @@ def sky_noise(blocks: Sequence[Blocks], black: float) -> SkyNoise:
             continue
         level, low, high = np.median(values, axis=0)
         # texture raises the higher quantile first
-        error = math.hypot(_error_of_median([v[1] for v in values]), max(high - low, 0.0) / 2, _MODEL_ERROR * low)
+        texture = max(float(high - low), 0.0)
+        error = math.hypot(_error_of_median([v[1] for v in values]), texture, _MODEL_ERROR * low)
         products = []
         for a, b in _pairs(len(blocks)):
             both = smooth[a] & smooth[b] & (place[a] == k) & (place[b] == k)
             if both.sum() >= _FEWEST_BLOCKS:
                 products.append(float((blocks[a].rough[both] * blocks[b].rough[both]).mean()))
         shared = (float(np.median(products)), _error_of_median(products)) if len(products) > 2 else (math.nan,) * 2
+        if texture > _TEXTURED * low:  # frames may share the scene
+            shared = math.nan, math.nan
+            smooth = [calm & (where != k) for calm, where in zip(smooth, place, strict=True)]
         rows.append((level, low, error, *shared))
     columns = np.array(rows, dtype=np.float64).reshape(-1, 5).T
     return SkyNoise(**dict(zip(SkyNoise.__annotations__, columns, strict=False)), smooth=smooth)
@@ -126,6 +133,10 @@ def _error_of_median(values: Sequence[float]) -> float:
     """Return the standard error of a median, from the deviations of the values."""
     spread = 1.4826 * float(np.median(np.abs(np.array(values) - np.median(values))))
     return 1.2533 * max(spread, 1e-9) / math.sqrt(len(values))
+
+
+def _as_it_is(raw: F32) -> F32:
+    return raw
 
 
 class SkyModel:
@@ -143,6 +154,7 @@ class SkyModel:
 
     def __init__(self, show: Callable[[F32], F32], sensor: Sensor, black_dn: float, factor: int) -> None:
         self.show, self.black_dn, self.top_dn = show, black_dn, sensor.readout.top_dn
+        self.is_raw = show is _as_it_is
         rng, size = np.random.default_rng(0), (_SIMULATED_PX * factor,) * 2
         self.noise = [
             (draw_normals(size, rng), draw_normals(size, rng).values()) for _ in range(2)
@@ -208,7 +220,7 @@ def fit_ordinary(
         out["readout.bias_dn"] = Estimate.normal(black_dn, spread, method)
     offset_dn = float(np.mean(sensor.readout.node_offsets_dn or (0.0,)))
     display = Display(bias_dn=sensor.readout.bias_dn, top_dn=sensor.readout.top_dn, stretch=stretch or 1.0)
-    show = (lambda raw: raw) if stretch is None else (lambda raw: display.developed(raw, factor))
+    show = _as_it_is if stretch is None else (lambda raw: display.developed(raw, factor))
     planes = [sky_noise(one, 0.0 if stretch else black_dn) for one in blocks]
     model = SkyModel(show, sensor, black_dn + offset_dn * (stretch is not None), factor)
     highest = max((float(one.level.max()) for one in planes if len(one.level)), default=0.0)
@@ -237,6 +249,7 @@ def _fitted_noise(
     if len(level) < 4:
         return {}, None
     paired = np.isfinite(shared)
+    shared_error = np.hypot(shared_error, (_MODEL_ERROR if model.is_raw else _PROCESSING_ERROR) * shared)
 
     def expected(logs: F64) -> tuple[F64, F64]:
         x, noise, fixed = model(signals_dn, *np.exp(logs))
@@ -247,7 +260,7 @@ def _fitted_noise(
         return np.concatenate([(noise - variance) / error, ((fixed - shared) / shared_error)[paired]])
 
     start = np.log([model.top_dn / 5e4, 5.0, 3.0])
-    best = optimize.least_squares(off, start, diff_step=0.02, x_scale=0.3, loss="soft_l1", max_nfev=30)
+    best = optimize.least_squares(off, start, diff_step=0.05, x_scale=0.3, loss="soft_l1", ftol=1e-3, xtol=1e-3)
     degrees = max(len(best.fun) - 3, 1)
     scatter = max(2 * best.cost / degrees, 1.0)
     errors = np.sqrt(np.diag(np.linalg.pinv(best.jac.T @ best.jac)) * scatter)
@@ -280,9 +293,9 @@ def _column_pattern(
         part = np.where(np.abs(part - cv2.medianBlur(part, 5)) < OUTLIER * 2, part, cv2.medianBlur(part, 5))
         sums = [cv2.blur(one, (_COLUMN_PX, 1)) for one in (part * mask, mask)]
         level = sums[0] / np.maximum(sums[1], 1e-6)
-        rough = (part - level) * mask / np.maximum(rise(level), 1e-6)
-        count = mask.sum(axis=0)
-        profiles.append(np.where(count >= _FEWEST_ROWS, rough.sum(axis=0) / np.maximum(count, 1), np.nan))
+        weight = rise(level) * mask  # levels that rise steeply tell most
+        count, sums = mask.sum(axis=0), [(one * weight).sum(axis=0) for one in (part - level, weight)]
+        profiles.append(np.where(count >= _FEWEST_ROWS, sums[0] / np.maximum(sums[1], 1e-9), np.nan))
     products = []
     for a, b in _pairs(len(profiles)):
         both = np.isfinite(profiles[a] + profiles[b])
