@@ -140,8 +140,10 @@ def test_the_intervals_of_a_fit_hold_the_hidden_values(taken: Any) -> None:
 
 
 def test_the_gain_is_that_of_a_characterisation() -> None:
-    """`characterise`, which agrees with the package emva1288 (test_detector_oracles.py), takes its own flats; both know
-    the gain to some 0.4 %."""
+    """`characterise`, which agrees with the package emva1288 (test_detector_oracles.py), takes its own flats.
+
+    Both know the gain to some 0.4 %.
+    """
     made = load_sensor("cmv4000")
     device = Device(made, 1, shape=(256, 256))
     frames = []

@@ -230,9 +230,15 @@ def fit_ordinary(
     out |= found
     if transfer is not None and len(planes) == 1:
         gain = out["readout.gain_dn_per_e"]
-        level, _, _ = model(signals, gain.value, out["readout.read_noise_e_rms"].value, 0.0)
-        rise = np.gradient(level, signals[: len(level)])
-        pattern = _column_pattern(images, planes[0].smooth, lambda x: np.interp(x, level, rise), factor)
+        power, range_dn = stretch or 1.0, display.top_dn - display.bias_dn
+
+        def rise(level: Any) -> Any:
+            """Return by how much a level of the frames, (signal / range)^power, rises with the signal in DN."""
+            if stretch is None:
+                return np.ones_like(level)
+            return 255 * power / range_dn * (np.maximum(level, 1) / 255) ** (1 - 1 / power)
+
+        pattern = _column_pattern(images, planes[0].smooth, rise, factor)
         if pattern is not None:
             out["readout.column_pattern_e_rms"] = pattern.root().over(gain.value, gain.error / gain.value)
     return out, transfer
@@ -294,7 +300,7 @@ def _column_pattern(
         sums = [cv2.blur(one, (_COLUMN_PX, 1)) for one in (part * mask, mask)]
         level = sums[0] / np.maximum(sums[1], 1e-6)
         weight = rise(level) * mask  # levels that rise steeply tell most
-        count, sums = mask.sum(axis=0), [(one * weight).sum(axis=0) for one in (part - level, weight)]
+        count, sums = mask.sum(axis=0), [(one * weight).sum(axis=0) for one in (part - level, rise(level))]
         profiles.append(np.where(count >= _FEWEST_ROWS, sums[0] / np.maximum(sums[1], 1e-9), np.nan))
     products = []
     for a, b in _pairs(len(profiles)):

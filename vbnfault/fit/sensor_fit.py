@@ -716,7 +716,7 @@ def draw_transfer(fit: SensorFit, path: Path) -> None:
         axes[0].plot(level, fitted, color=VERMILLION, lw=1, label="fit")
         axes[0].set(title="variance in time", xlabel="level / DN", ylabel="variance / DN²")
         axes[0].set(xscale="symlog", yscale="log")
-        axes[0].legend()
+        axes[0].legend(loc="upper left")
         axes[1].plot(level, (variance - fitted) / error, "o", ms=3, color=BLUE)
         axes[1].axhspan(-TWO_SIDED, TWO_SIDED, color=BLUE, alpha=0.12, lw=0)
         axes[1].set(title="residual over its error", xlabel="level / DN", xscale="symlog")
