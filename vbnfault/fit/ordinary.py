@@ -125,8 +125,9 @@ def sky_noise(blocks: Sequence[Blocks], black: float) -> SkyNoise:
 
 
 def _pairs(count: int) -> Iterator[tuple[int, int]]:
-    """Give pairs of frames: each with the next one and the one after it."""
-    return ((a, b) for a in range(count) for b in (a + 1, a + 2) if b < count)
+    """Give pairs of frames that lie a third and a half of their number apart, so that they share no scene."""
+    steps = {max(count // part, 1) for part in (2, 3)}
+    return ((a, a + step) for step in sorted(steps) for a in range(count - step))
 
 
 def _error_of_median(values: Sequence[float]) -> float:
@@ -301,7 +302,10 @@ def _column_pattern(
         level = sums[0] / np.maximum(sums[1], 1e-6)
         weight = rise(level) * mask  # levels that rise steeply tell most
         count, sums = mask.sum(axis=0), [(one * weight).sum(axis=0) for one in (part - level, rise(level))]
-        profiles.append(np.where(count >= _FEWEST_ROWS, sums[0] / np.maximum(sums[1], 1e-9), np.nan))
+        profile = np.where(count >= _FEWEST_ROWS, sums[0] / np.maximum(sums[1], 1e-9), np.nan)
+        # few columns that are lost or lie beside the body must not decide
+        limit = 3 * 1.4826 * float(np.nanmedian(np.abs(profile))) if np.isfinite(profile).any() else 0.0
+        profiles.append(np.clip(profile, -limit, limit))
     products = []
     for a, b in _pairs(len(profiles)):
         both = np.isfinite(profiles[a] + profiles[b])
