@@ -1,4 +1,4 @@
-"""Define the commands that compare a camera's own frames with a scene."""
+"""Define the commands that compare a camera's own frames with a scene, and fit a sensor to them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,17 @@ from typing import Annotated, Any, Literal
 import typer
 
 from .app import app
-from .options import MOST_PROCESSES, SceneOption, local_path, number, overrides, progress_bar, replaced, whole
+from .options import (
+    MOST_PROCESSES,
+    SceneOption,
+    check_written,
+    local_path,
+    number,
+    overrides,
+    progress_bar,
+    replaced,
+    whole,
+)
 
 _PANEL = "Your camera"
 
@@ -60,3 +70,54 @@ def passport(
     for text in result["conclusions"]["may_not"]:
         typer.echo(f"may not: {text}")
     typer.echo(f"page: {out / PAGE}")
+
+
+@app.command(rich_help_panel=_PANEL)
+def fit(
+    out: Annotated[Path, local_path("Sensor file to write.")],
+    frames: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            help="Folders or files of ordinary frames, such as of sky, ground and limbs.", metavar="FRAMES"
+        ),
+    ] = None,
+    darks: Annotated[list[Path] | None, typer.Option(help="Folder or file of darks; may be repeated.")] = None,
+    flats: Annotated[list[Path] | None, typer.Option(help="Folder or file of flats; may be repeated.")] = None,
+    stars: Annotated[
+        list[Path] | None, typer.Option(help="Folder or file of star fields; may be repeated.")
+    ] = None,
+    sensor: Annotated[
+        str | None,
+        typer.Option(
+            help="Sensor file, or name of a packaged detector, that says what frames do not: filters, pitch, bits.",
+            show_default="monochrome, assumed",
+        ),
+    ] = None,
+    stretch: Annotated[
+        float | None,
+        number(0.3, 1, "Frames are 8 bit images that show this power of the signal, maybe reduced.", unset="raw"),
+    ] = None,
+    plot: Annotated[Path | None, local_path("PNG of the photon transfer to write.", unset="none")] = None,
+) -> None:
+    """Fit a sensor to a camera's own frames: gain, noise, dark current, patterns, defects and response, each with
+    an interval of 95 %, and what could not be fitted. A folder may hold frames.csv with the frames' exposures.
+    """
+    from ..core.files.whole_files import write_whole, writing
+    from ..fit.exposures import read_exposures
+    from ..fit.sensor_fit import draw_transfer, fit_sensor, sensor_text
+
+    check_written("", {"--out": out, "--plot": plot})
+    exposures = read_exposures(
+        {"dark": darks or [], "flat": flats or [], "star": stars or [], "frame": frames or []}
+    )
+    result = fit_sensor(exposures, sensor, stretch)
+    text = sensor_text(result)
+    if plot is not None:
+        draw_transfer(result, plot)
+    with writing(out):
+        write_whole(out, text)
+    for key, one in result.estimates.items():
+        typer.echo(f"{key:<36}{one.value:>11.5g}   {one.low:.4g} to {one.high:.4g}   {one.method}")
+    for key, why in result.missing.items():
+        typer.echo(f"not fitted: {key} {why}")
+    typer.echo(f"sensor file: {out}")

@@ -90,7 +90,7 @@ class Display:
         shown = np.minimum((above / np.float32(self.top_dn - self.bias_dn)) ** np.float32(self.stretch), 1)
         shown[raw >= self.top_dn] = 1
         step = np.float32(self.step)
-        return step * np.floor(255 / step * _reduced(shown, factor) + np.float32(0.5))
+        return step * np.floor(255 / step * reduced(shown, factor) + np.float32(0.5))
 
     def fraction(self, level: float) -> float:
         """Return the fraction of white that a level stands for."""
@@ -280,7 +280,7 @@ def with_pose(trajectory: Trajectory, row: int, position_T_m: Any, camera_from_T
     return replace(trajectory, camera_position_T_m=positions, camera_from_T=turns)
 
 
-def _reduced(image: F32, factor: int) -> F32:
+def reduced(image: F32, factor: int) -> F32:
     """Return the means of squares of pixels, with the light of neighbours that published frames show."""
     if factor == 1:
         return image
