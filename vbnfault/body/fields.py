@@ -67,17 +67,13 @@ class Points:
         (value,) = self._run(_planes, width_m, key, count)
         return value
 
-    def blocks(
-        self, width_m: float, key: int, count: int, kernel: str = "blocks"
-    ) -> tuple[Float32, Float32, Float32]:
+    def blocks(self, width_m: float, key: int, count: int) -> tuple[Float32, Float32, Float32]:
         """Evaluate a pattern of cells about one width across; each cell has its own random level and tilt.
-
-        With the kernel "stones", no cell is cut.
 
         Returns three arrays, float32[count]: the value of the cell's tilted plane (standard deviation about 0.4),
         that of the second nearest cell, and the distance to the border between the two in metres.
         """
-        level, other, gap = self._run(_PATTERNS[kernel], width_m, key, count)
+        level, other, gap = self._run(_blocks, width_m, key, count)
         return level, other, np.float32(width_m) * gap
 
     def craters(self, width_m: float, key: int, count: int, fraction: float) -> Float32:
@@ -207,22 +203,9 @@ def _planes(d: Any, q: list[Any], word: Any) -> tuple[Any, ...]:
     return (total,)
 
 
-def _stones(d: Any, q: list[Any], word: Any) -> tuple[Any, ...]:
-    """Return what `_blocks` does, with the nearest cells found everywhere."""
-    return _cells(d, *_nearest_cells(d, q), word)
-
-
 def _blocks(d: Any, q: list[Any], word: Any) -> tuple[Any, ...]:
-    """Return the planes of the two nearest cells and the distance to their border, in cells.
-
-    At half of the points one of the two is missed, which cuts blocks along planes. The ground of comets was chosen
-    with these cuts, so they stay.
-    """
-    return _cells(d, *_split(d, [x - 0.5 for x in q]), word)
-
-
-def _cells(d: Any, words: list[list[Any]], f: list[Any], word: Any) -> tuple[Any, ...]:
-    """Return the planes of the two nearest of eight cells and the distance to their border, in cells."""
+    """Return the planes of the two nearest cells and the distance to their border, in cells."""
+    words, f = _nearest_cells(d, q)
     nearest, second = d.Float(9), d.Float(9)
     level, other = d.Float(0), d.Float(0)
     near = [d.Float(0)] * 3
@@ -254,7 +237,7 @@ def _cells(d: Any, words: list[list[Any]], f: list[Any], word: Any) -> tuple[Any
 
 def _craters(d: Any, q: list[Any], word: Any, fraction: Any) -> tuple[Any, ...]:
     """Return the sum of the craters' heights at positions in cells."""
-    words, f = _split(d, [x - 0.5 for x in q])
+    words, f = _nearest_cells(d, q)
     total = d.Float(0)
     for i, j, k, h in _corners(words, word):
         h = _mix(d, h)
@@ -305,7 +288,7 @@ def _impacts(d: Any, q: list[Any], word: Any, *law: Any) -> tuple[Any, ...]:
 
 def _clods(d: Any, q: list[Any], word: Any, fraction: Any) -> tuple[Any, ...]:
     """Return the height of the highest stone at positions in cells."""
-    words, f = _split(d, [x - 0.5 for x in q])
+    words, f = _nearest_cells(d, q)
     highest = d.Float(0)
     for i, j, k, h in _corners(words, word):
         h = _mix(d, h)
@@ -320,8 +303,7 @@ def _clods(d: Any, q: list[Any], word: Any, fraction: Any) -> tuple[Any, ...]:
     return (highest,)
 
 
-_PATTERNS = {"blocks": _blocks, "stones": _stones}
-_OUTPUTS = {_blocks: 3, _stones: 3, _impacts: 2}  # arrays that a kernel returns, if not one
+_OUTPUTS = {_blocks: 3, _impacts: 2}  # arrays that a kernel returns, if not one
 
 # --- fields on a mesh -------------------------------------------------------------------------------------------
 
@@ -430,10 +412,10 @@ class Octaves:
                 total += size * np.float32(angularity**0.5) * self.planes(wavelength, stream + k)
         return total
 
-    def blocks(self, width_m: float, height_m: float, stream: int, kernel: str = "blocks") -> Float32:
+    def blocks(self, width_m: float, height_m: float, stream: int) -> Float32:
         """Return the height of blocks of that width, each at its own level, with cracks between them, metres."""
         count = self._count(width_m)
-        level, other, gap = self._points.blocks(width_m, noise_key(self.seed, stream), count, kernel)
+        level, other, gap = self._points.blocks(width_m, noise_key(self.seed, stream), count)
         step = np.float32(height_m) * (other - level)
         # A step narrower than two facets, or steeper than 60°, would have an edge like a saw.
         ramp = np.maximum(0.06 * width_m, 1.8 * self.facet_m[:count]).astype(np.float32)

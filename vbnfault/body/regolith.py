@@ -169,7 +169,7 @@ def _rubble(noise: Octaves, amount: float, smallest_boulder_m: float) -> Float32
     number = 0
     while width > 1.6 * float(noise.facet_m[0]):
         height = amount * _STONE_HEIGHT * width
-        highest = np.maximum(highest, bent.blocks(width, height, 260 + number, "stones"))
+        highest = np.maximum(highest, bent.blocks(width, height, 260 + number))
         width, number = width / 1.7, number + 1
     return np.asarray(np.where(np.isfinite(highest), highest, 0), dtype=np.float32)
 
