@@ -35,7 +35,8 @@ from vbnfault.detector.sensor import Sensor, load_sensor, parse_sensor
 from vbnfault.fit.exposures import Exposure, Kind, read_exposures
 from vbnfault.fit.frames import body_figures, look, sky_figures
 from vbnfault.fit.replay import Display
-from vbnfault.fit.sensor_fit import SensorFit, fit_sensor, sensor_text
+from vbnfault.fit.sensor_file import sensor_text
+from vbnfault.fit.sensor_fit import SensorFit, fit_sensor
 
 F32 = NDArray[np.float32]
 PIXELS, STARS, HITS, LAMP = 256, 60, 12, 1e-3

@@ -104,7 +104,8 @@ def fit(
     """
     from ..core.files.whole_files import write_whole, writing
     from ..fit.exposures import read_exposures
-    from ..fit.sensor_fit import draw_transfer, fit_sensor, sensor_text
+    from ..fit.sensor_file import draw_transfer, sensor_text
+    from ..fit.sensor_fit import fit_sensor
 
     check_written("", {"--out": out, "--plot": plot})
     exposures = read_exposures(
