@@ -182,7 +182,8 @@ def test_a_class_that_is_no_name_is_refused(name: str, described_store: Path, tm
 def test_names_are_refused_where_a_store_is_created_too(tmp_path: Path) -> None:
     wrong: dict[str, dict[str, Any]] = {
         "store.faults": {"faults": ("../a",), "mask_any_faults": (), "layers": ()},
-        "store.soft_layers": {"soft_layers": ("../a", "", "", "")},
+        "store.soft_layers = '../a'": {"soft_layers": ("../a", "", "", "")},
+        "store.soft_layers = 'image': must end in opacity": {"soft_layers": ("image", "", "", "")},
         "store.site_names": {"site_names": ("a\nb",)},
         "title": {"attributes": {"title": "a\n---\n"}},
         "licence": {"attributes": {"licence": ["MIT"]}},

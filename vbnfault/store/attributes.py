@@ -9,6 +9,7 @@ from typing import Any
 
 from ..core.errors import InputError, shown, without_middle
 from ..core.process.environment import MOST_SAMPLES
+from ..core.quantities import SOFT_KINDS
 
 # Dotted keys of the root attributes that are tables wherever they are present; * stands for every key of a table.
 _TABLES = (
@@ -111,6 +112,9 @@ def check_names(spec: Any, samples: int) -> None:
                     f"store.{field} = {shown(name)}: must be at most 128 lower-case letters, digits, underscores "
                     "and begin with a letter"
                 )
+    for name in filter(None, spec.soft_layers):
+        if name.rpartition("_")[2] not in SOFT_KINDS:
+            raise InputError(f"store.soft_layers = {shown(name)}: must end in {' or '.join(SOFT_KINDS)}")
     for field in ("faults", "layers"):
         values = getattr(spec, field)
         if len(values) > _MOST_CLASSES or len({*values}) < len(values):
