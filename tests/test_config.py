@@ -176,6 +176,7 @@ def test_every_number_is_accepted_at_its_bounds() -> None:
                 extra |= {"shard_samples": 16} if key == "variants_per_view" else {}
                 extra |= {"aim": "nadir"} if key == "pointing_error_deg" else {}
                 extra |= {"width_px": 16 if bound == "minimum" else 16384} if key == "focal_length_mm" else {}
+                extra |= {"regolith": {}} if key == "craters_per_km2" else {}
                 extra |= {"detector": "x"} if key in ("individuals", "detector_temperature_K", "stretch") else {}
                 scene = parse_scene({"title": "t", table: {key: value, **extra}}, source="here")
                 assert getattr(getattr(scene, table), key) == value

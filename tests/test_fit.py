@@ -191,6 +191,26 @@ def test_the_command_writes_a_sensor_that_loads_and_says_what_it_could_not_fit(t
     assert abs(counts[0] - counts[1]) < 5 * math.sqrt(sum(counts)) + 0.15 * counts[1]
 
 
+def test_options_name_the_kinds_of_frames(taken: Any, tmp_path: Path) -> None:
+    _, frames, base = taken
+    command = ["fit", "--sensor", str(base), "--out", str(tmp_path / "fitted.toml")]
+    for kind, option in (("dark", "--darks"), ("flat", "--flats"), ("star", "--stars")):
+        folder = tmp_path / kind
+        folder.mkdir()
+        chosen = [one for one in frames if one.kind == kind]
+        for k, one in enumerate(chosen):
+            cv2.imwrite(str(folder / f"f{k:02}.png"), one.image)
+        rows = [f"f{k:02}.png,{one.exposure_s}" for k, one in enumerate(chosen) if one.exposure_s is not None]
+        if rows:
+            (folder / "frames.csv").write_text("\n".join(["name,exposure_s", *rows]))
+        command += [option, str(folder)]
+    result = CliRunner().invoke(cli.app, command, catch_exceptions=False)
+    assert result.exit_code == 0
+    assert "point spread" in result.output.split("not fitted")[0]
+    refused = CliRunner().invoke(cli.app, [*command, "--stretch", "2"])
+    assert refused.exit_code == 2
+
+
 def test_without_flats_the_dark_current_gives_the_gain(taken: Any) -> None:
     one, frames, base = taken
     fit = fit_sensor([x for x in frames if x.kind == "dark"], str(base))
