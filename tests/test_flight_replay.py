@@ -152,6 +152,13 @@ def test_the_sky_tells_background_glow_columns_and_tracks() -> None:
     assert figures["tracks"] == 2
 
 
+def test_a_frame_that_the_body_fills_tells_nothing_of_the_sky() -> None:
+    full = fit_frames.look(np.random.default_rng(2).uniform(90, 110, (80, 80)))
+    assert not full.sky.any()
+    assert full.clipped
+    assert np.isnan([*fit_frames.sky_figures(full, full.lit).values()]).all()
+
+
 def test_a_noisy_frame_is_rendered_with_the_higher_gain() -> None:
     body, rng = disc(80, 80), np.random.default_rng(3)
 

@@ -76,8 +76,8 @@ class Look:
 
     @property
     def clipped(self) -> bool:
-        """Return whether most of the sky is 0."""
-        return bool((self.image[self.sky] == 0).mean() > _CLIPPED)
+        """Return whether most of the sky is 0, or there is none."""
+        return int((self.image[self.sky] == 0).sum()) >= _CLIPPED * self.sky.sum()
 
 
 def look(image: NDArray[Any]) -> Look:
@@ -211,6 +211,9 @@ def sky_figures(one: Look, around: Mask) -> dict[str, float]:
     radius_px = float(np.sqrt(around.sum() / np.pi))
     away = ndimage.distance_transform_edt(~around) / max(radius_px, 1.0)
     sky = one.sky & (away > 0.05)
+    if not sky.any():
+        glows = (f"glow_{high:g}" for _, high in _GLOW_RADII)
+        return dict.fromkeys(("sky", *glows, "noise", "column", "tracks"), float("nan"))
     image = one.image
     residual = image - ndimage.median_filter(image, 5)
     ordinary = np.abs(residual[sky]) < 4 * max(float(np.std(residual[sky])), 1e-6)
