@@ -110,6 +110,9 @@ class PatchSpec:
     angularity
         Part of the variance of the relief longer than 20 m that is of planes which meet in edges; the rest is of
         rounded waves.
+    airfall
+        Factor on the cover of dust that low and level ground has beyond, and high and steep ground below, that which
+        the relief gives it; 0: none.
     largest_boulder_m
         Diameter of the largest boulder.
     fractured
@@ -134,6 +137,7 @@ class PatchSpec:
     contour_scarps: float = 0.0
     intermittency: float = 0.0
     angularity: float = 0.0
+    airfall: float = 0.0
     largest_boulder_m: float = 45.0
     fractured: Fractured | None = None
     regolith: Regolith | None = None
