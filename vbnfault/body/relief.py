@@ -62,7 +62,10 @@ _GRAVITY_PLACES = 6  # nearest ones from which gravity is interpolated, with the
 _STEEPEST = 1.5  # tangent of the relief's largest slope against the model
 _SLUMPS, _SLUMP_STEPS = 4, 25
 
-_LOW, _MEAN_SLOPE_DEG = 0.18, 30.0  # elevations in mean radii and slopes that make airfall depart by 1 from its mean
+_LOW, _MEAN_SLOPE_DEG = (
+    0.18,
+    30.0,
+)  # elevations in mean radii and slopes that make airfall depart by 1 from its mean
 
 _TALUS_CELL_M = 4.0
 _TALUS_REACH_M = 480.0
@@ -121,7 +124,7 @@ def add_relief(
         slope = _slope_deg(points, normals, faces, up)
         return Ground(
             height_m=np.zeros(len(points)),
-            dust=1 - smooth_step(*_DUST_LEAVES_DEG, slope),
+            dust=1 - smooth_step(*_DUST_LEAVES_DEG, slope) + _airfall(body, elevation, slope, spec.airfall),
             talus=np.zeros(len(points), dtype=np.float32),
         )
     # Points are sorted by facet size, so that each octave is evaluated at a leading part of them only.
@@ -174,8 +177,7 @@ def add_relief(
     if spec.fractured is not None:
         slope = _slope_deg(points + height_m[:, None] * normals, normals, faces, up)
         dust = dust * fractured.dust_that_rests(slope, spec.fractured)
-    if spec.airfall:
-        dust += np.float32(spec.airfall) * _airfall(body, elevation[order], model_slope)[rank]
+    dust = dust + _airfall(body, elevation[order], model_slope, spec.airfall)[rank]
     return Ground(height_m=height_m, dust=dust, talus=talus)
 
 
@@ -202,16 +204,18 @@ def _of_regolith(
     )
 
 
-def _airfall(body: Body, elevation_m: Float64, slope_deg: Float32) -> Float32:
-    """Return how much more of what falls back to the body lies on the ground than on average, float32[n], -2 to 2.
+def _airfall(body: Body, elevation_m: Float64, slope_deg: Float32, factor: float) -> Float32:
+    """Return what airfall adds to the cover of dust, float32[n], -2 to 2 times the factor.
 
     It gathers on level and on low ground: the neck of 67P is the brightest of its regions (Fornasier et al. 2015,
     A&A 583, A30; Keller et al. 2015, A&A 583, A34). Slope and elevation count alike; with both, the ranks of
     brightness in 11 flight frames correlate by 0.027 more, with either alone by 0.008.
     """
+    if not factor:
+        return np.zeros(len(slope_deg), dtype=np.float32)
     radius_m = (body.volume_m3 / (4 / 3 * np.pi)) ** (1 / 3)
-    low = (np.median(body.places[2]) - elevation_m) / (_LOW * radius_m)
-    return (np.clip(low, -1, 1) + np.clip(1 - slope_deg / _MEAN_SLOPE_DEG, -1, 1)).astype(np.float32)
+    low = np.clip((np.median(body.places[2]) - elevation_m) / (_LOW * radius_m), -1, 1)
+    return np.asarray(factor * (low + np.clip(1 - slope_deg / _MEAN_SLOPE_DEG, -1, 1)), dtype=np.float32)
 
 
 def _unevenness(body: Body, noise: Octaves, slope_deg: Float32, strength: float) -> Float64:

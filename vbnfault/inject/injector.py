@@ -1,0 +1,439 @@
+"""Inject faults into an image: invert its response to electrons, let the faults act, and convert the change back.
+
+An image holds noise already: N electrons in a pixel where λ were expected. A fault that lets the fraction t of the
+light through leaves a mean of t λ, and the variance must be t λ plus that of the readout, σ². Scaling the image
+alone leaves t² (λ + σ²); what is missing is t (1 - t) λ + (1 - t²) σ², which is the variance of the thinning of N
+and of the readout. So the noise that is added has, in each pixel, the variance
+
+    S' + σ² - v
+
+where S' are the electrons after the fault and v is the variance that the fault leaves of the image's own noise. It
+is measured: the same draws act on the image with a small perturbation of known variance. Light that a fault adds
+thereby gets its own shot noise, and light that it leaves alone none. A pixel that no fault changes keeps its number.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..camera import Camera
+from ..core import spectra
+from ..core.errors import InputError
+from ..core.quantities import Electrons, Radiance
+from ..detector.mosaic import channel_of
+from ..detector.noise import draw_normals, poisson
+from ..faults import MOSAIC_STEPS, Fault, FaultContext
+from ..pipeline.development import Development, Draws, acting_at
+from ..pipeline.injection import visible_draws
+from ..pipeline.labels import labels_of
+from ..pipeline.spec import Injection, SceneExposure, SceneLight
+from ..scene import keyed_random
+from ..scene.config import Scene, configure_faults, load_scene
+from ..scene.instrument import ImageTable
+from ..world import cameras, ephemeris
+from .picture import Picture
+from .sun import sun_direction
+
+F32 = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+_LEAST_PX = 16
+_ASSUMED_EXPOSURE_S = 0.01
+_NEARBY_PX = 15  # over which the variance of noise that a fault mixes between pixels is averaged
+_SAME = 1e-3  # relative difference of two measurements of the variance that shows no mixing
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Injected:
+    """Hold an image with its faults, and what is known of them.
+
+    Attributes
+    ----------
+    image
+        The image with faults, in the shape and the data type of the given one; uint8[y, x, 4] for electrons and
+        radiance.
+    clean
+        The image without faults: the given one.
+    faults
+        The classes of the scene, in the order of the dataset.
+    masks
+        bool[fault, y, x]: the mask of each class.
+    mask_any
+        bool[y, x]: pixels of any localised class.
+    mask_effect
+        bool[fault, y, x]: pixels of the noise-free image that change by 1 DN of 8 bits or more.
+    injected
+        bool[fault].
+    parameters
+        The drawn parameters by class, plain data.
+    left_out
+        Why a commanded class is not in the image, by class.
+    unrecoverable
+        bool[y, x]: pixels at white or at the lowest number, of which the light is not known.
+    electrons
+        float32[y, x, channel]: electrons of the image with faults before the readout; None where a fault acts in
+        the readout or on the finished image.
+    assumptions
+        What was assumed of the camera, a sentence each.
+    """
+
+    image: NDArray[Any]
+    clean: NDArray[Any]
+    faults: tuple[str, ...]
+    masks: Mask
+    mask_any: Mask
+    mask_effect: Mask
+    injected: Mask
+    parameters: dict[str, dict[str, Any]]
+    left_out: dict[str, str]
+    unrecoverable: Mask
+    electrons: F32 | None
+    assumptions: tuple[str, ...] = ()
+
+
+class _ImageDevelopment(Development):
+    """Develop images whose clean electrons are given."""
+
+    def __init__(self, electrons: Electrons, **shared: Any) -> None:
+        super().__init__(**shared)
+        self._given = electrons
+
+    def _undisturbed(self, draws: Draws) -> Electrons:
+        if self._instrument(draws):
+            names = ", ".join(sorted(draws))
+            raise InputError(f"{names}: changes the lens or the filters, which needs radiance and not an image")
+        return self._given
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Drawing:
+    """Hold the faults of an image and its keyed random numbers."""
+
+    faults: Mapping[str, Fault]
+    seed: int
+    index: int
+
+    def rng(self, stage: str, name: str) -> np.random.Generator:
+        """Return the generator for (stage, name)."""
+        return keyed_random.rng(self.seed, self.index, stage, name)
+
+
+class Injector:
+    """Inject the faults of a scene into images of its camera; everything that images share is made once.
+
+    Parameters
+    ----------
+    scene
+        A scene, its file or name. Its `[camera]`, `[sun]`, `[image]` and `[faults]` count.
+    source
+        Name of the scene in messages.
+
+    Raises
+    ------
+    InputError
+        The scene cannot be used.
+    """
+
+    def __init__(self, scene: Scene | str | Path, *, source: str = "scene") -> None:
+        if not isinstance(scene, Scene):
+            source, scene = str(scene), load_scene(scene)
+        self.scene, self.source = scene, source
+        self.faults = configure_faults(scene, source)
+        self._cameras: dict[tuple[int, int], Camera] = {}
+
+    def __call__(
+        self,
+        image: NDArray[Any] | Electrons | Radiance,
+        index: int = 0,
+        *,
+        sun: str | Sequence[float] | None = None,
+        commanded: Sequence[str] | None = None,
+        depth_m: NDArray[Any] | None = None,
+        camera: Camera | None = None,
+        context: Mapping[str, Any] | None = None,
+        raw: bool = False,
+    ) -> Injected:
+        """Return an image with faults.
+
+        Parameters
+        ----------
+        image
+            [y, x], [y, x, 1], [y, x, 3] (R, G, B) or [y, x, 4] (R, G, B, I), of whole numbers or floats; or the
+            expected electrons of the camera, or radiance, from which the camera takes the image with its own noise.
+        index
+            Number of the image: with the seed of the scene it keys all random numbers.
+        sun
+            "auto" finds the Sun as the saturated disc; two numbers are its pixel position, three its direction in
+            the camera frame; None is what `[image]` says.
+        commanded
+            Classes to inject; default: all of the scene.
+        depth_m
+            float[y, x]: depth along the boresight, where it is known.
+        camera
+            Camera with its exposure, in place of the scene's.
+        context
+            Further fields of `faults.FaultContext` that are known.
+        raw
+            Whether the numbers of [y, x] are those of the sensor's mosaic.
+
+        Raises
+        ------
+        InputError
+            The image cannot be used with this camera.
+        """
+        given = image if isinstance(image, Electrons | Radiance) else _checked_array(image)
+        if isinstance(given, Electrons | Radiance):
+            shape = given.array.shape[-2:] if isinstance(given, Radiance) else given.array.shape[:2]
+        else:
+            shape = given.shape[:2]
+        camera, assumed = self._camera((int(shape[0]), int(shape[1])), camera)
+        if isinstance(given, Electrons | Radiance):
+            light = given if isinstance(given, Electrons) else camera.expose(given, camera.exposure_s)
+            picture = None
+        else:
+            picture = Picture.of(given, self.scene.image or ImageTable(), camera, raw=raw)
+            assumed += picture.assumptions
+            light = picture.electrons
+        known = self._context(camera, sun, depth_m, picture)
+        drawing = _Drawing(faults=self.faults, seed=self.scene.dataset.seed, index=index)
+        development = self._development(light, camera, replace(known, **(context or {})), drawing)
+        names = [name for name in self.faults if commanded is None or name in commanded]
+        possible, left_out = self._possible(names, development.context)
+        draws = visible_draws(drawing, development, possible, stored=True)
+        left_out |= {name: "no draw of it changes the image" for name in possible if name not in draws}
+        injection = Injection(draws=draws, development=development)
+        members = [name for name, fault in self.faults.items() if fault.localised]
+        labels = labels_of(self.faults, injection, members, ("mask_effect",))
+        effects = np.zeros_like(labels.masks)
+        for k, name in enumerate(self.faults):
+            if name in labels.effects:
+                effects[k] = labels.effects[name]
+        if picture is None:
+            result, clean, electrons = development.image(draws).array, development.image({}).array, None
+            unrecoverable = np.zeros(camera_shape(camera), dtype=bool)
+        else:
+            result, electrons = self._changed(picture, development, draws, drawing)
+            clean, unrecoverable = picture.numbers, picture.unrecoverable
+        return Injected(
+            image=result,
+            clean=clean,
+            faults=tuple(self.faults),
+            masks=labels.masks,
+            mask_any=labels.mask_any,
+            mask_effect=effects,
+            injected=np.array([name in draws for name in self.faults]),
+            parameters={name: {"model": draw.fault.model, **draw.params} for name, draw in sorted(draws.items())},
+            left_out=left_out,
+            unrecoverable=unrecoverable,
+            electrons=electrons,
+            assumptions=tuple(assumed),
+        )
+
+    # --- camera and Sun ------------------------------------------------------------------------------------------
+
+    def _camera(self, shape: tuple[int, int], given: Camera | None) -> tuple[Camera, list[str]]:
+        """Return the camera of images of a shape, and what was assumed of it."""
+        height, width = shape
+        if given is not None:
+            if camera_shape(given) != shape:
+                raise InputError(
+                    f"image of {width} x {height} pixels: the camera has {given.width_px} x {given.height_px}"
+                )
+            return given, []
+        if min(shape) < _LEAST_PX:
+            raise InputError(f"image of {width} x {height} pixels: must have at least {_LEAST_PX} x {_LEAST_PX}")
+        table, assumed = self.scene.camera, []
+        exposure_s = table.exposure_s
+        if exposure_s == "auto":
+            exposure_s = _ASSUMED_EXPOSURE_S
+            assumed.append(f"camera.exposure_s = {exposure_s:g}: assumed, since the scene leaves it to be metered")
+        for key, default in (("fov_deg", 65.0), ("detector", "")):
+            if key not in table.model_fields_set and "focal_length_mm" not in table.model_fields_set:
+                assumed.append(f"camera.{key} = {default!r}: assumed, since the scene does not give it")
+        if shape not in self._cameras:
+            own = table.model_copy(update={"width_px": width, "height_px": height})
+            self._cameras[shape] = cameras.base_camera(self.scene.model_copy(update={"camera": own}))
+        return replace(self._cameras[shape], exposure_s=float(exposure_s)), assumed
+
+    def _context(
+        self, camera: Camera, sun: str | Sequence[float] | None, depth_m: Any, picture: Picture | None
+    ) -> FaultContext:
+        """Return the context of the faults."""
+        nodes = ephemeris.wavelengths_nm(self.scene)
+        distance_au = ephemeris.sun_distance_au(self.scene)
+        direction = sun_direction(
+            (self.scene.image or ImageTable()).sun if sun is None else sun, camera, distance_au, picture
+        )
+        return FaultContext(
+            camera=camera,
+            sun_xy_px=None if direction is None else camera.project(direction),
+            sun_direction_C=direction,
+            sun_irradiance_W_m2_nm=spectra.solar_band_irradiance_W_m2_nm(nodes, distance_au),
+            wavelength_nm=nodes,
+            sun_angular_radius_rad=spectra.sun_angular_radius_rad(distance_au),
+            sun_visible_fraction=None if direction is None else 1.0,
+            depth_m=None if depth_m is None else np.asarray(depth_m),
+        )
+
+    def _possible(self, names: Sequence[str], context: FaultContext) -> tuple[list[str], dict[str, str]]:
+        """Return the commanded classes that can act on an image, and why the others cannot."""
+        lacking = {}
+        for name in names:
+            fault = self.faults[name]
+            if fault.needs_sun and context.sun_xy_px is None:
+                lacking[name] = "needs the Sun before the camera; give it by image.sun or --sun"
+            elif fault.needs_mosaic and context.camera.detector.mosaic is None:
+                lacking[name] = "acts inside a sensor; name one by camera.detector"
+            elif fault.needs_ccd and not context.camera.is_ccd:
+                lacking[name] = "has no effect on CMOS"
+        return [name for name in names if name not in lacking], lacking
+
+    def _development(
+        self, light: Electrons, camera: Camera, context: FaultContext, drawing: _Drawing
+    ) -> _ImageDevelopment:
+        """Return what develops images of given electrons."""
+        nothing = Radiance(
+            array=np.zeros((len(context.sunlight[0]), 1, 1), np.float32), wavelength_nm=context.sunlight[0]
+        )
+        exposure = SceneExposure(camera=camera, light=SceneLight(lens=camera.lens, rendered=nothing), rate=light)
+        return _ImageDevelopment(light, exposure=exposure, context=context, rng=drawing.rng)
+
+    # --- the image -----------------------------------------------------------------------------------------------
+
+    def _changed(
+        self, picture: Picture, development: _ImageDevelopment, draws: Draws, drawing: _Drawing
+    ) -> tuple[NDArray[Any], F32 | None]:
+        """Return the numbers of the image with the drawn faults, and its electrons."""
+        camera, optical = development.exposure.camera, acting_at(draws, "electrons")
+        before = picture.electrons.array
+        after = development.signal(draws, optical).merged.array if optical else before
+        if optical:
+            after = after + self._missing_noise(picture, development, draws, after, drawing)
+        change = after - before
+        inside = [name for step in MOSAIC_STEPS for name in acting_at(draws, step)]
+        if inside:
+            change = self._through_sensor(picture, development, draws, after, drawing)
+        numbers = picture.with_change(change)
+        if acting_at(draws, "rgbi"):
+            levels = picture.levels(numbers)
+            numbers = picture.with_levels(numbers, levels, development.read_out(levels, draws))
+        return numbers, None if inside or acting_at(draws, "rgbi") else after
+
+    def _missing_noise(
+        self, picture: Picture, development: _ImageDevelopment, draws: Draws, after: F32, drawing: _Drawing
+    ) -> F32:
+        """Return the noise that the faults' change of the light has, electrons float32[y, x, channel]."""
+        before, camera, context = picture.electrons, development.exposure.camera, development.context
+        optical = acting_at(draws, "electrons")
+        touched = after != before.array
+        if not touched.any():
+            return np.zeros_like(after)
+        read2 = np.float32(camera.detector.read_noise_e_rms**2)
+        deviation = np.sqrt(before.array + read2)
+        kept = []
+        for k in range(2):
+            signs = np.where(drawing.rng("inject", f"signs/{k}").integers(0, 2, after.shape, np.int8), 1, -1)
+            probe = before.with_array((before.array + deviation * signs).astype(np.float32))
+            other = self._development(probe, camera, context, drawing)
+            kept.append((other.signal(draws, optical).merged.array - after) ** 2)
+        mean = 0.5 * (kept[0] + kept[1])
+        mixed = np.abs(kept[0] - kept[1]) > _SAME * (mean + 1)
+        if mixed.any():  # a blur: the variance varies slowly
+            smooth = cv2.blur(mean, (_NEARBY_PX, _NEARBY_PX)).reshape(mean.shape)
+            mean = np.where(mixed, smooth, mean)
+        missing = np.where(touched, np.maximum(np.maximum(after, 0) + read2 - mean, 0), 0).astype(np.float32)
+        normals = draw_normals(after.shape, drawing.rng("inject", "noise"))
+        noise = poisson(missing, normals) - missing
+        return np.where(touched, noise, 0).astype(np.float32)
+
+    def _through_sensor(
+        self, picture: Picture, development: _ImageDevelopment, draws: Draws, after: F32, drawing: _Drawing
+    ) -> F32:
+        """Return the change of electrons, float32[y, x, channel], where faults act inside the sensor, too.
+
+        The noise-free sensor takes the image with and without the faults, so that what both share cancels. Charge
+        that a fault adds gets its shot noise.
+        """
+        camera = development.camera_with(draws).mosaic
+        plain, acts = development.exposure.camera.mosaic, development.acts(draws)
+        exposure_s, pattern = development.exposure.camera.exposure_s, plain.sensor.pattern
+        signals = [picture.electrons, picture.electrons.with_array(np.maximum(after, 0).astype(np.float32))]
+        raws = [
+            sensor.raw(signal, exposure_s, None, steps).astype(np.float32)
+            for sensor, signal, steps in zip((plain, camera), signals, ({}, acts), strict=True)
+        ]
+        own = channel_of(pattern, raws[0].shape)
+        expected = [
+            sensor.device.expected_e(np.take_along_axis(signal.array, own[..., None], 2)[..., 0], exposure_s, steps)
+            for sensor, signal, steps in zip((camera, camera), (signals[1], signals[1]), ({}, acts), strict=True)
+        ]
+        added = np.maximum(expected[1] - expected[0], 0).astype(np.float32)
+        noise = poisson(added, draw_normals(added.shape, drawing.rng("inject", "charge"))) - added
+        change = (raws[1] - raws[0]) / np.float32(plain.sensor.readout.system_gain_dn_per_e) + noise
+        return picture.spread(change)
+
+
+def inject(
+    image: NDArray[Any] | Electrons | Radiance,
+    faults: Mapping[str, Any],
+    *,
+    camera: Camera | Mapping[str, Any] | None = None,
+    seed: int = 0,
+    sun: str | Sequence[float] | None = None,
+    **known: Any,
+) -> Injected:
+    """Return an image with faults, their masks and their parameters.
+
+    Parameters
+    ----------
+    image
+        As for `Injector`.
+    faults
+        Tables of the faults by class, as under `[faults]` of a scene: {"dust_on_optics": {"model": "defocused"}}.
+    camera
+        Keys of `[camera]`, or a camera with its exposure; default: a scene's default camera.
+    seed
+        Seed of all random numbers.
+    sun, known
+        As for `Injector`; `image_keys` are keys of `[image]`.
+
+    Raises
+    ------
+    InputError
+        Image, camera or faults cannot be used.
+    """
+    tables: dict[str, Any] = {"title": "inject", "dataset": {"seed": seed}, "faults": dict(faults)}
+    if "image_keys" in known:
+        tables["image"] = known.pop("image_keys")
+    if isinstance(camera, Mapping):
+        tables["camera"] = dict(camera)
+    injector = Injector(Scene.model_validate(tables))
+    return injector(image, sun=sun, camera=camera if isinstance(camera, Camera) else None, **known)
+
+
+def _checked_array(image: Any) -> NDArray[Any]:
+    """Return an image as an array. Raises InputError if it has another shape or data type than an image."""
+    array = np.asarray(image)
+    if array.ndim == 3 and array.shape[2] == 1:
+        array = array[..., 0]
+    if array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] not in (3, 4)) or not array.size:
+        raise InputError(
+            f"image of shape {list(array.shape)}: must be [y, x], or [y, x, channel] with 1, 3 or 4 channels"
+        )
+    if array.dtype.kind not in "uif" or array.dtype.itemsize > 4 and array.dtype.kind in "ui":
+        raise InputError(f"image of {array.dtype}: must hold whole numbers of up to 32 bits, or floats")
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
+        raise InputError(f"image: holds {int((~np.isfinite(array)).sum())} values that are NaN or infinite")
+    return array
+
+
+def camera_shape(camera: Camera) -> tuple[int, int]:
+    """Return (height, width) in pixels."""
+    return camera.height_px, camera.width_px
