@@ -61,6 +61,7 @@ ONLY = {  # distribution → the packages or modules that import it
     "spiceypy": {"core.files.spice"},
     "OpenEXR": {"core.files.images"},
     "tifffile": {"core.files.tiff"},
+    "astropy": {"inject.files"},
 }
 
 

@@ -81,8 +81,8 @@ class Ground:
     height_m
         float64[n], along the model's normal.
     dust
-        float32[n]: 1 is covered by dust, 0 bare; airfall goes beyond both. Of regolith: deviation of the albedo from
-        its mean, -1 to 1.5.
+        float32[n]: 1 is covered by dust, 0 bare; airfall goes beyond both. Of regolith: deviation of the albedo
+        from its mean, -1 to 1.5.
     talus
         float32[n] in [0, 1]; 1 is debris at the foot of a cliff. Of regolith: the density of boulders.
     """

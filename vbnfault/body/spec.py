@@ -111,8 +111,8 @@ class PatchSpec:
         Part of the variance of the relief longer than 20 m that is of planes which meet in edges; the rest is of
         rounded waves.
     airfall
-        Factor on the cover of dust that low and level ground has beyond, and high and steep ground below, that which
-        the relief gives it; 0: none.
+        How much more dust covers low and level ground, and how much less high and steep ground, than the relief
+        alone would let lie there; 0: no more.
     largest_boulder_m
         Diameter of the largest boulder.
     fractured

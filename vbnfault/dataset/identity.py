@@ -47,6 +47,8 @@ _LIBRARIES = ("mitsuba", "drjit", "numpy", "scipy", "trimesh", "scikit-image", "
 # [first, last] of the other's plan that it holds; `repeats`, how often it holds each; `source`, what identifies the
 # other store and its plan.
 RETAKE = "retake"
+# Root attribute of a store of images into which faults were put: digests of their files, and where the Sun is.
+IMAGES = "images"
 # Keys that came after version 0.1 of the store: a scene that has their defaults has the identity of before.
 _LEFT_OUT_AT_DEFAULT = (
     "body.atmosphere",
@@ -61,6 +63,8 @@ _LEFT_OUT_AT_DEFAULT = (
     "camera.exposure_stops",
     "dataset.variants_per_view",
     "dataset.radiance_dtype",
+    "image",
+    "patch.airfall",
     "patch.fractured",
     "patch.contour_scarps",
     "patch.facet_px",
@@ -357,7 +361,7 @@ def is_exact(attributes: Mapping[str, Any]) -> bool:
     redraws = scene.get("plan", {}).get("on_invisible") == "redraw_view"
     as_drawn = scene.get("geometry", {}).get("sun_visibility") == "as_drawn"
     flown = scene.get("spice", {}).get("spacecraft") or scene.get("trajectory")
-    return bool(redraws and not as_drawn and not flown and RETAKE not in attributes)
+    return bool(redraws and not as_drawn and not flown and not {RETAKE, IMAGES} & set(attributes))
 
 
 def stored_scene(attributes: Mapping[str, Any]) -> Scene:
@@ -453,7 +457,7 @@ def planned(attributes: Mapping[str, Any], faults: Sequence[str]) -> Callable[[i
         drawn = table.view(scene, index, tries - 1)
         # the plan does not set these angles if a trajectory places camera and Sun, or if the camera aims
         names = ("sun_azimuth_deg", "sun_elevation_deg", "roll_deg", "pitch_deg", "yaw_deg")
-        angles = () if scene.is_flown or scene.is_aimed else names
+        angles = () if scene.is_flown or scene.is_aimed or IMAGES in attributes else names
         return {
             **{name: drawn[name] for name in angles},
             "stratum": int(table.stratum[index]),

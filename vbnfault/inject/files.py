@@ -1,7 +1,7 @@
 """Read images of users' files, and write them back with other numbers: size, depth and metadata stay.
 
-PNG and TIFF of 8 and 16 bits (TIFF of 32 bits, too), FITS of any BITPIX with its BZERO, BSCALE and BLANK, OpenEXR, and
-numpy's NPY. Each kind says how it is read and how it is written in one class.
+PNG and TIFF of 8 and 16 bits (TIFF of 32 bits, too), FITS of any BITPIX with its BZERO, BSCALE and BLANK,
+OpenEXR, and numpy's NPY. Each kind says how it is read and how it is written in one class.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ class Npy(ImageFile):
 
 
 class Fits(ImageFile):
-    """First image of a FITS file; pixels that its BLANK or NaN mark as missing stay so, and are black for faults."""
+    """First image of a FITS file; pixels that BLANK or NaN mark as missing stay so, and are black for faults."""
 
     endings = (".fits", ".fit", ".fts")
 
@@ -138,7 +138,9 @@ class Fits(ImageFile):
             values: NDArray[Any] = stored.astype(np.int64) + int(zero)
             unsigned = zero == 2.0 ** (8 * stored.dtype.itemsize - 1) or stored.dtype == np.uint8
             kind = f"{'u' if unsigned else 'i'}{stored.dtype.itemsize}"
-            values = values.astype(kind) if zero in (0, 2.0 ** (8 * stored.dtype.itemsize - 1)) else values.astype(float)
+            values = (
+                values.astype(kind) if zero in (0, 2.0 ** (8 * stored.dtype.itemsize - 1)) else values.astype(float)
+            )
         else:
             values = stored.astype(np.float64) * scale + zero
         self.numbers = np.where(self._missing, 0, values).astype(values.dtype.newbyteorder("="))
@@ -175,7 +177,7 @@ class Exr(ImageFile):
     def __init__(self, path: Path) -> None:
         """Read an OpenEXR file."""
         self._header, self._channels = images.read_exr(path)
-        names = [name for name in ("R", "G", "B") if name in self._channels] or ["Y"]
+        names: list[str] = [name for name in ("R", "G", "B") if name in self._channels] or ["Y"]
         if len(names) not in _COLOURS or names[0] not in self._channels:
             known = ", ".join(self._channels)
             raise InputError(f"is an OpenEXR file with the channels {known}; must have R, G and B, or Y")

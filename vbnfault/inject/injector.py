@@ -1,16 +1,4 @@
-"""Inject faults into an image: invert its response to electrons, let the faults act, and convert the change back.
-
-An image holds noise already: N electrons in a pixel where λ were expected. A fault that lets the fraction t of the
-light through leaves a mean of t λ, and the variance must be t λ plus that of the readout, σ². Scaling the image
-alone leaves t² (λ + σ²); what is missing is t (1 - t) λ + (1 - t²) σ², which is the variance of the thinning of N
-and of the readout. So the noise that is added has, in each pixel, the variance
-
-    S' + σ² - v
-
-where S' are the electrons after the fault and v is the variance that the fault leaves of the image's own noise. It
-is measured: the same draws act on the image with a small perturbation of known variance. Light that a fault adds
-thereby gets its own shot noise, and light that it leaves alone none. A pixel that no fault changes keeps its number.
-"""
+"""Inject faults into images: of files, of other renderers, of a camera that runs."""
 
 from __future__ import annotations
 
@@ -19,7 +7,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,18 +14,18 @@ from ..camera import Camera
 from ..core import spectra
 from ..core.errors import InputError
 from ..core.quantities import Electrons, Radiance
-from ..detector.mosaic import channel_of
-from ..detector.noise import draw_normals, poisson
-from ..faults import MOSAIC_STEPS, Fault, FaultContext
-from ..pipeline.development import Development, Draws, acting_at
+from ..faults import Fault, FaultContext
+from ..pipeline.development import Development, Draws
 from ..pipeline.injection import visible_draws
 from ..pipeline.labels import labels_of
-from ..pipeline.spec import Injection, SceneExposure, SceneLight
+from ..pipeline.spec import Draw, Injection, SceneExposure, SceneLight
 from ..scene import keyed_random
 from ..scene.config import Scene, configure_faults, load_scene
 from ..scene.instrument import ImageTable
 from ..world import cameras, ephemeris
+from .change import struck
 from .picture import Picture
+from .response import Response
 from .sun import sun_direction
 
 F32 = NDArray[np.float32]
@@ -46,8 +33,6 @@ Mask = NDArray[np.bool_]
 
 _LEAST_PX = 16
 _ASSUMED_EXPOSURE_S = 0.01
-_NEARBY_PX = 15  # over which the variance of noise that a fault mixes between pixels is averaged
-_SAME = 1e-3  # relative difference of two measurements of the variance that shows no mixing
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -80,6 +65,12 @@ class Injected:
     electrons
         float32[y, x, channel]: electrons of the image with faults before the readout; None where a fault acts in
         the readout or on the finished image.
+    camera
+        The camera, with its exposure.
+    response
+        How the numbers follow from light; None for electrons and radiance.
+    sun_xy_px
+        Pixel position of the Sun, float64[2]; None without a Sun before the camera.
     assumptions
         What was assumed of the camera, a sentence each.
     """
@@ -95,6 +86,9 @@ class Injected:
     left_out: dict[str, str]
     unrecoverable: Mask
     electrons: F32 | None
+    camera: Camera
+    response: Response | None = None
+    sun_xy_px: NDArray[np.float64] | None = None
     assumptions: tuple[str, ...] = ()
 
 
@@ -189,52 +183,57 @@ class Injector:
             The image cannot be used with this camera.
         """
         given = image if isinstance(image, Electrons | Radiance) else _checked_array(image)
-        if isinstance(given, Electrons | Radiance):
-            shape = given.array.shape[-2:] if isinstance(given, Radiance) else given.array.shape[:2]
-        else:
-            shape = given.shape[:2]
-        camera, assumed = self._camera((int(shape[0]), int(shape[1])), camera)
+        camera, assumed = self._camera(_shape(given), camera)
+        picture = None
         if isinstance(given, Electrons | Radiance):
             light = given if isinstance(given, Electrons) else camera.expose(given, camera.exposure_s)
-            picture = None
         else:
             picture = Picture.of(given, self.scene.image or ImageTable(), camera, raw=raw)
             assumed += picture.assumptions
             light = picture.electrons
-        known = self._context(camera, sun, depth_m, picture)
+        known = replace(self._context(camera, sun, depth_m, picture), **(context or {}))
         drawing = _Drawing(faults=self.faults, seed=self.scene.dataset.seed, index=index)
-        development = self._development(light, camera, replace(known, **(context or {})), drawing)
-        names = [name for name in self.faults if commanded is None or name in commanded]
-        possible, left_out = self._possible(names, development.context)
-        draws = visible_draws(drawing, development, possible, stored=True)
-        left_out |= {name: "no draw of it changes the image" for name in possible if name not in draws}
+        development = _development(light, known, drawing)
+        draws, left_out = self._drawn(development, drawing, commanded)
         injection = Injection(draws=draws, development=development)
         members = [name for name, fault in self.faults.items() if fault.localised]
         labels = labels_of(self.faults, injection, members, ("mask_effect",))
-        effects = np.zeros_like(labels.masks)
-        for k, name in enumerate(self.faults):
-            if name in labels.effects:
-                effects[k] = labels.effects[name]
+        shape, nothing = development.context.shape, np.zeros(development.context.shape, dtype=bool)
         if picture is None:
-            result, clean, electrons = development.image(draws).array, development.image({}).array, None
-            unrecoverable = np.zeros(camera_shape(camera), dtype=bool)
+            result, electrons = development.image(draws).array, None
         else:
-            result, electrons = self._changed(picture, development, draws, drawing)
-            clean, unrecoverable = picture.numbers, picture.unrecoverable
+            result, electrons = struck(
+                picture, development, draws, lambda other: _development(other, known, drawing), drawing.rng
+            )
+        effects = [labels.effects.get(name, nothing) for name in self.faults]
         return Injected(
             image=result,
-            clean=clean,
+            clean=development.image({}).array if picture is None else picture.numbers,
             faults=tuple(self.faults),
             masks=labels.masks,
             mask_any=labels.mask_any,
-            mask_effect=effects,
-            injected=np.array([name in draws for name in self.faults]),
+            mask_effect=np.array(effects, dtype=bool).reshape(-1, *shape),
+            injected=np.array([name in draws for name in self.faults], dtype=bool),
             parameters={name: {"model": draw.fault.model, **draw.params} for name, draw in sorted(draws.items())},
             left_out=left_out,
-            unrecoverable=unrecoverable,
+            unrecoverable=nothing if picture is None else picture.unrecoverable,
             electrons=electrons,
+            camera=camera,
+            response=None if picture is None else picture.response,
+            sun_xy_px=known.sun_xy_px,
             assumptions=tuple(assumed),
         )
+
+    def _drawn(
+        self, development: Development, drawing: _Drawing, commanded: Sequence[str] | None
+    ) -> tuple[dict[str, Draw], dict[str, str]]:
+        """Return draws of the commanded classes, and why the others are not in the image."""
+        names = [name for name in self.faults if commanded is None or name in commanded]
+        left_out = self._impossible(names, development.context)
+        possible = [name for name in names if name not in left_out]
+        draws = visible_draws(drawing, development, possible, stored=True)
+        unseen = {name: "no draw of it changes the image" for name in possible if name not in draws}
+        return draws, {**left_out, **unseen}
 
     # --- camera and Sun ------------------------------------------------------------------------------------------
 
@@ -242,7 +241,7 @@ class Injector:
         """Return the camera of images of a shape, and what was assumed of it."""
         height, width = shape
         if given is not None:
-            if camera_shape(given) != shape:
+            if (given.height_px, given.width_px) != shape:
                 raise InputError(
                     f"image of {width} x {height} pixels: the camera has {given.width_px} x {given.height_px}"
                 )
@@ -282,8 +281,8 @@ class Injector:
             depth_m=None if depth_m is None else np.asarray(depth_m),
         )
 
-    def _possible(self, names: Sequence[str], context: FaultContext) -> tuple[list[str], dict[str, str]]:
-        """Return the commanded classes that can act on an image, and why the others cannot."""
+    def _impossible(self, names: Sequence[str], context: FaultContext) -> dict[str, str]:
+        """Return why some of the classes cannot act on an image."""
         lacking = {}
         for name in names:
             fault = self.faults[name]
@@ -293,91 +292,22 @@ class Injector:
                 lacking[name] = "acts inside a sensor; name one by camera.detector"
             elif fault.needs_ccd and not context.camera.is_ccd:
                 lacking[name] = "has no effect on CMOS"
-        return [name for name in names if name not in lacking], lacking
+        return lacking
 
-    def _development(
-        self, light: Electrons, camera: Camera, context: FaultContext, drawing: _Drawing
-    ) -> _ImageDevelopment:
-        """Return what develops images of given electrons."""
-        nothing = Radiance(
-            array=np.zeros((len(context.sunlight[0]), 1, 1), np.float32), wavelength_nm=context.sunlight[0]
-        )
-        exposure = SceneExposure(camera=camera, light=SceneLight(lens=camera.lens, rendered=nothing), rate=light)
-        return _ImageDevelopment(light, exposure=exposure, context=context, rng=drawing.rng)
 
-    # --- the image -----------------------------------------------------------------------------------------------
+def _development(light: Electrons, context: FaultContext, drawing: _Drawing) -> _ImageDevelopment:
+    """Return what develops images of given electrons."""
+    nodes, camera = context.sunlight[0], context.camera
+    dark = Radiance(array=np.zeros((len(nodes), 1, 1), np.float32), wavelength_nm=nodes)
+    exposure = SceneExposure(camera=camera, light=SceneLight(lens=camera.lens, rendered=dark), rate=light)
+    return _ImageDevelopment(light, exposure=exposure, context=context, rng=drawing.rng)
 
-    def _changed(
-        self, picture: Picture, development: _ImageDevelopment, draws: Draws, drawing: _Drawing
-    ) -> tuple[NDArray[Any], F32 | None]:
-        """Return the numbers of the image with the drawn faults, and its electrons."""
-        camera, optical = development.exposure.camera, acting_at(draws, "electrons")
-        before = picture.electrons.array
-        after = development.signal(draws, optical).merged.array if optical else before
-        if optical:
-            after = after + self._missing_noise(picture, development, draws, after, drawing)
-        change = after - before
-        inside = [name for step in MOSAIC_STEPS for name in acting_at(draws, step)]
-        if inside:
-            change = self._through_sensor(picture, development, draws, after, drawing)
-        numbers = picture.with_change(change)
-        if acting_at(draws, "rgbi"):
-            levels = picture.levels(numbers)
-            numbers = picture.with_levels(numbers, levels, development.read_out(levels, draws))
-        return numbers, None if inside or acting_at(draws, "rgbi") else after
 
-    def _missing_noise(
-        self, picture: Picture, development: _ImageDevelopment, draws: Draws, after: F32, drawing: _Drawing
-    ) -> F32:
-        """Return the noise that the faults' change of the light has, electrons float32[y, x, channel]."""
-        before, camera, context = picture.electrons, development.exposure.camera, development.context
-        optical = acting_at(draws, "electrons")
-        touched = after != before.array
-        if not touched.any():
-            return np.zeros_like(after)
-        read2 = np.float32(camera.detector.read_noise_e_rms**2)
-        deviation = np.sqrt(before.array + read2)
-        kept = []
-        for k in range(2):
-            signs = np.where(drawing.rng("inject", f"signs/{k}").integers(0, 2, after.shape, np.int8), 1, -1)
-            probe = before.with_array((before.array + deviation * signs).astype(np.float32))
-            other = self._development(probe, camera, context, drawing)
-            kept.append((other.signal(draws, optical).merged.array - after) ** 2)
-        mean = 0.5 * (kept[0] + kept[1])
-        mixed = np.abs(kept[0] - kept[1]) > _SAME * (mean + 1)
-        if mixed.any():  # a blur: the variance varies slowly
-            smooth = cv2.blur(mean, (_NEARBY_PX, _NEARBY_PX)).reshape(mean.shape)
-            mean = np.where(mixed, smooth, mean)
-        missing = np.where(touched, np.maximum(np.maximum(after, 0) + read2 - mean, 0), 0).astype(np.float32)
-        normals = draw_normals(after.shape, drawing.rng("inject", "noise"))
-        noise = poisson(missing, normals) - missing
-        return np.where(touched, noise, 0).astype(np.float32)
-
-    def _through_sensor(
-        self, picture: Picture, development: _ImageDevelopment, draws: Draws, after: F32, drawing: _Drawing
-    ) -> F32:
-        """Return the change of electrons, float32[y, x, channel], where faults act inside the sensor, too.
-
-        The noise-free sensor takes the image with and without the faults, so that what both share cancels. Charge
-        that a fault adds gets its shot noise.
-        """
-        camera = development.camera_with(draws).mosaic
-        plain, acts = development.exposure.camera.mosaic, development.acts(draws)
-        exposure_s, pattern = development.exposure.camera.exposure_s, plain.sensor.pattern
-        signals = [picture.electrons, picture.electrons.with_array(np.maximum(after, 0).astype(np.float32))]
-        raws = [
-            sensor.raw(signal, exposure_s, None, steps).astype(np.float32)
-            for sensor, signal, steps in zip((plain, camera), signals, ({}, acts), strict=True)
-        ]
-        own = channel_of(pattern, raws[0].shape)
-        expected = [
-            sensor.device.expected_e(np.take_along_axis(signal.array, own[..., None], 2)[..., 0], exposure_s, steps)
-            for sensor, signal, steps in zip((camera, camera), (signals[1], signals[1]), ({}, acts), strict=True)
-        ]
-        added = np.maximum(expected[1] - expected[0], 0).astype(np.float32)
-        noise = poisson(added, draw_normals(added.shape, drawing.rng("inject", "charge"))) - added
-        change = (raws[1] - raws[0]) / np.float32(plain.sensor.readout.system_gain_dn_per_e) + noise
-        return picture.spread(change)
+def _shape(image: NDArray[Any] | Electrons | Radiance) -> tuple[int, int]:
+    """Return (height, width) in pixels."""
+    array = image.array if isinstance(image, Electrons | Radiance) else image
+    height, width = array.shape[-2:] if isinstance(image, Radiance) else array.shape[:2]
+    return int(height), int(width)
 
 
 def inject(
@@ -427,13 +357,8 @@ def _checked_array(image: Any) -> NDArray[Any]:
         raise InputError(
             f"image of shape {list(array.shape)}: must be [y, x], or [y, x, channel] with 1, 3 or 4 channels"
         )
-    if array.dtype.kind not in "uif" or array.dtype.itemsize > 4 and array.dtype.kind in "ui":
+    if array.dtype.kind not in "uif" or (array.dtype.kind in "ui" and array.dtype.itemsize > 4):
         raise InputError(f"image of {array.dtype}: must hold whole numbers of up to 32 bits, or floats")
     if array.dtype.kind == "f" and not np.isfinite(array).all():
         raise InputError(f"image: holds {int((~np.isfinite(array)).sum())} values that are NaN or infinite")
     return array
-
-
-def camera_shape(camera: Camera) -> tuple[int, int]:
-    """Return (height, width) in pixels."""
-    return camera.height_px, camera.width_px

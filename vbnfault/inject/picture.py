@@ -12,6 +12,7 @@ from ..camera import Camera
 from ..core.errors import InputError
 from ..core.quantities import LUMINANCE, RGBI, Electrons
 from ..detector.demosaic import interpolate
+from ..detector.interface import with_luminance
 from ..detector.mosaic import channel_of
 from ..scene.instrument import ImageTable
 from .response import Response, read_table
@@ -98,18 +99,6 @@ class Picture:
         pattern = self.camera.mosaic.sensor.pattern
         return np.stack([interpolate(change_e, pattern, name) for name in pattern.channels], axis=-1)
 
-    def levels(self, numbers: NDArray[Any]) -> RGBI:
-        """Return numbers as an image of 8 bits."""
-        span = self.response.white_dn - self.response.black_dn
-        code = np.clip(np.rint(255 * (numbers.astype(np.float64) - self.response.black_dn) / span), 0, 255)
-        eight = np.atleast_3d(code.astype(np.uint8))
-        if eight.shape[2] == 1:
-            eight = np.repeat(eight, 4, axis=2)
-        elif eight.shape[2] == 3:
-            intensity = np.rint(eight.astype(np.float32) @ LUMINANCE).astype(np.uint8)
-            eight = np.concatenate([eight, intensity[..., None]], axis=2)
-        return RGBI(array=np.ascontiguousarray(eight))
-
     def with_levels(self, numbers: NDArray[Any], before: RGBI, after: RGBI) -> NDArray[Any]:
         """Return numbers with the change of an image of 8 bits.
 
@@ -128,12 +117,23 @@ class Picture:
         return out
 
     def _rounded(self, values: NDArray[np.float64]) -> NDArray[Any]:
-        """Return values in the data type of the image: whole numbers rounded, and clipped to white and the range."""
+        """Return values in the data type of the image: whole numbers rounded, clipped to white and the range."""
         dtype = self.numbers.dtype
         if dtype.kind == "f":
             return values.astype(dtype)
         limits = np.iinfo(dtype)
         return np.clip(np.rint(values), limits.min, min(self.response.white_dn, limits.max)).astype(dtype)
+
+
+def levels(numbers: NDArray[Any], response: Response) -> NDArray[np.uint8]:
+    """Return numbers as an image of 8 bits, uint8[y, x, 4] with R, G, B and I."""
+    code = 255 * (numbers.astype(np.float64) - response.black_dn) / (response.white_dn - response.black_dn)
+    eight = np.atleast_3d(np.clip(np.rint(code), 0, 255).astype(np.uint8))
+    if eight.shape[2] == 1:
+        eight = np.repeat(eight, 4, axis=2)
+    elif eight.shape[2] == 3:
+        eight = with_luminance(eight)
+    return np.ascontiguousarray(eight)
 
 
 def _response(

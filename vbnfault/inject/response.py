@@ -37,7 +37,7 @@ class Response:
     table: F64 | None = None
 
     def light(self, numbers: ArrayLike) -> F64:
-        """Return linear light over that of white, float64 in the shape of the numbers; below black it is negative."""
+        """Return linear light over that of white, float64 in the shape of the numbers; negative below black."""
         code = (np.asarray(numbers, dtype=np.float64) - self.black_dn) / (self.white_dn - self.black_dn)
         if self.curve == "linear":
             return code

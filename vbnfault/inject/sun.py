@@ -58,6 +58,7 @@ def _saturated_disc(picture: Picture, camera: Camera, distance_au: float) -> F64
     disc = (area > _ROUND * np.pi / 4 * widest**2) & (widest >= max(2.0, _NARROWEST * diameter_px))
     if count < 2 or not disc.any():
         raise InputError(
-            "image.sun = 'auto': the image has no round region of saturated pixels as wide as the Sun; give its position"
+            "image.sun = 'auto': the image has no round region of saturated pixels as wide as the Sun; give its "
+            "position"
         )
     return np.asarray(centres[1:][np.argmax(np.where(disc, area, 0))] + 0.5)

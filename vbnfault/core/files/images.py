@@ -80,7 +80,7 @@ def png_numbers(data: bytes, most_values: int) -> NDArray[Any]:
 
 
 def with_png_numbers(data: bytes, numbers: NDArray[Any], text: str) -> bytes:
-    """Return a PNG file with other numbers [y, x, channel], the other chunks of the former one, and a text chunk."""
+    """Return a PNG file with other numbers [y, x, channel], the chunks of the former one, and a text chunk."""
     done, encoded_data = cv2.imencode(".png", np.ascontiguousarray(_swapped(numbers)))
     if not done:
         raise VbnfaultError("the image cannot be encoded as PNG")

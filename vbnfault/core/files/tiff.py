@@ -75,7 +75,9 @@ def tiff_numbers(data: bytes, most_values: int) -> NDArray[Any]:
             check_values(page.imagelength, page.imagewidth, page.samplesperpixel, most_values)
             _check_kind(page)
             if page.photometric in (_WHITE_IS_0, _PALETTE) or page.bitspersample < 8:
-                raise InputError("is a TIFF file with a palette, inverted grey or packed bits; save it as plain grey or RGB")
+                raise InputError(
+                    "is a TIFF file with a palette, inverted grey or packed bits; save it as plain grey or RGB"
+                )
             return _samples(page, data, most_values)
     except InputError:
         raise
