@@ -63,7 +63,7 @@ _HOMES = {
     "choice": "faults",
     "flag": "faults",
     "export": "output.export:export_store",
-    "inject": "inject:inject",
+    "inject": "inject:",
     "load_lens": "lens",
     "load_scene": "scene.config",
     "load_sensor": "detector.sensor",

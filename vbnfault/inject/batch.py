@@ -298,7 +298,7 @@ def inject_files(
     if labels == "zarr":
         _build(batch, options)
         return batch
-    job = _Images(out, Progress(len(names), shown=progress), dict.fromkeys(range(len(names)), 0))
+    job = _Images(out, Progress(len(names), shown=progress, noun="images"), dict.fromkeys(range(len(names)), 0))
     with job.progress:
         build.do_tasks(_Workers(batch), job, options)
     job.raise_failures(of=f" of {len(names)}")

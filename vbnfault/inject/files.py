@@ -109,8 +109,7 @@ class Fits(ImageFile):
 
     def __init__(self, path: Path) -> None:
         """Read a FITS file."""
-        from astropy.io import fits  # takes half a second to import
-
+        fits = _astropy_fits()
         self._data = path.read_bytes()
         try:
             with fits.open(io.BytesIO(self._data), do_not_scale_image_data=True, memmap=False) as file:
@@ -147,8 +146,7 @@ class Fits(ImageFile):
 
     def write(self, path: Path, numbers: NDArray[Any], text: str) -> None:
         """Write a FITS file with the header of this one and a line of history."""
-        from astropy.io import fits
-
+        fits = _astropy_fits()
         changed = (numbers != self.numbers) & ~self._missing
         scale, zero = self._scale
         out = self._stored.copy()
@@ -167,6 +165,15 @@ class Fits(ImageFile):
             part.header["HISTORY"] = text[:70]
             file.writeto(buffer, output_verify="silentfix")
         write_whole(path, buffer.getvalue())
+
+
+def _astropy_fits() -> Any:
+    """Return astropy's module of FITS files. Raises InputError if it is not installed."""
+    try:
+        from astropy.io import fits  # takes half a second to import
+    except ImportError as error:
+        raise InputError("needs astropy: pip install 'vbnfault[fits]'") from error
+    return fits
 
 
 class Exr(ImageFile):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from ..core import spectra
 from ..core.errors import InputError
 from ..core.quantities import Electrons, Radiance
 from ..faults import Fault, FaultContext
-from ..pipeline.development import Development, Draws
+from ..pipeline.development import Development, Draws, without
 from ..pipeline.injection import visible_draws
 from ..pipeline.labels import labels_of
 from ..pipeline.spec import Draw, Injection, SceneExposure, SceneLight
@@ -33,6 +34,7 @@ Mask = NDArray[np.bool_]
 
 _LEAST_PX = 16
 _ASSUMED_EXPOSURE_S = 0.01
+_ROUNDING_DN = 2.0  # a larger change of the model's image of 8 bits shows in any image
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -195,19 +197,24 @@ class Injector:
         drawing = _Drawing(faults=self.faults, seed=self.scene.dataset.seed, index=index)
         development = _development(light, known, drawing)
         draws, left_out = self._drawn(development, drawing, commanded)
+        result, electrons = None, None
+        if picture is not None:
+            of = partial(_development, context=known, drawing=drawing)
+            drawn, (result, electrons) = draws, struck(picture, development, draws, of, drawing.rng)
+            for name in [name for name in drawn if not development.effect(drawn, name, _ROUNDING_DN).any()]:
+                # a change below the rounding of the model's image may be one below that of this image, too
+                others = without(draws, name)
+                lacking = struck(picture, development, others, of, drawing.rng)
+                if np.array_equal(lacking[0], result):
+                    draws, (result, electrons) = others, lacking
+                    left_out[name] = "changes no number of the image"
         injection = Injection(draws=draws, development=development)
         members = [name for name, fault in self.faults.items() if fault.localised]
         labels = labels_of(self.faults, injection, members, ("mask_effect",))
         shape, nothing = development.context.shape, np.zeros(development.context.shape, dtype=bool)
-        if picture is None:
-            result, electrons = development.image(draws).array, None
-        else:
-            result, electrons = struck(
-                picture, development, draws, lambda other: _development(other, known, drawing), drawing.rng
-            )
         effects = [labels.effects.get(name, nothing) for name in self.faults]
         return Injected(
-            image=result,
+            image=development.image(draws).array if result is None else result,
             clean=development.image({}).array if picture is None else picture.numbers,
             faults=tuple(self.faults),
             masks=labels.masks,
@@ -283,16 +290,8 @@ class Injector:
 
     def _impossible(self, names: Sequence[str], context: FaultContext) -> dict[str, str]:
         """Return why some of the classes cannot act on an image."""
-        lacking = {}
-        for name in names:
-            fault = self.faults[name]
-            if fault.needs_sun and context.sun_xy_px is None:
-                lacking[name] = "needs the Sun before the camera; give it by image.sun or --sun"
-            elif fault.needs_mosaic and context.camera.detector.mosaic is None:
-                lacking[name] = "acts inside a sensor; name one by camera.detector"
-            elif fault.needs_ccd and not context.camera.is_ccd:
-                lacking[name] = "has no effect on CMOS"
-        return lacking
+        dark = [name for name in names if self.faults[name].needs_sun and context.sun_xy_px is None]
+        return dict.fromkeys(dark, "needs the Sun before the camera; give it by image.sun or --sun")
 
 
 def _development(light: Electrons, context: FaultContext, drawing: _Drawing) -> _ImageDevelopment:
