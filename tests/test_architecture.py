@@ -53,7 +53,7 @@ ONLY = {  # distribution → the packages or modules that import it
     "obstore": {"store.bucket"},
     "dask": {"dataset.dask"},
     "distributed": {"dataset.dask"},
-    "torch": {"train.datasets", "train.loader", "train.slots"},
+    "torch": {"inject.transform", "train.datasets", "train.loader", "train.slots"},
     "typer": {"cli"},
     "pyarrow": {"output.export.formats.huggingface", "scene.trajectory", "study"},
     "SALib": {"study"},

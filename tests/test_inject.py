@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 import signal
 import subprocess
 import sys
@@ -20,6 +21,7 @@ from astropy.io import fits
 from typer.testing import CliRunner
 
 import vbnfault
+from vbnfault.camera import Camera
 from vbnfault.cli import app
 from vbnfault.core.errors import InputError, VbnfaultError
 from vbnfault.core.files import resources
@@ -71,6 +73,17 @@ def sun_facing(name: str) -> Frame:
 MODELS = [f"{fault}/{model}" for fault, models in registry().items() for model in models]
 
 
+def fits_camera(name: str, camera: Camera) -> bool:
+    """Return whether a model of a fault can act in a camera."""
+    fault, _, model = name.partition("/")
+    cls = registry()[fault][model]
+    return not (
+        (cls.needs_mosaic and camera.detector.mosaic is None)
+        or (cls.thin_lens_only and camera.lens.real is not None)
+        or (cls.needs_ccd and not camera.is_ccd)
+    )
+
+
 def only(scene: Scene, name: str) -> Scene:
     """Return a scene with one model of a fault, and its defaults."""
     fault, _, model = name.partition("/")
@@ -82,13 +95,8 @@ def only(scene: Scene, name: str) -> Scene:
 @pytest.mark.parametrize("base", ["quickstart", "navcam67p", "physical67p"])
 @pytest.mark.parametrize("name", MODELS)
 def test_own_electrons_give_the_data_sets_own_image(name: str, base: str) -> None:
-    fault, _, model = name.partition("/")
-    cls, frame = registry()[fault][model], sun_facing(base)
-    if (
-        (cls.needs_mosaic and frame.camera.detector.mosaic is None)
-        or (cls.thin_lens_only and frame.camera.lens.real is not None)
-        or (cls.needs_ccd and not frame.camera.is_ccd)
-    ):
+    fault, frame = name.partition("/")[0], sun_facing(base)
+    if not fits_camera(name, frame.camera):
         pytest.skip("the model has no meaning with this camera")
     scene = only(frame.spec.scene, name)
     spec = replace(frame.spec, scene=scene, faults=configure_faults(scene, "scene"))
@@ -110,8 +118,7 @@ def test_every_model_was_seen_in_some_image() -> None:
         frame = sun_facing(base)
         image = frame.images.clean.array[..., 0]
         for name in MODELS:
-            cls = registry()[name.partition("/")[0]][name.partition("/")[2]]
-            if cls.needs_mosaic and frame.camera.detector.mosaic is None:
+            if not fits_camera(name, frame.camera):
                 continue
             result = Injector(only(frame.spec.scene, name))(np.maximum(image, 40), sun=(60.0, 20.0))
             if result.injected.any():
@@ -446,6 +453,32 @@ def test_the_command_says_what_it_assumed_and_where_the_images_are(tmp_path: Pat
     assert "assumed: image.white_dn = 255" in result.output
     assert f"2 images: {tmp_path / 'out'}" in result.output
     assert json.loads((tmp_path / "out/labels/00.png.json").read_text())["seed"] == 3
+
+
+# --- a training loop ----------------------------------------------------------------------------------------------
+
+
+def test_batches_of_a_training_loop_have_the_draws_of_their_numbers() -> None:
+    torch = pytest.importorskip("torch", reason="PyTorch is an extra")
+    from vbnfault.torch import Inject
+
+    faults = {"dust_on_optics": {}, "broken_pixels": {"model": "texture"}, "vignetting": {}}
+    transform = Inject(faults, camera=CAMERA, probability=0.6, seed=4)
+    batch = torch.randint(20, 200, (5, 3, 48, 64), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+    images, masks = transform(batch, range(5))
+    assert images.shape == batch.shape
+    assert images.dtype == batch.dtype
+    assert masks.shape == (5, 3, 48, 64)
+    again, _ = pickle.loads(pickle.dumps(transform))(batch[3:], [3, 4])
+    assert torch.equal(again, images[3:])
+    floats, same = transform(batch.float() / 255, range(5))
+    assert floats.dtype == torch.float32
+    assert torch.equal(same, masks)
+    assert (floats * 255 - images.float()).abs().max() <= 0.51  # the numbers of 8 bits are rounded
+    with pytest.raises(InputError, match="must be uint8 or float32"):
+        transform(batch[0], [0])
+    with pytest.raises(InputError, match="probability = 2: must be from 0 to 1"):
+        Inject(faults, probability=2)
 
 
 # --- bad input ----------------------------------------------------------------------------------------------------

@@ -3,7 +3,7 @@
     result = vbnfault.inject(image, {"dust_on_optics": {"model": "defocused"}}, camera={"fov_deg": 5.0})
 
 The package itself can be called, as its function `inject`. Its modules: `response` converts numbers to light,
-`picture` holds an image as electrons, `change` lets the faults act, `injector` does all of it for image after image,
+`picture` holds an image as electrons, `change` lets the faults act, `injector` does all of it, image after image,
 `files` reads and writes files, and `batch` works through many.
 """
 

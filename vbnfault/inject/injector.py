@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ..camera import Camera
 from ..core import spectra
 from ..core.errors import InputError
-from ..core.quantities import Electrons, Radiance
+from ..core.quantities import RGBI, Electrons, Radiance
 from ..faults import Fault, FaultContext
 from ..pipeline.development import Development, Draws, without
 from ..pipeline.injection import visible_draws
@@ -95,11 +95,18 @@ class Injected:
 
 
 class _ImageDevelopment(Development):
-    """Develop images whose clean electrons are given."""
+    """Develop images whose clean electrons are given; where they hold the noise of an image, no other is drawn."""
 
-    def __init__(self, electrons: Electrons, **shared: Any) -> None:
+    def __init__(self, electrons: Electrons, *, holds_noise: bool, **shared: Any) -> None:
         super().__init__(**shared)
-        self._given = electrons
+        self._given, self._holds_noise = electrons, holds_noise
+
+    @cached_property
+    def noise(self) -> Any:
+        return None if self._holds_noise else super().noise
+
+    def image(self, draws: Draws, *, noisy: bool = True, keep_signals: bool = True) -> RGBI:
+        return super().image(draws, noisy=noisy and not self._holds_noise, keep_signals=keep_signals)
 
     def _undisturbed(self, draws: Draws) -> Electrons:
         if self._instrument(draws):
@@ -195,11 +202,11 @@ class Injector:
             light = picture.electrons
         known = replace(self._context(camera, sun, depth_m, picture), **(context or {}))
         drawing = _Drawing(faults=self.faults, seed=self.scene.dataset.seed, index=index)
-        development = _development(light, known, drawing)
+        of = partial(_development, context=known, drawing=drawing, holds_noise=picture is not None)
+        development = of(light)
         draws, left_out = self._drawn(development, drawing, commanded)
         result, electrons = None, None
         if picture is not None:
-            of = partial(_development, context=known, drawing=drawing)
             drawn, (result, electrons) = draws, struck(picture, development, draws, of, drawing.rng)
             for name in [name for name in drawn if not development.effect(drawn, name, _ROUNDING_DN).any()]:
                 # a change below the rounding of the model's image may be one below that of this image, too
@@ -294,12 +301,14 @@ class Injector:
         return dict.fromkeys(dark, "needs the Sun before the camera; give it by image.sun or --sun")
 
 
-def _development(light: Electrons, context: FaultContext, drawing: _Drawing) -> _ImageDevelopment:
+def _development(
+    light: Electrons, context: FaultContext, drawing: _Drawing, *, holds_noise: bool
+) -> _ImageDevelopment:
     """Return what develops images of given electrons."""
     nodes, camera = context.sunlight[0], context.camera
     dark = Radiance(array=np.zeros((len(nodes), 1, 1), np.float32), wavelength_nm=nodes)
     exposure = SceneExposure(camera=camera, light=SceneLight(lens=camera.lens, rendered=dark), rate=light)
-    return _ImageDevelopment(light, exposure=exposure, context=context, rng=drawing.rng)
+    return _ImageDevelopment(light, holds_noise=holds_noise, exposure=exposure, context=context, rng=drawing.rng)
 
 
 def _shape(image: NDArray[Any] | Electrons | Radiance) -> tuple[int, int]:
