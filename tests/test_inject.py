@@ -474,7 +474,8 @@ def test_batches_of_a_training_loop_have_the_draws_of_their_numbers() -> None:
     floats, same = transform(batch.float() / 255, range(5))
     assert floats.dtype == torch.float32
     assert torch.equal(same, masks)
-    assert (floats * 255 - images.float()).abs().max() <= 0.51  # the numbers of 8 bits are rounded
+    # the numbers of 8 bits are rounded, and rounding of floats moves a count of noise by an electron or two
+    assert (floats * 255 - images.float()).abs().max() <= 0.5 + 2 * 255 / CAMERA["full_well_e"]
     with pytest.raises(InputError, match="must be uint8 or float32"):
         transform(batch[0], [0])
     with pytest.raises(InputError, match="probability = 2: must be from 0 to 1"):
