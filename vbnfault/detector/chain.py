@@ -29,6 +29,7 @@ from .effects.electrons import upper_fraction
 from .efficiency import white_balance
 from .individual import Individual, IndividualSpec, dark_rate_e_s, make_individual, offset_e, response
 from .interface import luminance
+from .measured import as_measured
 from .mosaic import channel_of
 from .noise import NormalField, draw_normals
 from .readout import ReadoutIndividual, ReadoutNoise, read_out
@@ -97,15 +98,20 @@ class Device:
         self.sensor, self.seed, self.direction = sensor, seed, direction
         self.shape = (sensor.height_px, sensor.width_px) if shape is None else shape
         self.temperature_K = sensor.temperature_K if temperature_K is None else temperature_K
-        self.individual = individual(sensor.individual, self.shape, sensor.pixel_pitch_um, seed)
+        self.drawn = individual(sensor.individual, self.shape, sensor.pixel_pitch_um, seed)
+        self.individual = as_measured(self.drawn, sensor)
         self.response = response(self.individual)
         self.offset_e = offset_e(self.individual)
         drawn = ReadoutIndividual.draw(
             self.shape, sensor.readout, np.random.default_rng(np.random.SeedSequence([seed, *b"readout"]))
         )
+        if sensor.measured is not None and sensor.measured.offset_e is not None:
+            drawn = replace(drawn, row_e=None, column_e=None)  # the measured offsets have these patterns
         self.readout_individual = replace(drawn, pixel_e=self.offset_e)
         self.dark_rate_e_s = dark_rate_e_s(self.individual, self.temperature_K)
-        self.transfer_dark_e = transfer_dark_e(sensor, self.dark_rate_e_s, direction)
+        self.transfer_dark_e = None  # a dark frame has this signal, too
+        if sensor.measured is None or sensor.measured.dark_e_s is None:
+            self.transfer_dark_e = transfer_dark_e(sensor, self.dark_rate_e_s, direction)
         self.telegraph = self.individual.rts.at(self.temperature_K)
         self.chain = chain_of(sensor.effects)
 
