@@ -241,7 +241,7 @@ def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
     layers = tuple(name for name in stored_layers(scene, session.faults) if name != "clean")
     individuals = scene.camera.individuals
     _check_origins(session.faults)
-    kinds = tuple(masks.kind(fault, is_ccd=camera.is_ccd) for fault in session.faults.values())
+    kinds = tuple(masks.kind(fault, camera) for fault in session.faults.values())
     references = ephemeris.attitude_references(scene)
     return StoreSpec(
         height=camera.height_px,

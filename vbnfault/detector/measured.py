@@ -174,8 +174,8 @@ class Measured:
         at = self.origin_px and tuple(k // (n * t) * t for k, t in zip(self.origin_px, tile[::-1], strict=True))
         return self.changed(blocks, origin_px=at, description={**self.description, "binning": n})
 
-    def window(self, shape: tuple[int, int], tile: tuple[int, ...]) -> Measured:
-        """Return what the pixels of a window show. Raises InputError where it reaches beyond the sensor."""
+    def corner(self, shape: tuple[int, int], tile: tuple[int, ...]) -> tuple[int, int]:
+        """Return the column and row at which a window begins. Raises InputError where it is not on the sensor."""
         height, width = self.kinds.shape
         x, y = self.origin_px or (
             (width - shape[1]) // 2 // tile[1] * tile[1],
@@ -186,6 +186,11 @@ class Measured:
                 f"defects.origin_px = {[x, y]}: a window of {shape[1]}x{shape[0]} px from there reaches beyond the "
                 f"{width}x{height} px that were measured"
             )
+        return x, y
+
+    def window(self, shape: tuple[int, int], tile: tuple[int, ...]) -> Measured:
+        """Return what the pixels of a window show. Raises InputError where it reaches beyond the sensor."""
+        x, y = self.corner(shape, tile)
         part = slice(y, y + shape[0]), slice(x, x + shape[1])
         return self.changed(lambda _, array: np.ascontiguousarray(array[part]))
 

@@ -51,6 +51,8 @@ class MosaicDetector(Detector):
                 raise InputError(
                     f"{key} = {getattr(self, key)}: {sensor.name} has {getattr(sensor, key)}; must be at most that"
                 )
+        if sensor.measured is not None:
+            sensor.measured.corner((self.height_px, self.width_px), np.shape(sensor.pattern.tile))
 
     @property
     def name(self) -> str:

@@ -3,9 +3,9 @@
 Pinned photodiodes that are not emptied at once leave a fraction to the next exposure, however long after (image
 lag; Fossum & Hondongwa 2014, doi 10.1109/JEDS.2014.2306412). Traps in the depleted volume empty slowly. Releases of
 many time constants add to a power law of the time since, near 1/t: measured on infrared arrays (Smith et al. 2008,
-Proc. SPIE 7021, 70210J; Long et al. 2012, Proc. SPIE 8442, 84421W; Leisenring et al. 2016, Proc. SPIE 9915, 99152N),
-and known as residual bulk image on CCDs (Rest et al. 2002, Rev. Sci. Instrum. 73, 2028). With N the electrons that a
-pixel held, at most the full well, an exposure T that begins w after it gains
+Proc. SPIE 7021, 70210J; Long et al. 2012, Proc. SPIE 8442, 84421W; Leisenring et al. 2016, Proc. SPIE 9915,
+99152N), and known as residual bulk image on CCDs (Rest et al. 2002, Rev. Sci. Instrum. 73, 2028). With N the
+electrons that a pixel held, at most the full well, an exposure T that begins w after it gains
 
     N · (lag_fraction + trap_fraction · ∫ t^-power dt)   from w to w + T, t in s,
 

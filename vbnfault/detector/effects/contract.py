@@ -133,10 +133,13 @@ class Effect(Table):
         Name of the effect, and of its table in a sensor file.
     after
         Name of the effect or the step directly behind which it acts.
+    spreads
+        True if what happens to a pixel reaches others, so that faults may change pixels beyond their footprint.
     """
 
     name: ClassVar[str]
     after: ClassVar[str]
+    spreads: ClassVar[bool] = False
 
     @classmethod
     def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:

@@ -91,6 +91,7 @@ class Compression(Effect):
 
     name = "compression"
     after = "companding"
+    spreads = True
 
     codec: Literal["jpeg", "jpeg2000"] = Field(description="the compression")
     quality: int = Field(90, ge=1, le=100, description="of jpeg: the scale of libjpeg")

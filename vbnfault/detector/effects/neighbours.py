@@ -21,6 +21,8 @@ from .contract import F32, Effect, Exposure
 class _Sharing(Effect, ABC):
     """Let each pixel give fractions of its signal to the eight pixels around it; at the edges none is lost."""
 
+    spreads = True
+
     beside_fraction: float = Field(
         ge=0, le=0.12, description="fraction that each of the four pixels above, below, left and right gets"
     )
