@@ -143,11 +143,15 @@ def test_a_fits_file_says_exposure_and_temperature(tmp_path: Path) -> None:
     assert by_header is not None
     assert by_header == by_keys
     assert by_header.description["dark_temperature_K"] == 273.15
-    # a mean of frames need not be whole
-    mean = write(tmp_path / "mean.fits", np.full(SHAPE, 100.25, np.float32), EXPTIME=DARK_S)
+
+
+@pytest.mark.parametrize("ending", [".fits", ".tif"])
+@pytest.mark.parametrize("dn", [100.25, 2000.0625])
+def test_a_mean_of_frames_need_not_be_whole(tmp_path: Path, ending: str, dn: float) -> None:
+    mean = write(tmp_path / f"mean{ending}", np.full(SHAPE, dn, np.float32))
     gain = sensor(tmp_path).readout.system_gain_dn_per_e
-    device = Device(sensor(tmp_path, defects={"dark": mean}), 1)
-    np.testing.assert_allclose(device.dark_rate_e_s * DARK_S * gain, 36.25, rtol=1e-5)
+    device = Device(sensor(tmp_path, defects={"dark": mean, "dark_exposure_s": DARK_S}), 1)
+    np.testing.assert_allclose(device.dark_rate_e_s * DARK_S * gain, dn - 64, rtol=1e-5)
 
 
 def test_a_list_adds_its_pixels_to_those_that_are_drawn(tmp_path: Path) -> None:

@@ -94,6 +94,11 @@ def test_a_table_bends_the_response() -> None:
     bent = Nonlinearity(table=table).apply(signal, Exposure(device=device, exposure_s=0.1, noise=None, acts={}))
     # beyond the table its last slope, 3000 e over 4000 e, goes on
     np.testing.assert_allclose(bent, [[0, 950, 1900, 4600, 8500, 10_000]], rtol=1e-6)
+    # a full well of 13 500 e reads as 11 125 e, and is white in every colour
+    whole = Device(quiet(Nonlinearity(table=table)), 1, shape=(16, 20))
+    raw = whole.raw(np.full((16, 20), 1e6, np.float32), 0.01)
+    assert (whole.rgbi(raw, 0.01).array == 255).all()
+    assert raw.max() < 0.9 * 4095
     straight = Nonlinearity(table=((1.0, 1.0), (2.0, 2.0)))
     np.testing.assert_array_equal(collected(straight), collected())
 

@@ -39,7 +39,7 @@ class FrozenFrame(Fault):
 
     rows_fraction: Interval = bounds(0.1, 1.0, limits=(0, 1), doc="part of the rows that are stale; assumed")
     shift_px: Interval = bounds(
-        3.0, 60.0, limits=(0, 1024), unit="px", doc="displacement between the two exposures; assumed"
+        3.0, 30.0, limits=(0, 1024), unit="px", doc="displacement between the two exposures; assumed"
     )
 
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:

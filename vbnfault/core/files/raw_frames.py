@@ -46,10 +46,12 @@ def _numbers(values: NDArray[np.float32]) -> NDArray[Any]:
     if values.shape[2] > 1 and (values != values[..., :1]).any():
         raise InputError("has colours; must hold the raw numbers of a mosaic, or grey ones")
     grey = values[..., 0]
+    if not (grey.min() >= 0 and grey.max() <= 1):  # DN as they are: floating-point numbers, such as means of frames
+        return grey
     for top, kind in ((255, np.uint8), (65535, np.uint16)):
         whole = np.rint(grey * np.float32(top))
         # sixteen bits lie off the steps of eight bits by 1/257 at least
-        if np.abs(grey * np.float32(top) - whole).max() < (1e-3 if top == 255 else 0.05) and whole.min() >= 0:
+        if np.abs(grey * np.float32(top) - whole).max() < (1e-3 if top == 255 else 0.05):
             return whole.astype(kind)
     return grey
 

@@ -33,7 +33,7 @@ class Nonlinearity(Effect):
     """Bend the response of the sense node and the amplifier by a table, as a linearity test measures it.
 
     Pairs as in EMVA 1288 (release 4.0, section 6.7): what light makes, and what it reads as. Straight lines join
-    them, the first from (0, 0), and the last goes on. The development of the image does not correct the response.
+    them, the first from (0, 0), and the last goes on. The image is not corrected for it, but a full well is white.
     """
 
     name = "nonlinearity"
@@ -55,10 +55,14 @@ class Nonlinearity(Effect):
 
     def apply(self, signal: F32, exposure: Exposure) -> F32:
         """Return the electrons as which the charge reads."""
+        return self.read(signal)
+
+    def read(self, electrons: F32) -> F32:
+        """Return the electrons as which a charge reads, float32 in the shape of `electrons`."""
         given, read = np.array([(0.0, 0.0), *self.table]).T
         slope = (read[-1] - read[-2]) / (given[-1] - given[-2])
-        beyond = np.maximum(signal - given[-1], 0) * slope
-        return np.asarray(np.interp(signal, given, read) + beyond, dtype=np.float32)
+        beyond = np.maximum(electrons - given[-1], 0) * slope
+        return np.asarray(np.interp(electrons, given, read) + beyond, dtype=np.float32)
 
 
 class Analogue(Effect):
