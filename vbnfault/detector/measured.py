@@ -244,8 +244,8 @@ def _measured(sensor: Sensor) -> Measured:
         maps["damage_e_s"] = (rate - usual) / np.float32(arrhenius_factor(kelvin, spec.reference_K))
         kinds[hot] |= HOT
     maps["offset_e"] = offset
-    for name in set(frames) - {"flat"}:
-        if name == "dark" or "dark" not in frames:
+    for name in ("bias", "dark"):  # of the dark frame, where there are both
+        if name in frames:
             maps["level"] = frames[name] / np.float32(readout.top_dn)
     if "flat" in signal:
         dark_e = (0 if offset is None else offset) + rate * np.float32(files.flat_exposure_s)

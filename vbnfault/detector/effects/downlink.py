@@ -37,13 +37,14 @@ class Companding(Effect):
     after = "stuck_pixels"
 
     law: Literal["square_root", "linear"] = Field(
-        "square_root", description="how DN, bias included, grow with the codes: as their square, or in equal steps"
+        "square_root",
+        description="square_root or linear: DN, bias included, grow as the square of the codes, or as the codes",
     )
     bits: int = Field(8, ge=1, le=16, description="bits of a code")
     levels_dn: tuple[Annotated[int, Field(ge=0, le=65535)], ...] = Field(
         (),
         max_length=65536,
-        description="DN that the ground restores for each code, rising, in place of law and bits; default: by them",
+        description="DN that the ground restores for each code, rising, in place of law and bits",
     )
 
     @field_validator("levels_dn")
@@ -93,7 +94,7 @@ class Compression(Effect):
     after = "companding"
     spreads = True
 
-    codec: Literal["jpeg", "jpeg2000"] = Field(description="the compression")
+    codec: Literal["jpeg", "jpeg2000"] = Field(description="the compression: jpeg or jpeg2000")
     quality: int = Field(90, ge=1, le=100, description="of jpeg: the scale of libjpeg")
     bits_per_px: float = Field(2.0, ge=0.05, le=16, description="of jpeg2000: size of the compressed image at most")
 

@@ -39,7 +39,7 @@ class _Sharing(Effect, ABC):
 
 
 class Crosstalk(_Sharing):
-    """Let carriers diffuse to neighbouring pixels before they are collected (Janesick 2001, section 4.2)."""
+    """Let carriers diffuse to neighbouring pixels before they are collected (Janesick 2001)."""
 
     name = "crosstalk"
     after = "light"
