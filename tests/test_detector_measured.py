@@ -126,6 +126,45 @@ def test_a_measured_device_takes_the_frames_again(tmp_path: Path, name: str, nod
         assert np.abs(plain.raw(light, exposure_s).astype(int) - taken[key])[known].max() > limit
 
 
+def test_a_dark_frame_alone_is_taken_again_at_its_exposure(tmp_path: Path) -> None:
+    """Below black a pixel has an offset, above it dark current; a stuck pixel shows what the frame shows."""
+    dark = np.random.default_rng(1).integers(55, 110, SHAPE).astype(np.uint16)
+    table = {"dark": write(tmp_path / "dark.png", dark), "dark_exposure_s": DARK_S}
+    device = Device(sensor(tmp_path, defects=table), 1)
+    np.testing.assert_array_equal(device.raw(ZERO, DARK_S), dark)
+    np.testing.assert_array_equal(device.raw(ZERO, 0.0), np.minimum(dark, 64))
+    table |= {"bad_pixels": listed(tmp_path, "x,y\n5,6\n"), "bad_kind": "stuck"}
+    assert Device(sensor(tmp_path, defects=table), 1).raw(LIGHT, 0.1)[6, 5] == dark[6, 5]
+
+
+def test_frames_may_be_of_another_gain(tmp_path: Path, frames: dict[str, Any]) -> None:
+    """Twice the DN per electron: half of the electrons, half of the offsets and currents, the same responses."""
+    own, other = (
+        sensor(tmp_path, defects=frames | more).measured
+        for more in ({}, {"gain_dn_per_e": 2 * sensor(tmp_path).readout.system_gain_dn_per_e})
+    )
+    assert own is not None
+    assert other is not None
+    for name in ("offset_e", "dark_e_s"):
+        np.testing.assert_allclose(getattr(other, name), getattr(own, name) / 2, rtol=1e-5)
+    np.testing.assert_allclose(other.gain, own.gain, rtol=1e-5)
+
+
+def test_the_shade_of_lamp_and_lens_is_no_response(tmp_path: Path, frames: dict[str, Any]) -> None:
+    y, x = (np.linspace(-1, 1, size) for size in SHAPE)
+    shade = 1 - 0.2 * (x**2 + y[:, None] ** 2) + 0.05 * x
+    flat = cv2.imread(str(tmp_path / frames["flat"]), cv2.IMREAD_UNCHANGED)
+    write(tmp_path / "shaded.png", np.rint(64 + (flat - 64.0) * shade).astype(np.uint16))
+    table = frames | {"flat": "shaded.png"}
+    true = Device(sensor(tmp_path), 5).response
+    kept, removed = (
+        Device(sensor(tmp_path, defects=table | {"flat_surface": how}), 5).response for how in ("kept", "removed")
+    )
+    # 15 terms of 768 pixels of each colour take 1 % of the responses' spread of 0.01 along, 14 % of it in amplitude
+    assert (removed - true).std() < 0.2 * 0.01
+    assert (kept / true).std() == pytest.approx((shade / shade.mean()).std(), rel=0.05)
+
+
 def test_currents_follow_the_temperature_by_their_own_laws(tmp_path: Path) -> None:
     """An ordinary pixel as silicon, a hot one beyond the median as displaced atoms (0.63 eV)."""
     made = sensor(tmp_path)
