@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
@@ -52,8 +53,9 @@ _BITS = {"dead": DEAD, "hot": HOT, "stuck": STUCK, "rts": RTS}
 _FRAMES = ("dark", "bias", "flat")
 _FILES = (*_FRAMES, "bad_pixels")
 
-_OUTLIER = 6.0  # robust standard deviations above the median from which a dark current is a hot pixel's
-_DEAD_BELOW = 0.5  # response over the mean response, as `vbnfault fit` counts dead pixels
+_AROUND_PX = 5  # width of the square whose median stands for the neighbours of a pixel
+_OUTLIER = 6.0  # robust standard deviations above its neighbours from which a dark current is a hot pixel's
+_DEAD_BELOW = 0.5  # response over that of the neighbours of its colour, as `vbnfault fit` counts dead pixels
 _LEAST_FLAT_DN = 10.0
 _SATURATED = 0.95
 
@@ -237,20 +239,19 @@ def _measured(sensor: Sensor) -> Measured:
     offset: Any = signal.get("bias")
     rate: Any = np.float32(0)
     if "dark" in signal:
-        rate, offset, hot = _dark(signal["dark"], offset, files, 0.5 / float(gains.max()))
-        usual = np.where(hot, np.median(rate), rate).astype(np.float32)
+        rate, usual, offset = _dark(signal["dark"], offset, files, 0.5 / float(gains.max()))
         kelvin: Any = files.dark_temperature_K
         maps["dark_e_s"] = usual / np.float32(spec.dark_factor(kelvin))
         maps["damage_e_s"] = (rate - usual) / np.float32(arrhenius_factor(kelvin, spec.reference_K))
-        kinds[hot] |= HOT
+        kinds[rate > usual] |= HOT
     maps["offset_e"] = offset
     for name in ("bias", "dark"):  # of the dark frame, where there are both
         if name in frames:
             maps["level"] = frames[name] / np.float32(readout.top_dn)
     if "flat" in signal:
         dark_e = (0 if offset is None else offset) + rate * np.float32(files.flat_exposure_s)
-        maps["gain"] = _responses(signal["flat"] - dark_e, files, sensor)
-        kinds[maps["gain"] < _DEAD_BELOW] |= DEAD
+        maps["gain"], dead = _responses(signal["flat"] - dark_e, files, sensor)
+        kinds[dead] |= DEAD
     if files.bad_pixels:
         kinds |= _listed(files.bad_pixels, files.bad_kind, shape)
     return Measured(**maps, kinds=kinds, origin_px=files.origin_px, description=_description(files))
@@ -313,25 +314,27 @@ def _check_size(image: NDArray[Any], where: str, shape: tuple[int, int]) -> None
         )
 
 
-def _dark(
-    signal_e: F32, offset_e: F32 | None, files: DefectFiles, least_e: float
-) -> tuple[F32, F32, NDArray[np.bool_]]:
-    """Return dark currents at the frame's temperature, offsets, and which pixels are hot, from a dark frame.
+def _dark(signal_e: F32, offset_e: F32 | None, files: DefectFiles, least_e: float) -> tuple[F32, F32, F32]:
+    """Return dark currents at the frame's temperature, those without the excess of hot pixels, and offsets.
 
-    Without a bias frame, all that a pixel shows above black is dark current, and what it lacks is its offset.
-    `least_e` is the least standard deviation, that of rounding.
+    A pixel is hot if it is far above its neighbours, as a glow is not. Without a bias frame, all that a pixel shows
+    above black is dark current, and what it lacks is its offset. `least_e` is the least standard deviation, that of
+    rounding.
     """
     if offset_e is None:
         offset_e = np.minimum(signal_e, 0)
     assert files.dark_exposure_s is not None
     rate = np.maximum(signal_e - offset_e, 0) / np.float32(files.dark_exposure_s)
-    above = rate - np.median(rate)
-    spread = max(1.4826 * float(np.median(np.abs(above))), least_e / files.dark_exposure_s)
-    return rate, offset_e, above > _OUTLIER * spread
+    around = cv2.medianBlur(rate, _AROUND_PX)
+    spread = max(1.4826 * float(np.median(np.abs(rate - around))), least_e / files.dark_exposure_s)
+    return rate, np.where(rate - around > _OUTLIER * spread, around, rate), offset_e
 
 
-def _responses(signal_e: F32, files: DefectFiles, sensor: Sensor) -> F32:
-    """Return the response of each pixel over the mean of its colour, at least 0, from a flat. Raises InputError."""
+def _responses(signal_e: F32, files: DefectFiles, sensor: Sensor) -> tuple[F32, NDArray[np.bool_]]:
+    """Return the response of each pixel over the mean of its colour, at least 0, and which pixels are dead.
+
+    Raises InputError for a flat that is dark or saturated.
+    """
     readout, gain = sensor.readout, files.gain_dn_per_e or 1.0
     least, full = _LEAST_FLAT_DN / gain, min((readout.top_dn - readout.bias_dn) / gain, readout.full_well_e)
     middle = float(np.median(signal_e))
@@ -340,16 +343,18 @@ def _responses(signal_e: F32, files: DefectFiles, sensor: Sensor) -> F32:
             f"defects.flat = {shown(files.flat)}: has a median of {middle:.4g} e above black; must be from "
             f"{least:.4g} to {_SATURATED * full:.4g}, below saturation"
         )
-    out = np.empty_like(signal_e)
+    out, dead = np.empty_like(signal_e), np.empty(signal_e.shape, dtype=np.bool_)
     rows, columns = np.shape(sensor.pattern.tile)
     for y in range(rows):
         for x in range(columns):
-            plane: Any = signal_e[y::rows, x::columns]
-            usual = np.abs(plane / np.median(plane) - 1) < _DEAD_BELOW
+            plane: Any = np.ascontiguousarray(signal_e[y::rows, x::columns])
+            around = cv2.medianBlur(plane, _AROUND_PX)
+            usual = np.abs(plane - around) < _DEAD_BELOW * around
+            dead[y::rows, x::columns] = plane <= _DEAD_BELOW * around
             if files.flat_surface == "removed":
-                plane = plane / np.maximum(smooth_surface(np.where(usual, plane, np.median(plane))), 1e-6)
+                plane = plane / np.maximum(smooth_surface(np.where(usual, plane, around)), 1e-6)
             out[y::rows, x::columns] = np.maximum(plane / plane[usual].mean(dtype=np.float64), 0)
-    return out
+    return out, dead
 
 
 def smooth_surface(image: F32) -> F32:
