@@ -34,8 +34,8 @@ TABLES: dict[str, list[dict[str, Any]]] = {
 }
 
 
-def raw_of(folder: Path, name: str, effects: dict[str, Any]) -> NDArray[Any]:
-    """The raw mosaic that a store holds of a scene whose sensor has effects."""
+def sensor_file(folder: Path, name: str, effects: dict[str, Any]) -> str:
+    """The path of a packaged sensor's file with effects."""
     table = toml_files.read_toml(resources.find("scenes/detectors", "generic_cmos"), "detector")
     table["effects"] = effects
     numbers = [
@@ -46,9 +46,14 @@ def raw_of(folder: Path, name: str, effects: dict[str, Any]) -> NDArray[Any]:
     ]
     table["sources"] |= dict.fromkeys(numbers, "assumed")
     (folder / f"{name}.toml").write_text(toml_files.toml_text(table))
+    return str(folder / f"{name}.toml")
+
+
+def raw_of(folder: Path, name: str, effects: dict[str, Any]) -> NDArray[Any]:
+    """The raw mosaic that a store holds of a scene whose sensor has effects."""
     scene = small_scene(
         dataset={"samples": 1, "sites": 1, "layers": ["raw"], "shard_samples": 1},
-        camera={"width_px": 48, "height_px": 40, "detector": str(folder / f"{name}.toml")},
+        camera={"width_px": 48, "height_px": 40, "detector": sensor_file(folder, name, effects)},
     )
     out = folder / f"{name}.zarr"
     dataset.build_scene(parse_scene({**scene, "faults": {}}, source="test"), out, source="test")
@@ -87,3 +92,20 @@ def test_all_at_once_act_in_the_order_of_the_chain(tmp_path: Path, plain: NDArra
     raw = raw_of(tmp_path, "all", {name: TABLES[name][0] for name in TABLES})
     assert raw.shape == plain.shape
     assert np.corrcoef(raw.ravel(), plain.ravel())[0, 1] > 0.9
+
+
+def test_masks_hold_what_compression_spreads(tmp_path: Path) -> None:
+    """Without noise, nothing differs from the clean twin beyond the mask of broken pixels."""
+    coarse = {"compression": TABLES["compression"][1]}
+    scene = small_scene(
+        dataset={"samples": 2, "sites": 1, "layers": ["clean", "mask_effect"], "shard_samples": 2},
+        camera={"width_px": 48, "height_px": 40, "detector": sensor_file(tmp_path, "a", coarse)},
+        plan={"faulty_fraction": 1.0},
+    )
+    faults = {"broken_pixels": {"model": "hot_pixels", "growth_factor": 1e5, "least_dn": 20.0}}
+    out = tmp_path / "a.zarr"
+    dataset.build_scene(parse_scene({**scene, "faults": faults}, source="test"), out, source="test")
+    opened = store.open_store(out)
+    layers = opened.read_sample(0).layers
+    assert layers["mask_effect"][0].sum() > 64  # blocks of 8 x 8 pixels of each colour
+    assert not (layers["mask_effect"] & ~layers["mask"]).any()
