@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -292,6 +293,9 @@ def test_binned_and_windowed_pixels_are_those_of_the_sensor(tmp_path: Path, fram
     np.testing.assert_array_equal(device.individual.dsnu_e, both.measured.offset_e[2:18, 4:24])
     middle = Device(sensor(tmp_path, defects=frames), 9, shape=(20, 30))
     np.testing.assert_array_equal(middle.individual.dsnu_e, whole.offset_e[14:34, 16:46])
+    again = pickle.loads(pickle.dumps(both))
+    assert (again, hash(again)) == (both, hash(both))
+    assert both.measured != whole
     # a higher gain shows the same electrons
     assert amplified(made, 4.0).measured is whole
 

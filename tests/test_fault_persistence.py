@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from conftest import small_scene
 from scipy.integrate import quad
 from test_faults_kit import make, make_context, noisy, rng, with_mosaic
 
+from vbnfault import dataset, store
 from vbnfault.core.quantities import Charge
 from vbnfault.faults import FaultContext
 from vbnfault.faults.persistence import power_integral
+from vbnfault.scene.config import parse_scene
 
 SIZE = 64
 
@@ -82,3 +87,40 @@ def test_the_sun_leaves_a_disc_of_its_size() -> None:
         np.indices(dark.shape) + 0.5, axis=(1, 2), weights=np.broadcast_to(quantity.array, dark.shape)
     )
     assert (x, y) == pytest.approx((30.0, 20.0), abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("name", "table"),
+    [
+        *(("persistence", {"source": source, "lag_fraction": 0.3}) for source in ("drawn", "frame", "sun")),
+        ("frozen_frame", {}),
+        ("transmission", {"fill": "shifted", "sync_rows": 8, "packet_px": 64}),
+        ("transmission", {"cut_rows": 16, "cut_every": 1, "lost_count": 0, "damaged_count": 0, "lost_lines": 0}),
+    ],
+)
+def test_faults_of_earlier_exposures_and_of_the_link_reach_the_store(
+    name: str, table: dict[str, Any], tmp_path: Path
+) -> None:
+    scene = small_scene(
+        dataset={"samples": 2, "sites": 1, "layers": ["clean"], "shard_samples": 2},
+        camera={"width_px": 48, "height_px": 40, "detector": "generic_cmos"},
+        plan={"faulty_fraction": 1.0},
+    )
+    out = tmp_path / "a.zarr"
+    dataset.build_scene(parse_scene({**scene, "faults": {name: table}}, source="test"), out, source="test")
+    opened = store.open_store(out)
+    assert store.examine(opened, expected=dataset.planned(opened.attributes, opened.spec.faults)).problems == []
+    for k in range(2):
+        sample = opened.read_sample(k)
+        assert sample.scalars["injected"].all()
+        mask = sample.layers["mask"][0]
+        changed = (sample.layers["image"] != sample.layers["clean"]).any(axis=2)
+        assert mask.any()
+        if name == "transmission":  # a footprint, beyond which nothing changes
+            assert not (changed & ~mask).any()
+        elif name == "frozen_frame":
+            first, last = json.loads(sample.scalars["parameters"])[name]["rows"]
+            near = np.zeros(len(mask), bool)
+            near[max(first - 2, 0) : last + 2] = True  # demosaicing reaches two rows
+            assert not changed[~near].any()
+            assert changed[first:last].mean() > 0.3
