@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
+from ...core.errors import VbnfaultError
 from .contract import Effect, Exposure
 from .output import Raw
 
@@ -125,10 +126,12 @@ class Compression(Effect):
         below, right = max(_LEAST_PX - height, 0), max(_LEAST_PX - width, 0)
         plane = cv2.copyMakeBorder(plane, 0, below, 0, right, cv2.BORDER_REFLECT)
         if self.codec == "jpeg":
-            _, data = cv2.imencode(".jpg", plane.astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, self.quality])
+            done, data = cv2.imencode(".jpg", plane.astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, self.quality])
         else:
             rate = max(round(1000 * self.bits_per_px / 16), 1)  # of OpenCV, in thousandths of 16 bits
-            _, data = cv2.imencode(".jp2", plane, [cv2.IMWRITE_JPEG2000_COMPRESSION_X1000, rate])
+            done, data = cv2.imencode(".jp2", plane, [cv2.IMWRITE_JPEG2000_COMPRESSION_X1000, rate])
+        if not done:
+            raise VbnfaultError(f"effects.compression: OpenCV {cv2.__version__} cannot encode {self.codec}")
         return np.asarray(cv2.imdecode(data, cv2.IMREAD_UNCHANGED))[:height, :width]
 
 
