@@ -27,7 +27,7 @@ from ..camera import Camera
 from ..core.errors import InputError, VbnfaultError, in_file
 from ..core.files import file_contents, resources, user_files
 from ..core.process import llvm
-from ..detector import Detector
+from ..detector import Detector, load_sensor
 from ..faults import Fault, belongs_here, is_packaged, loaded_plugin, plugins_of, registry
 from ..lens import load_lens
 from ..pipeline import masks
@@ -198,8 +198,10 @@ def _contents_of_files(identity: dict[str, Any], scene: Scene) -> None:
     if scene.camera.lens:
         identity["camera"]["lens"] = _lens_digest(scene.camera.lens)
     if scene.camera.detector:
-        identity["camera"]["detector"] = _digest(
-            resources.find("scenes/detectors", scene.camera.detector), "detector"
+        path = resources.find("scenes/detectors", scene.camera.detector)
+        measured = load_sensor(path).measured
+        identity["camera"]["detector"] = "+".join(
+            [_digest(path, "detector"), *(measured.digests if measured else ())]
         )
     if scene.body.albedo_map is not None and scene.body.albedo_map.file != EARTH:
         identity["body"]["albedo_map"]["file"] = _digest(scene.body.albedo_map.file, "texture")
@@ -243,7 +245,7 @@ def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
     layers = tuple(name for name in stored_layers(scene, session.faults) if name != "clean")
     individuals = scene.camera.individuals
     _check_origins(session.faults)
-    kinds = tuple(masks.kind(fault, is_ccd=camera.is_ccd) for fault in session.faults.values())
+    kinds = tuple(masks.kind(fault, camera) for fault in session.faults.values())
     references = ephemeris.attitude_references(scene)
     return StoreSpec(
         height=camera.height_px,

@@ -191,7 +191,7 @@ class ComaGrains(_Particles):
 
     model = "coma_grains"
     default = True
-    after = ""
+    after = "frozen_frame"
 
 
 @dataclass(frozen=True, kw_only=True)
