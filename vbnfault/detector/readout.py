@@ -266,7 +266,8 @@ class ReadoutIndividual:
         """Draw patterns of the spec's spreads. It always draws one variate per row, column and code."""
         row, column = (rng.standard_normal(n, dtype=np.float32) for n in shape)
         if (freedom := spec.column_pattern_freedom) is not None:  # scaled to the same standard deviation
-            column = (stdtrit(freedom, ndtr(column.astype(np.float64))) * (1 - 2 / freedom) ** 0.5).astype(np.float32)
+            tailed = stdtrit(freedom, ndtr(column.astype(np.float64)))
+            column = (tailed * (1 - 2 / freedom) ** 0.5).astype(np.float32)
         widths = rng.standard_normal(spec.top_dn + 1, dtype=np.float32)
         return cls(
             row_e=row * np.float32(spec.row_pattern_e_rms),
