@@ -116,11 +116,11 @@ def test_every_model_was_seen_in_some_image() -> None:
     seen = set()
     for base in ("quickstart", "navcam67p", "physical67p"):
         frame = sun_facing(base)
-        image = frame.images.clean.array[..., 0]
+        image = frame.images.clean.array[..., 0].astype(np.uint16) * 257  # charge that lags behind is little
         for name in MODELS:
             if not fits_camera(name, frame.camera):
                 continue
-            result = Injector(only(frame.spec.scene, name))(np.maximum(image, 40), sun=(60.0, 20.0))
+            result = Injector(only(frame.spec.scene, name))(np.maximum(image, 40 * 257), sun=(60.0, 20.0))
             if result.injected.any():
                 seen.add(name)
                 assert (result.image != result.clean).any()
