@@ -118,7 +118,7 @@ def test_every_model_was_seen_in_some_image() -> None:
         frame = sun_facing(base)
         image = frame.images.clean.array[..., 0].astype(np.uint16) * 257  # charge that lags behind is little
         for name in MODELS:
-            if not fits_camera(name, frame.camera):
+            if name in seen or not fits_camera(name, frame.camera):
                 continue
             result = Injector(only(frame.spec.scene, name))(np.maximum(image, 40 * 257), sun=(60.0, 20.0))
             if result.injected.any():
