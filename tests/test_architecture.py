@@ -206,7 +206,17 @@ def test_every_required_package_that_is_imported_is_declared() -> None:
     imported = {i.target.partition(".")[0] for i in imports() if i.target_unit is None}
     names = importlib.metadata.packages_distributions()
     needed = {name.replace("_", "-") for module in imported for name in names.get(module, [])}
-    optional = {"SALib", "astropy", "dask", "distributed", "obstore", "scikit-learn", "spiceypy", "torch", "vbnfault"}
+    optional = {
+        "SALib",
+        "astropy",
+        "dask",
+        "distributed",
+        "obstore",
+        "scikit-learn",
+        "spiceypy",
+        "torch",
+        "vbnfault",
+    }
     assert needed - optional <= declared.keys() | {"pydantic-core"}  # pydantic requires one version of it
     for name, version in (("mitsuba", "3.10.0"), ("drjit", "1.6.0"), ("zarr", "4.0.0"), ("pydantic", "3.0.0")):
         assert version not in declared[name]

@@ -32,8 +32,9 @@ from .picture import Picture, levels
 F32 = NDArray[np.float32]
 Rng = Callable[[str, str], np.random.Generator]
 
-_NEARBY_PX = 15  # over which the variance of noise that a fault mixes between pixels is averaged
-_SAME = 1e-3  # relative difference of two measurements of the variance that shows no mixing
+# Pixels over which the variance of noise that a fault mixes is averaged, and fraction of them whose perturbation
+# must have changed its sign for that
+_NEARBY_PX, _MIXED = 15, 0.01
 
 
 def struck(
@@ -44,15 +45,18 @@ def struck(
     The electrons are None where a fault acts inside the sensor or on the finished image. `of` returns the same
     development of other electrons, and `rng` the generator for (stage, name).
     """
-    before, optical = picture.electrons.array, acting_at(draws, "electrons")
-    after = before
+    before, optical = picture.electrons, acting_at(draws, "electrons")
+    after, change = before.array, np.zeros_like(picture.light)
     if optical:
         after = development.signal(draws, optical).merged.array
-        after = after + _missing_noise(
-            picture, after, lambda light: of(light).signal(draws, optical).merged.array, rng
+        change = picture.in_image(after - before.array)
+        noise = _missing_noise(
+            picture, change, lambda light: of(light).signal(draws, optical).merged.array - after, rng
         )
+        change, after = change + noise, after + (picture.seen(noise).array if noise.any() else 0)
     inside = any(acting_at(draws, step) for step in MOSAIC_STEPS)
-    change = _through_sensor(picture, development, draws, after, rng) if inside else after - before
+    if inside:
+        change = picture.in_image(_through_sensor(picture, development, draws, after, rng))
     numbers = picture.with_change(change)
     on_image = bool(acting_at(draws, "rgbi"))
     if on_image:
@@ -61,29 +65,29 @@ def struck(
     return numbers, None if inside or on_image else after
 
 
-def _missing_noise(picture: Picture, after: F32, act: Callable[[Electrons], F32], rng: Rng) -> F32:
-    """Return the noise of the light that faults took away or added, electrons float32[y, x, channel].
+def _missing_noise(picture: Picture, change: F32, act: Callable[[Electrons], F32], rng: Rng) -> F32:
+    """Return the noise of the light that faults took away or added, over white, float32[y, x, channel].
 
-    `act` returns what the faults make of other electrons.
+    `act` returns the change of what the faults make of the image's electrons if these are others.
     """
-    before = picture.electrons
-    touched = after != before.array
+    touched = change != 0
     if not touched.any():
-        return np.zeros_like(after)
+        return np.zeros_like(change)
+    white = picture.white_e
     read2 = np.float32(picture.camera.detector.read_noise_e_rms**2)
-    deviation = np.sqrt(before.array + read2)
-    left = []
-    for k in range(2):
-        signs = 2 * rng("inject", f"signs/{k}").integers(0, 2, after.shape, np.int8) - np.int8(1)
-        left.append((act(before.with_array((before.array + deviation * signs).astype(np.float32))) - after) ** 2)
-    variance = 0.5 * (left[0] + left[1])
-    mixed = np.abs(left[0] - left[1]) > _SAME * (variance + 1)
-    if mixed.any():  # a blur: the variance that it leaves varies slowly over the image
+    signs = 2 * rng("inject", "signs").integers(0, 2, change.shape, np.int8) - np.int8(1)
+    probe = np.sqrt(picture.light * white + read2) / white * signs
+    left = picture.in_image(act(picture.seen(picture.light + probe))) * white
+    variance = left**2
+    # a fault that acts on each pixel alone keeps the signs; a blur mixes them, and its variance varies slowly
+    mixed = cv2.blur((left * signs < 0).astype(np.float32), (_NEARBY_PX, _NEARBY_PX)).reshape(left.shape) > _MIXED
+    if mixed.any():
         smooth = cv2.blur(variance, (_NEARBY_PX, _NEARBY_PX)).reshape(variance.shape)
         variance = np.where(mixed, smooth, variance)
-    missing = np.maximum(np.maximum(after, 0) + read2 - variance, 0).astype(np.float32)
-    noise = poisson(missing, draw_normals(after.shape, rng("inject", "noise"))) - missing
-    return np.where(touched, noise, np.float32(0))
+    after = np.maximum(picture.light + change, 0) * white
+    missing = np.maximum(after + read2 - variance, 0).astype(np.float32)
+    noise = poisson(missing, draw_normals(change.shape, rng("inject", "noise"))) - missing
+    return np.where(touched, noise / white, np.float32(0))
 
 
 def _through_sensor(picture: Picture, development: Development, draws: Draws, after: F32, rng: Rng) -> F32:

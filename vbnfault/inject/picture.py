@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from ..core.errors import InputError
 from ..core.quantities import LUMINANCE, RGBI, Electrons
 from ..detector.demosaic import interpolate
 from ..detector.interface import with_luminance
-from ..detector.mosaic import channel_of
+from ..detector.mosaic import channel_of, sample
 from ..scene.instrument import ImageTable
 from .response import Response, read_table
 
@@ -30,8 +31,11 @@ class Picture:
     ----------
     numbers
         The image as given, [y, x] or [y, x, channel].
-    electrons
-        Electrons of each pixel and channel of the camera that its numbers stand for, not below 0.
+    light
+        Light that the numbers stand for over that of white, float32[y, x, channel of the image], not below 0.
+    white_e
+        Electrons at white, float32[channel of the image]. Grey images and raw mosaics have one channel, whose white
+        is the full well over the gain.
     response
         How the numbers follow from light.
     camera
@@ -45,7 +49,8 @@ class Picture:
     """
 
     numbers: NDArray[Any]
-    electrons: Electrons
+    light: F32
+    white_e: F32
     response: Response
     camera: Camera
     raw: bool
@@ -60,44 +65,54 @@ class Picture:
             what = "camera.detector names no sensor" if detector.mosaic is None else "it has several channels"
             raise InputError(f"image: cannot be a raw mosaic: {what}")
         response, assumptions = _response(numbers.dtype, table, camera, raw=raw)
-        light = response.light(numbers)
         highest = np.iinfo(numbers.dtype).max if numbers.dtype.kind in "ui" else np.inf
         lost = (numbers >= min(response.white_dn, highest)) | (numbers <= np.minimum(0, response.black_dn))
-        if numbers.ndim == 3:
-            lost = lost.any(axis=2)
-        planes = _unmixed(light, camera) if raw else _to_camera(light, camera)
-        white = detector.white_e
-        electrons = (np.maximum(planes, 0) * white).astype(np.float32)
+        light = np.atleast_3d(np.maximum(response.light(numbers), 0).astype(np.float32))
         return cls(
             numbers=numbers,
-            electrons=Electrons(array=electrons, white_e=white),
+            light=light,
+            white_e=_white_e(light.shape[2], camera),
             response=response,
             camera=camera,
             raw=raw,
-            unrecoverable=lost,
+            unrecoverable=lost.any(axis=2) if lost.ndim == 3 else lost,
             assumptions=assumptions,
         )
 
-    def with_change(self, change_e: F32) -> NDArray[Any]:
-        """Return the numbers with a change of electrons, float32[y, x, channel]; others stay as they are."""
-        fraction = change_e / self.camera.detector.white_e
+    @cached_property
+    def electrons(self) -> Electrons:
+        """Return the electrons of each pixel and channel of the camera that the numbers stand for."""
+        return self.seen(self.light)
+
+    def seen(self, light: F32) -> Electrons:
+        """Return light of the image, [y, x, channel of the image], as electrons of the camera's channels."""
+        white = self.camera.detector.white_e
         if self.raw:
-            own = channel_of(self.camera.mosaic.sensor.pattern, fraction.shape[:2])
-            change = np.take_along_axis(fraction, own[..., None].astype(np.intp), 2)[..., 0]
-        else:
-            change = _to_image(fraction, self.camera, 1 if self.numbers.ndim == 2 else self.numbers.shape[2])
-            change = change.reshape(self.numbers.shape)
+            return Electrons(array=self.spread(light[..., 0] * white.max()), white_e=white)
+        return Electrons(array=_to_camera(light, self.camera) * white, white_e=white)
+
+    def in_image(self, change_e: F32) -> F32:
+        """Return a change of the camera's electrons as one of the image's light, float32[y, x, channel]."""
+        if self.raw:
+            return sample(change_e, self.camera.mosaic.sensor.pattern)[..., None] / self.white_e
+        return _to_image(change_e / self.camera.detector.white_e, self.camera, self.light.shape[2])
+
+    def with_change(self, change: F32) -> NDArray[Any]:
+        """Return the numbers with a change of light, float32[y, x, channel]; others stay as they are."""
+        change = change.reshape(self.numbers.shape)
         changed = change != 0
         out = self.numbers.copy()
-        out[changed] = self._rounded(
-            self.response.numbers(self.response.light(self.numbers[changed]) + change[changed])
-        )
+        light = self.response.light(self.numbers[changed])
+        out[changed] = self._rounded(self.response.numbers(light + change[changed]))
         return out
 
-    def spread(self, change_e: F32) -> F32:
-        """Return a change of the mosaic's electrons, float32[y, x], as that of all channels, [y, x, channel]."""
+    def spread(self, mosaic_e: F32) -> F32:
+        """Return electrons of the mosaic, float32[y, x], in all channels, [y, x, channel]; their own stay exact."""
         pattern = self.camera.mosaic.sensor.pattern
-        return np.stack([interpolate(change_e, pattern, name) for name in pattern.channels], axis=-1)
+        planes = np.stack([interpolate(mosaic_e, pattern, name) for name in pattern.channels], axis=-1)
+        own = channel_of(pattern, mosaic_e.shape)[..., None].astype(np.intp)
+        np.put_along_axis(planes, own, mosaic_e[..., None], axis=2)
+        return planes
 
     def with_levels(self, numbers: NDArray[Any], before: RGBI, after: RGBI) -> NDArray[Any]:
         """Return numbers with the change of an image of 8 bits.
@@ -117,12 +132,13 @@ class Picture:
         return out
 
     def _rounded(self, values: NDArray[np.float64]) -> NDArray[Any]:
-        """Return values in the data type of the image: whole numbers rounded, clipped to white and the range."""
+        """Return values in the data type of the image: whole numbers rounded, clipped to white or the top code."""
         dtype = self.numbers.dtype
         if dtype.kind == "f":
             return values.astype(dtype)
         limits = np.iinfo(dtype)
-        return np.clip(np.rint(values), limits.min, min(self.response.white_dn, limits.max)).astype(dtype)
+        top = self.camera.mosaic.sensor.readout.top_dn if self.raw else self.response.white_dn
+        return np.clip(np.rint(values), limits.min, min(top, limits.max)).astype(dtype)
 
 
 def levels(numbers: NDArray[Any], response: Response) -> NDArray[np.uint8]:
@@ -165,16 +181,23 @@ def _response(
     )
 
 
-def _to_camera(light: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
-    """Return the light of an image in the camera's channels, [y, x, channel]."""
-    channels, planes = camera.detector.channels, np.atleast_3d(light)
-    given = planes.shape[2]
+def _white_e(channels: int, camera: Camera) -> F32:
+    """Return the electrons at white of an image's channels, float32[channel]."""
+    white = dict(zip(camera.detector.channels, camera.detector.white_e, strict=True))
+    full = camera.detector.white_e.max()
+    colours = [white.get(colour, full) for colour in _COLOURS]
+    return np.array({1: [full], 3: colours, 4: [*colours, white.get("W", full)]}[channels], dtype=np.float32)
+
+
+def _to_camera(light: F32, camera: Camera) -> F32:
+    """Return an image's light in the camera's channels, [y, x, channel]. Raises InputError for lost colours."""
+    channels, given = camera.detector.channels, light.shape[2]
     if given == 1:
-        return np.repeat(planes, len(channels), axis=2)
+        return np.repeat(light, len(channels), axis=2)
     if channels == ("W",):
         raise InputError(f"image: has {given} channels, but camera.detector {camera.detector.name} sees no colours")
-    white = planes[..., 3] if given == 4 else planes[..., :3] @ LUMINANCE.astype(np.float64)
-    return np.stack([planes[..., _COLOURS.index(c)] if c in _COLOURS else white for c in channels], axis=-1)
+    white = light[..., 3] if given == 4 else light[..., :3] @ LUMINANCE
+    return np.stack([light[..., _COLOURS.index(c)] if c in _COLOURS else white for c in channels], axis=-1)
 
 
 def _to_image(light: F32, camera: Camera, count: int) -> F32:
@@ -187,17 +210,3 @@ def _to_image(light: F32, camera: Camera, count: int) -> F32:
         intensity = sum(w * planes[c] for c, w in zip(_COLOURS, LUMINANCE, strict=True))  # type: ignore[assignment]
     colours = [planes.get(c, intensity) for c in _COLOURS]
     return np.stack({1: [intensity], 3: colours, 4: [*colours, intensity]}[count], axis=-1)
-
-
-def _unmixed(light: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
-    """Return the light of a raw mosaic in all channels: its own where it was seen, elsewhere interpolated.
-
-    The numbers of a channel are those without white balance, so white is that of the sensor for all of them.
-    """
-    pattern, detector = camera.mosaic.sensor.pattern, camera.detector
-    balance = detector.white_e.max() / detector.white_e
-    plane = light.astype(np.float32)
-    own = channel_of(pattern, plane.shape)
-    out = np.stack([interpolate(plane, pattern, name) for name in pattern.channels], axis=-1).astype(np.float64)
-    np.put_along_axis(out, own[..., None].astype(np.intp), light[..., None], axis=2)
-    return out * balance
