@@ -193,7 +193,7 @@ def _of_regolith(
     return Ground(
         height_m=_slumped(points, faces, height[rank].astype(np.float64)),
         dust=regolith.brightness(noise, slope[order], fine, bright, spec.regolith.rubble)[rank],
-        talus=regolith.stony(slope, fine[rank], spec.regolith.rubble),
+        talus=regolith.stony(slope, fine[rank], bright[rank], spec.regolith.rubble),
     )
 
 
