@@ -40,8 +40,8 @@ _AT_ONCE = 0.6  # difference in age, over a lifetime of the octave's largest, of
 _SHALLOWER, _PEAK, _PEAK_WIDTH = -0.7, 0.03, 0.15
 _HOLLOW = 0.4  # depth of a hollow that a younger crater of like size leaves of an older one
 _OUTLINE, _LOBES = 0.03, 8.0  # how far outlines depart from circles, and how quickly around them
-# square root of 2 κt over the radius: Gaussians whose widths wear a crater; the first leaves its rim 0.1 radii round
-_CRATER_WORN = (0.032, 0.06, 0.1, 0.15, 0.2, 0.26, 0.33, 0.42, 0.54, 0.7, 0.9, 1.2, 1.7)
+# square root of 2 κt over the radius: Gaussians whose widths wear a crater; the first rounds its rim by 0.1 radii
+_CRATER_WORN = (0.036, 0.06, 0.1, 0.15, 0.2, 0.26, 0.33, 0.42, 0.54, 0.7, 0.9, 1.2, 1.7)
 
 
 def octave_rotation(number: int) -> Float64:
@@ -59,11 +59,14 @@ class Points:
     ----------
     position_m
         float64[n, 3], metres.
+    normals
+        float64[n, 3]: unit normals of the ground, which `impacts` needs.
     """
 
-    def __init__(self, position_m: Float64) -> None:
+    def __init__(self, position_m: Float64, normals: Float64 | None = None) -> None:
         d = backend()
         self.count = len(position_m)
+        self._normals = normals
         self._axes = [d.Float64(flat(position_m[:, k])) for k in range(3)]
 
     def gradient(self, wavelength_m: float, key: int, count: int) -> Float32:
@@ -104,8 +107,9 @@ class Points:
         """Return height of craters in metres, brightness of the freshest, and age of the ground, float32[n] each.
 
         A cell of this width holds at most one sphere per layer, with a diameter of a third to two thirds of the
-        width. A crater lasts as long as it is wide, so that ages are in metres. It erases what is older inside of
-        its rim, and ever less up to 1.5 radii.
+        width. The ground cuts it in a circle, in which the crater lies. It lasts for a time in proportion to its
+        width, in metres: 1.5 times its width. It erases what is older inside of its rim, and ever less up to
+        1.5 radii.
 
         Parameters
         ----------
@@ -120,8 +124,10 @@ class Points:
         if not len(age_m):
             return age_m, age_m, age_m
         d, width = backend(), np.float32(width_m)
-        before = d.Float(flat(age_m / width))
-        kernel = partial(_impacts, before, layers)
+        assert self._normals is not None
+        normals = self._normals[: len(age_m)] @ octave_rotation(key & 0xFFFF).T
+        upright = [d.Float(flat(normals[:, k].astype(np.float32))) for k in range(3)]
+        kernel = partial(_impacts, d.Float(flat(age_m / width)), upright, layers)
         height, bright, age = self._run(kernel, width_m, key, len(age_m), *law[:-1], law[-1] / width_m)
         return width * height, bright, width * age
 
@@ -287,8 +293,8 @@ def _craters(d: Any, q: list[Any], word: Any, fraction: Any) -> tuple[Any, ...]:
     return (total,)
 
 
-def _impacts(before: Any, layers: int, d: Any, q: list[Any], word: Any, *law: Any) -> tuple[Any, ...]:
-    """Return the craters' height at positions in cells, where the freshest are bright, and the age of the ground."""
+def _impacts(before: Any, up: Any, layers: int, d: Any, q: list[Any], word: Any, *law: Any) -> tuple[Any, ...]:
+    """Return the craters' height in cells, where the freshest are bright, and the age of the ground."""
     words, f = _nearest_cells(d, q)
     fraction, index, wear, ponds, simple = law
     craters = []
@@ -298,11 +304,14 @@ def _impacts(before: Any, layers: int, d: Any, q: list[Any], word: Any, *law: An
         g = _mix(d, h + 0x9E3779B9)
         e = _mix(d, g)
         offset = [f[axis] - (step + _unit(d, h, 10 * axis)) for axis, step in enumerate((i, j, k))]
-        distance = d.dr.sqrt(offset[0] * offset[0] + offset[1] * offset[1] + offset[2] * offset[2]) + 1e-9
         # the radius inverts N(>= R) ~ R^-index; what lies beyond 1.5 radii may be in no cell of the eight
-        radius = (1.0 / 6) * d.dr.power(1 - (1 - d.dr.power(d.Float(2), -index)) * _unit(d, g, 0), -1 / index)
-        lobes = sum((_unit(d, e, 8 * axis) - 0.5) * offset[axis] for axis in range(3)) / distance
-        x = distance / radius * (1 + _OUTLINE * d.dr.sin(_LOBES * lobes + 6.3 * _unit(d, e, 2)))
+        sphere = (1.0 / 6) * d.dr.power(1 - (1 - d.dr.power(d.Float(2), -index)) * _unit(d, g, 0), -1 / index)
+        depth = sum(a * b for a, b in zip(offset, up, strict=True))
+        radius = d.dr.sqrt(d.dr.maximum(sphere * sphere - depth * depth, 1e-8))
+        square = d.dr.maximum(sum(a * a for a in offset), 1e-12)
+        lobes = sum((_unit(d, e, 8 * axis) - 0.5) * offset[axis] for axis in range(3)) * d.dr.rsqrt(square)
+        x = d.dr.sqrt(d.dr.maximum(square - depth * depth, 0)) / radius
+        x = x * (1 + _OUTLINE * d.dr.sin(_LOBES * lobes + 6.3 * _unit(d, e, 2)))
         x = d.dr.select(d.Float(e >> 8) * 2.0**-24 < fraction, x, np.inf)  # ten bits are too coarse
         early = _unit(d, g, 20) + 0.5 / 1024  # 1: just formed
         age = 3 * radius * (1 - early)
@@ -318,8 +327,8 @@ def _impacts(before: Any, layers: int, d: Any, q: list[Any], word: Any, *law: An
         kept = _later(d, d.dr.select(hides == youngest, next_youngest, youngest) - age)
         left = fresh * d.dr.lerp(_HOLLOW, 1, kept)
         excess = d.dr.maximum(2 * radius / simple, 1)  # diameter over that of the largest simple craters
-        depth = d.dr.power(excess, _SHALLOWER)
-        floor = -left * d.dr.select(level, 0.2, d.dr.select(excess > 1, 0.33 * depth, 1))
+        deep = d.dr.power(excess, _SHALLOWER)
+        floor = -left * d.dr.minimum(d.dr.select(level, 0.2, 1), d.dr.select(excess > 1, 0.33 * deep, 1))
         over = profiles(x, left) - floor
         curve = 1e-6 - 0.3 * floor  # over which the floor meets the wall
         near = d.dr.maximum(curve - d.dr.abs(over), 0)
@@ -362,8 +371,8 @@ class _Profiles:
 def _worn_craters() -> Float32:
     """Return heights over the radius of craters of the depths 0, 1/31 … 1 of a fresh one, float32[32, 96].
 
-    Columns are distances from the centre from 0 to `_CRATER_REACH` radii. Fresh simple craters are those of Fassett &
-    Thomson 2014 (JGR Planets 119, 2255, eq. 4), a fifth as deep as wide. Diffusion wears them, and rounds all rims.
+    Columns are distances from the centre from 0 to `_CRATER_REACH` radii. Fresh simple craters are those of Fassett
+    & Thomson 2014 (JGR Planets 119, 2255, eq. 4), a fifth as deep as wide. Diffusion wears them and rounds rims.
     """
     step = 0.02
     axis = np.arange(-4.0, 4.0 + step / 2, step)
@@ -375,8 +384,9 @@ def _worn_craters() -> Float32:
     worn = [ndimage.gaussian_filter(fresh, width / step)[middle, middle:] for width in _CRATER_WORN]
     depth = np.array([profile.max() - profile[0] for profile in worn])
     at = np.linspace(0, _CRATER_REACH, 96)
-    taper = smooth_step(0.0, 0.25, _CRATER_REACH - at)
-    profiles = [taper * np.interp(at, axis[middle:], profile) for profile in worn]
+    # worn ones reach farther
+    taper = [smooth_step(0.0, min(0.1 + 1.5 * width, 0.8), _CRATER_REACH - at) for width in _CRATER_WORN]
+    profiles = [part * np.interp(at, axis[middle:], one) for part, one in zip(taper, worn, strict=True)]
     wanted = np.linspace(0, 1, 32) * depth[0]
     rows = [np.interp(wanted, depth[::-1], column[::-1]) for column in np.transpose(profiles)]
     return np.transpose(rows).astype(np.float32)
@@ -437,12 +447,18 @@ class Octaves:
     """Evaluate noise at points that are sorted by the size of their facets; it is 0 where facets are too coarse."""
 
     def __init__(
-        self, place_m: Float64, facet_m: Float64, seed: int, roughness: Roughness, longest_m: float
+        self,
+        place_m: Float64,
+        facet_m: Float64,
+        seed: int,
+        roughness: Roughness,
+        longest_m: float,
+        normals: Float64 | None = None,
     ) -> None:
         self.place_m = place_m
         self.facet_m = facet_m
         self.seed = seed
-        self._points = Points(place_m)
+        self._points = Points(place_m, normals)
         self._roughness = roughness
         self.longest_m = longest_m
         self._unit = 1.0 / windowed_deviation(roughness.hurst)

@@ -3,7 +3,7 @@
 Heights are added along the model's normal, as in `relief`. The ground consists of:
 
 - undulations that continue the roughness of the model, rougher in some regions than in others;
-- craters of the size law of `CraterLaw`, from fresh bowls with rims to ghosts;
+- craters of the size law of `CraterLaw`, from fresh bowls with rims to ghosts, the later ones on top;
 - fine material that levels low and gentle ground: ponds on Eros, the Muses Sea on Itokawa;
 - rubble: stones too small to be boulders of their own, heaped on each other.
 
@@ -13,11 +13,11 @@ has slid, and in the freshest craters.
 References
 ----------
 Gault 1970, Radio Science 5, 273: at geometric saturation, craters number 1.54 D^-2; at equilibrium between those
-that form and those that are worn away, 1 to 10 % of that. Pike 1977, in Impact and Explosion Cratering, 489:
-fresh simple craters are a fifth as deep as wide, with rims of 4 % of the diameter. Fassett & Thomson 2014, JGR
-Planets 119, 2255: wear by diffusion rounds and fills them until nothing is left. Murchie et al. 2002, Icarus 155,
-145: steep walls on Eros are up to a third brighter. Miyamoto et al. 2007, Science 316, 1011: fine material
-gathers where the potential is low.
+that form and those that are worn away, 1 to 10 % of that. Fassett & Thomson 2014, JGR Planets 119, 2255: fresh
+simple craters are a fifth as deep as wide, with rims of 4 % of the diameter; wear by diffusion rounds and fills
+them until nothing is left. Pike 1977, in Impact and Explosion Cratering, 489: depths and peaks of complex craters.
+Murchie et al. 2002, Icarus 155, 145: steep walls on Eros are up to a third brighter. Miyamoto et al. 2007, Science
+316, 1011: fine material gathers where the potential is low.
 """
 
 from __future__ import annotations
@@ -84,13 +84,8 @@ class CraterLaw:
 
     @property
     def wear(self) -> float:
-        """Return the power of a uniform number that is a crater's depth over a fresh one's.
-
-        In the mean, a circle is shallower than its sphere by B((b + 3) / 2, 1 / 2) / B((b + 2) / 2, 1 / 2), for
-        the index b.
-        """
-        cut = special.beta((self.index + 3) / 2, 0.5) / special.beta((self.index + 2) / 2, 0.5)
-        return float(max(FRESH_DEPTH * cut / self.depth - 1, 0.0))
+        """Return the power of a uniform number that is a crater's depth over a fresh one's."""
+        return max(FRESH_DEPTH / self.depth - 1, 0.0)
 
 
 def crater_law(per_km2: float, spec: Regolith) -> CraterLaw:

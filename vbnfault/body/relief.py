@@ -125,7 +125,9 @@ def add_relief(
     order = np.argsort(facet_m, kind="stable")
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
-    noise = Octaves(points[order] + site.position_T_m, facet_m[order], spec.seed, roughness, longest_m)
+    noise = Octaves(
+        points[order] + site.position_T_m, facet_m[order], spec.seed, roughness, longest_m, normals[order]
+    )
     if spec.regolith is not None:
         return _of_regolith(body, mesh, noise, (order, rank), (up, elevation), spec)
     scale: Float64 | float = spec.relief
