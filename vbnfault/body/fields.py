@@ -33,8 +33,7 @@ GRADIENT_STD = 0.191
 PLANES_STD = 0.1826
 
 _CRATER_REACH = 1.5  # radii up to which a crater changes the ground
-_ERASED = 0.6  # radii up to which it erases what is older
-_AT_ONCE = 0.6  # difference in age, over a lifetime of the octave's largest, of craters that share their ground
+_AT_ONCE = 0.8  # difference in age, over a lifetime of the octave's largest, of craters that share their ground
 # Complex craters of the Moon are 1.044 D^0.301 km deep, and their peaks 0.6 m (D / km)^1.97 high, a fifth of D wide
 # (Pike 1977): at twice the largest simple diameter, 0.03 radii
 _SHALLOWER, _PEAK, _PEAK_WIDTH = -0.7, 0.03, 0.15
@@ -315,7 +314,8 @@ def _impacts(before: Any, up: Any, layers: int, d: Any, q: list[Any], word: Any,
         x = d.dr.select(d.Float(e >> 8) * 2.0**-24 < fraction, x, np.inf)  # ten bits are too coarse
         early = _unit(d, g, 20) + 0.5 / 1024  # 1: just formed
         age = 3 * radius * (1 - early)
-        hides = age + (1 + _AT_ONCE) * d.dr.maximum(x - _ERASED, 0) / (_CRATER_REACH - _ERASED)
+        outward = x / _CRATER_REACH
+        hides = age + (1 + _AT_ONCE) * outward * outward * outward
         next_youngest = d.dr.minimum(next_youngest, d.dr.maximum(youngest, hides))
         youngest = d.dr.minimum(youngest, hides)
         craters.append((x, radius, early, age, hides, _unit(d, g, 10) < ponds))
