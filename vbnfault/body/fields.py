@@ -321,24 +321,31 @@ def _impacts(before: Any, up: Any, layers: int, d: Any, q: list[Any], word: Any,
         craters.append((x, radius, early, age, hides, _unit(d, g, 10) < ponds))
     total, bright = d.Float(0), d.Float(0)
     profiles = _Profiles(d)
-    for x, radius, early, age, hides, level in craters:
+    for x, radius, early, age, hides, pond in craters:
         # one of like size leaves a hollow without a rim where a younger one lies on it, a smaller one nothing
         fresh = d.dr.power(early, wear)
         kept = _later(d, d.dr.select(hides == youngest, next_youngest, youngest) - age)
         left = fresh * d.dr.lerp(_HOLLOW, 1, kept)
-        excess = d.dr.maximum(2 * radius / simple, 1)  # diameter over that of the largest simple craters
-        deep = d.dr.power(excess, _SHALLOWER)
-        floor = -left * d.dr.minimum(d.dr.select(level, 0.2, 1), d.dr.select(excess > 1, 0.33 * deep, 1))
-        over = profiles(x, left) - floor
-        curve = 1e-6 - 0.3 * floor  # over which the floor meets the wall
-        near = d.dr.maximum(curve - d.dr.abs(over), 0)
-        peak = _PEAK * d.dr.minimum(excess - 1, 1) * left * d.dr.exp(-d.dr.square(x / _PEAK_WIDTH))
-        height = floor + d.dr.maximum(over, 0) + 0.25 * near * near / curve + peak
+        height = _with_level_floor(d, profiles(x, left), left, x, pond, 2 * radius / simple)
         stays = _later(d, before - age)
         total = total + stays * radius * height
         shine = d.dr.maximum(8 * fresh - 7, 0) * d.dr.clip(2 * (_CRATER_REACH - x), 0, 1)
         bright = bright + stays * kept * shine
     return total, bright, d.dr.minimum(before, youngest)
+
+
+def _with_level_floor(d: Any, height: Any, left: Any, x: Any, pond: Any, size: Any) -> Any:
+    """Return the height over the radius of a crater that is a pond or complex.
+
+    `size` is its diameter over that of the largest simple craters.
+    """
+    complex_ = d.dr.select(size > 1, 0.33 * d.dr.power(d.dr.maximum(size, 1), _SHALLOWER), 1)
+    floor = -left * d.dr.minimum(d.dr.select(pond, 0.2, 1), complex_)
+    over = height - floor
+    curve = 1e-6 - 0.3 * floor  # over which the floor meets the wall
+    near = d.dr.maximum(curve - d.dr.abs(over), 0)
+    peak = _PEAK * d.dr.clip(size - 1, 0, 1) * left * d.dr.exp(-d.dr.square(x / _PEAK_WIDTH))
+    return floor + d.dr.maximum(over, 0) + 0.25 * near * near / curve + peak
 
 
 def _later(d: Any, age_difference: Any) -> Any:
