@@ -131,7 +131,9 @@ def add_relief(
     order = np.argsort(facet_m, kind="stable")
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
-    noise = Octaves(points[order] + site.position_T_m, facet_m[order], spec.seed, roughness, longest_m)
+    noise = Octaves(
+        points[order] + site.position_T_m, facet_m[order], spec.seed, roughness, longest_m, normals[order]
+    )
     if spec.regolith is not None:
         return _of_regolith(body, mesh, noise, (order, rank), (up, elevation), spec)
     scale: Float64 | float = spec.relief
@@ -200,7 +202,7 @@ def _of_regolith(
     return Ground(
         height_m=_slumped(points, faces, height[rank].astype(np.float64)),
         dust=regolith.brightness(noise, slope[order], fine, bright, spec.regolith.rubble)[rank],
-        talus=regolith.stony(slope, fine[rank], spec.regolith.rubble),
+        talus=regolith.stony(slope, fine[rank], bright[rank], spec.regolith.rubble),
     )
 
 

@@ -51,6 +51,8 @@ class Regolith:
         Mean depth over diameter; fresh craters have 0.2.
     largest_crater_m
         Larger craters belong to the shape model.
+    simple_crater_m
+        Larger craters are complex: shallower, with level floors and central peaks.
     equilibrium
         Fraction of geometric saturation that the number of craters does not exceed.
     ponds
@@ -66,6 +68,7 @@ class Regolith:
     crater_index: float = 2.0
     crater_depth: float = 0.12
     largest_crater_m: float = 300.0
+    simple_crater_m: float = 1e9
     equilibrium: float = 0.05
     ponds: float = 0.0
     smooth: float = 0.0

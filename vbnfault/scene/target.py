@@ -214,8 +214,11 @@ class RegolithTable(Table):
     largest_crater_m: float = Field(
         300.0,
         ge=1,
-        le=1e5,
+        le=1e6,
         description="larger ones belong to the shape; a shape file holds those of two of its edges or more",
+    )
+    simple_crater_m: float = Field(
+        1e9, ge=1, le=1e9, description="larger craters are complex: shallower, with level floors and central peaks"
     )
     equilibrium: float = Field(
         0.05, ge=0.001, le=0.2, description="most craters, over those of geometric saturation (Gault 1970)"
