@@ -239,7 +239,7 @@ def _sample(batch: Batch, index: int, image: ImageFile, result: Injected) -> Sam
         "clean": levels(result.clean, response),
         "mask": result.masks,
         "mask_any": result.mask_any,
-        "mask_effect": result.mask_effect,
+        "mask_effect": np.asarray(result.mask_effect),
     }
     sizes = {"fault": len(result.faults), "xyz": 3, "quaternion": 4, "axis_row": 3, "axis_col": 3, "xy": 2}
     scalars: dict[str, Any] = {

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -64,6 +65,10 @@ class Picture:
         if raw and (detector.mosaic is None or numbers.ndim != 2):
             what = "camera.detector names no sensor" if detector.mosaic is None else "it has several channels"
             raise InputError(f"image: cannot be a raw mosaic: {what}")
+        if numbers.ndim == 3 and detector.channels == ("W",):
+            raise InputError(
+                f"image: has {numbers.shape[2]} channels, but camera.detector {detector.name} sees no colours"
+            )
         response, assumptions = _response(numbers.dtype, table, camera, raw=raw)
         highest = np.iinfo(numbers.dtype).max if numbers.dtype.kind in "ui" else np.inf
         lost = (numbers >= min(response.white_dn, highest)) | (numbers <= np.minimum(0, response.black_dn))
@@ -89,13 +94,20 @@ class Picture:
         white = self.camera.detector.white_e
         if self.raw:
             return Electrons(array=self.spread(light[..., 0] * white.max()), white_e=white)
-        return Electrons(array=_to_camera(light, self.camera) * white, white_e=white)
+        mixed = cv2.transform(light, white[:, None] * self._mixing[0]).reshape(*light.shape[:2], len(white))
+        return Electrons(array=mixed, white_e=white)
 
     def in_image(self, change_e: F32) -> F32:
         """Return a change of the camera's electrons as one of the image's light, float32[y, x, channel]."""
         if self.raw:
             return sample(change_e, self.camera.mosaic.sensor.pattern)[..., None] / self.white_e
-        return _to_image(change_e / self.camera.detector.white_e, self.camera, self.light.shape[2])
+        mixed = cv2.transform(change_e, self._mixing[1] / self.camera.detector.white_e)
+        return np.asarray(mixed).reshape(self.light.shape)
+
+    @cached_property
+    def _mixing(self) -> tuple[F32, F32]:
+        """Return the matrices from the image's channels to the camera's and back, for light over white."""
+        return _mixing(self.light.shape[2], self.camera.detector.channels)
 
     def with_change(self, change: F32) -> NDArray[Any]:
         """Return the numbers with a change of light, float32[y, x, channel]; others stay as they are."""
@@ -122,13 +134,14 @@ class Picture:
         """
         channels = 1 if numbers.ndim == 2 else numbers.shape[2]
         pick = [3] if channels == 1 else list(range(channels))
-        old, new = (x.array[..., pick].reshape(numbers.shape).astype(np.float64) for x in (before, after))
-        step = (self.response.white_dn - self.response.black_dn) / 255
-        moved = numbers.astype(np.float64) + (new - old) * step
-        moved = np.where(new == 0, self.response.black_dn, np.where(new == 255, self.response.white_dn, moved))
-        out = numbers.copy()
+        old, new = (x.array[..., pick].reshape(numbers.shape) for x in (before, after))
         changed = new != old
-        out[changed] = self._rounded(moved[changed])
+        level = new[changed].astype(np.float64)
+        step = (self.response.white_dn - self.response.black_dn) / 255
+        moved = numbers[changed] + (level - old[changed]) * step
+        out = numbers.copy()
+        ends = [level == 0, level == 255]
+        out[changed] = self._rounded(np.select(ends, [self.response.black_dn, self.response.white_dn], moved))
         return out
 
     def _rounded(self, values: NDArray[np.float64]) -> NDArray[Any]:
@@ -143,7 +156,8 @@ class Picture:
 
 def levels(numbers: NDArray[Any], response: Response) -> NDArray[np.uint8]:
     """Return numbers as an image of 8 bits, uint8[y, x, 4] with R, G, B and I."""
-    code = 255 * (numbers.astype(np.float64) - response.black_dn) / (response.white_dn - response.black_dn)
+    scale = np.float32(255 / (response.white_dn - response.black_dn))
+    code = (numbers.astype(np.float32) - np.float32(response.black_dn)) * scale
     eight = np.atleast_3d(np.clip(np.rint(code), 0, 255).astype(np.uint8))
     if eight.shape[2] == 1:
         eight = np.repeat(eight, 4, axis=2)
@@ -189,24 +203,16 @@ def _white_e(channels: int, camera: Camera) -> F32:
     return np.array({1: [full], 3: colours, 4: [*colours, white.get("W", full)]}[channels], dtype=np.float32)
 
 
-def _to_camera(light: F32, camera: Camera) -> F32:
-    """Return an image's light in the camera's channels, [y, x, channel]. Raises InputError for lost colours."""
-    channels, given = camera.detector.channels, light.shape[2]
-    if given == 1:
-        return np.repeat(light, len(channels), axis=2)
-    if channels == ("W",):
-        raise InputError(f"image: has {given} channels, but camera.detector {camera.detector.name} sees no colours")
-    white = light[..., 3] if given == 4 else light[..., :3] @ LUMINANCE
-    return np.stack([light[..., _COLOURS.index(c)] if c in _COLOURS else white for c in channels], axis=-1)
+def _mixing(count: int, channels: tuple[str, ...]) -> tuple[F32, F32]:
+    """Return the matrices from an image's channels to a camera's and back, for light over white.
 
-
-def _to_image(light: F32, camera: Camera, count: int) -> F32:
-    """Return light in the camera's channels as that of an image with 1, 3 or 4 channels, [y, x, channel]."""
-    channels = camera.detector.channels
-    planes = {name: light[..., k] for k, name in enumerate(channels)}
-    if "W" in planes:
-        intensity = planes["W"]
-    else:
-        intensity = sum(w * planes[c] for c, w in zip(_COLOURS, LUMINANCE, strict=True))  # type: ignore[assignment]
-    colours = [planes.get(c, intensity) for c in _COLOURS]
-    return np.stack({1: [intensity], 3: colours, 4: [*colours, intensity]}[count], axis=-1)
+    A grey image has the luminance of the colours, or what pixels without a filter see.
+    """
+    image = {1: ["I"], 3: list(_COLOURS), 4: [*_COLOURS, "I"]}[count]
+    grey = [float(c == "W") for c in channels] if "W" in channels else LUMINANCE.tolist()
+    back = [grey if c not in channels else [float(c == k) for k in channels] for c in image]
+    if count == 1:
+        return np.ones((len(channels), 1), np.float32), np.array(back, np.float32)
+    luminance = [float(c == "I") for c in image] if count == 4 else LUMINANCE.tolist()
+    forth = [luminance if c == "W" else [float(c == k) for k in image] for c in channels]
+    return np.array(forth, np.float32), np.array(back, np.float32)

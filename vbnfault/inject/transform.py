@@ -60,7 +60,7 @@ class Inject:
     @cached_property
     def injector(self) -> Injector:
         """Return what injects the faults; each process makes its own."""
-        return Injector(self._scene)
+        return Injector(self._scene, effects=False)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what another process needs."""
