@@ -278,3 +278,14 @@ def test_fine_facets_all_over_a_body_are_foreseen_without_making_them(
     assert max(made) < 10 * budget
     # edges are halved, so that the number of triangles goes by steps of up to a factor of two on either side
     assert budget / 2 < len(refined(*model, limit)[2]) < 2 * budget
+
+
+def test_facets_near_the_size_of_the_models_own_are_foreseen() -> None:
+    """Facets of four times the size asked for would split no edge of this model of 11 m edges."""
+    ball = trimesh.creation.icosphere(subdivisions=5, radius=300.0)
+    points = np.array(ball.vertices) - [300.0, 0.0, 0.0]
+    model = (points, np.array(ball.vertices) / 300.0, np.array(ball.faces))
+    budget = 60_000
+    limit = refine.affordable(refine.EdgeLimit(2.0, 250.0), model, budget)
+    # as above
+    assert budget / 2 < len(refine.refine(*model, limit)[2]) < 2 * budget

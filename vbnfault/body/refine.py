@@ -65,6 +65,11 @@ def affordable(limit: EdgeLimit, model: tuple[Float64, Float64, Int32], budget: 
             break
         probe /= 2  # these facets are too coarse to predict the number of finer ones
     wanted = added * probe**2
+    # a probe splits no edge of a model whose facets are as small as its own
+    while probe > 1 and added < before and before + wanted <= budget:
+        probe /= 2
+        added = len(refine(*model, EdgeLimit(probe * limit.facet_m, limit.radius_m))[2]) - before
+        wanted = added * probe**2
     if before + wanted <= budget:
         return limit
     return EdgeLimit(limit.facet_m * float(np.sqrt(wanted / (budget - before))), limit.radius_m)
