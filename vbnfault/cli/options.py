@@ -215,7 +215,9 @@ class SceneOptions(SceneValues):
             return loaded
         camera = loaded.camera
         size = {f"camera.{k}": max(16, round(self.scale * getattr(camera, k))) for k in ("width_px", "height_px")}
-        field = {"camera.fov_deg": camera.fov_deg, "camera.focal_length_mm": None}
+        field: dict[str, Any] = {"camera.fov_deg": camera.fov_deg, "camera.focal_length_mm": None}
+        if camera.calibration is not None:
+            field = {"camera.calibration.scale_to_frame": True}
         return config.load_scene(scene, self._values() | size | field)
 
 

@@ -1,4 +1,4 @@
-"""Map directions to pixels as a camera's calibration says: OpenCV's models, and Brown and Conrady's in either sense.
+"""Map directions to pixels by a camera's calibration: OpenCV's models, and Brown and Conrady's in either sense.
 
 Pixel positions count from the corner of the image's first pixel, so that pixel centres lie at +0.5. OpenCV, ROS and
 Kalibr count from the centre of the first pixel: their principal points are 0.5 smaller (`of_centres`).
@@ -31,7 +31,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..core.errors import InputError, shown
+from .errors import InputError, shown
 
 F64 = NDArray[np.float64]
 Floats = NDArray[np.floating[Any]]
@@ -141,7 +141,7 @@ class Calibration:
         InputError
             The file is missing, of another kind, or incomplete; the message names file and key.
         """
-        from .calibration_files import read_calibration
+        from .files.calibrations import read_calibration
 
         return read_calibration(path, camera=camera, model=model, size_px=size_px)
 
@@ -297,9 +297,9 @@ class Calibration:
         reached = self._reached
         if height.max() >= reached:
             raise InputError(
-                f"the {self.model} polynomial folds back {reached * self.focal_length_px:.1f} px from the principal "
-                f"point, inside the frame, whose corner lies {height.max() * self.focal_length_px:.1f} px away; "
-                "give a calibration that holds up to the corner, or a smaller frame"
+                f"the {self.model} polynomial folds back {reached * self.focal_length_px:.1f} px from the "
+                "principal point, which is inside the frame: its corner lies "
+                f"{height.max() * self.focal_length_px:.1f} px away; give a calibration that holds up to the corner"
             )
         again = self.pixel_of(self.directions_of(border))
         off = np.abs(again - border)
@@ -318,7 +318,7 @@ class Calibration:
         return np.concatenate(sides) * (self.width_px, self.height_px)
 
     def _heights(self, xy: F64) -> F64:
-        """Return distances from the principal point in focal lengths, float64[n], on the plane that is not tilted."""
+        """Return distances from the principal point in focal lengths, float64[n], before the sensor's tilt."""
         down = (xy[..., 1] - self.cy) / self.fy
         p = np.stack([(xy[..., 0] - self.cx - self.skew * down) / self.fx, down], axis=-1)
         p = p if self.model == "fisheye" else _by(np.linalg.inv(self._tilt), p)
@@ -349,7 +349,7 @@ class Calibration:
         return np.asarray(onto @ turned)
 
 
-def _by(homography: F64, p: F64) -> F64:
+def _by(homography: Floats, p: F64) -> F64:
     """Return points float64[..., 2] mapped by a homography."""
     if (homography == np.eye(3)).all():
         return p
@@ -366,7 +366,7 @@ def _determinant(jacobian: F64) -> F64:
     return np.asarray(jacobian[..., 0, 0] * jacobian[..., 1, 1] - jacobian[..., 0, 1] * jacobian[..., 1, 0])
 
 
-def _first_root(polynomial: F64) -> float:
+def _first_root(polynomial: ArrayLike) -> float:
     """Return the square root of the least positive root of a polynomial of squares, ascending; inf without one."""
     kept = np.trim_zeros(np.asarray(polynomial, dtype=np.float64), "b")
     roots = np.roots(kept[::-1]) if len(kept) > 1 else np.zeros(0)

@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.errors import InputError, in_file, shown
-from ..core.files.user_files import read_input
-from .calibration import COEFFICIENTS, Calibration
+from ..calibration import COEFFICIENTS, Calibration
+from ..errors import InputError, in_file, shown
+from .user_files import read_input
 
 KINDS = "a camera_info YAML of ROS, a camchain YAML of Kalibr, a FileStorage of OpenCV, or a cameras.txt of COLMAP"
 
@@ -184,7 +184,7 @@ def _opencv(text: str, camera: str, model: str, size_px: tuple[int, int] | None)
     try:
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         root = storage.root()
-        nodes = {name.lower().replace("_", ""): (name, root.getNode(name)) for name in root.keys()}
+        nodes = {name.lower().replace("_", ""): (name, root.getNode(name)) for name in root.keys()}  # noqa: SIM118
     except (cv2.error, SystemError, UnicodeDecodeError):
         raise InputError(f"cannot be read as a FileStorage of OpenCV; must be {KINDS}") from None
 
@@ -200,8 +200,7 @@ def _opencv(text: str, camera: str, model: str, size_px: tuple[int, int] | None)
     values = _of_matrix(_mat(*found), found[0])
     found = named(_DISTORTION)
     coefficients = () if found is None else tuple(_mat(*found).ravel().tolist())
-    if size_px is None:
-        size_px = _opencv_size(nodes)
+    size: Any = _opencv_size(nodes) if size_px is None else size_px
     flag = nodes.get("fisheyemodel")
     stated = "" if flag is None else ("fisheye" if flag[1].real() else "opencv")
     if stated and model not in ("", stated):
@@ -211,7 +210,7 @@ def _opencv(text: str, camera: str, model: str, size_px: tuple[int, int] | None)
     if len(coefficients) not in counts:
         raise InputError(f"distortion_coefficients: has {len(coefficients)} numbers; must be {_or(counts)}")
     return Calibration.of_centres(
-        model=model, **_size(size_px, "image_width, image_height"), **values, coefficients=coefficients
+        model=model, **_size(size, "image_width, image_height"), **values, coefficients=coefficients
     )
 
 
