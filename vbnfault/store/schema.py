@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.calibration import COEFFICIENTS
 from ..core.errors import InputError
 from ..core.quantities import CHANNELS
 from ..scene.names import SPLITS, STRATA
@@ -52,7 +53,7 @@ MAX_SAMPLE_BYTES = 2**34  # all layers of a sample, uncompressed
 _SCALARS = "scalars"  # the entry of the `layer` axis that stands for all scalars of a sample
 
 
-RATIONAL = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # coefficients of OpenCV's rational model, in its order
+RATIONAL = COEFFICIENTS["opencv"][:8]  # of the distortion of cameras without a calibration
 # Fields that older stores lack, with their defaults, which are not written: such stores stay as they were.
 _LATER = {
     "sample_names": (),
