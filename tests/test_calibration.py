@@ -123,7 +123,7 @@ def test_a_polynomial_that_folds_inside_the_frame_names_its_radius(fields: Any, 
 
 
 def test_the_named_radius_is_where_the_polynomial_turns() -> None:
-    """x (1 + k1 x²) is greatest at x² = -1 / 3 k1, where it is 2x / 3; the map ends 0.2 % before."""
+    """x (1 + k1 x²) is greatest at x² = -1 / 3 k1, where it is 2x / 3. The map ends 1e-4 before."""
     calibration = Calibration(**{**PLAIN, "fy": 900.0}, coefficients=(-0.6,))
     turn_px = 900 * 2 / 3 * np.sqrt(1 / 1.8)
     with pytest.raises(InputError, match=f"folds back {turn_px:.0f}"):

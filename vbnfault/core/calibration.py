@@ -50,7 +50,7 @@ EXACT = 1e-10  # largest error of an inversion, in focal lengths
 _STEPS = 60
 _TABLE = 1025  # nodes of the first guess of an inversion
 # The polynomial is used up to this part of its fold: at the fold itself the image has no size.
-_BEFORE_FOLD = 0.998
+_BEFORE_FOLD = 0.9999
 _FARTHEST_SLOPE = 1e3  # of the models on a plane
 _AROUND = 64  # azimuths, and radii, at which a model with tangential terms is checked
 _LEAST_SLOPE_Z = 1e-3
