@@ -35,11 +35,11 @@ class CameraView:
     camera_position_T_m
         float64[3]: position of the camera in T, in m. Any frame that is fixed in the ground serves as T.
     distortion
-        OpenCV's k1, k2, p1, p2, k3, k4, k5, k6, float64[8], the first 4 or 5 of them, or 12 or 14 with thin prism and
-        tilt; k1 to k4 of a fisheye.
+        OpenCV's k1, k2, p1, p2, k3, k4, k5, k6, float64[8], the first 4 or 5 of them, or 12 or 14 with thin prism
+        and tilt; k1 to k4 of a fisheye.
     model
-        "opencv", "fisheye" or "undistorting" (`Calibration`): the attribute `model` of the array `distortion`, which
-        that of a calibrated camera has.
+        "opencv", "fisheye" or "undistorting" (`Calibration`): the attribute `model` of the array `distortion` of a
+        calibrated camera.
     valid_to_deg
         Angle from the boresight up to which `distortion` holds, the attribute `valid_to_deg` of the array
         `distortion`. None: up to where the model first folds, which is computed. Farther directions have no pixel.
