@@ -15,7 +15,7 @@ from conftest import small_scene
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from test_calibration import KALIBR, ROS, YAML_1_0
-from test_render import NODES, box, join, scene, sun
+from test_render import NODES, ball, box, join, scene, sun
 
 from vbnfault import dataset, render, store
 from vbnfault.camera import Camera
@@ -28,6 +28,7 @@ from vbnfault.faults import FaultContext
 from vbnfault.faults.straylight import TextureStraylight, flare_centres_px
 from vbnfault.faults.straylight_lens import TracedStraylight
 from vbnfault.lens import Halo, ThinLens
+from vbnfault.pipeline import simulate
 from vbnfault.render.description import View
 from vbnfault.scene import config
 from vbnfault.world.sky import SkyFrame, StarCatalogue, star_radiance
@@ -443,3 +444,85 @@ def test_the_sense_of_brown_and_conrady_counts(sense: str) -> None:
     corner = found.directions_of([0.0, 0.0])
     farther = np.hypot(*corner[:2]) / corner[2] > np.hypot(found.cx / found.fx, found.cy / found.fy)
     assert farther == (sense == "distorting")
+
+
+# --- beside the rectilinear camera
+
+
+def rectilinear_twin(table: dict[str, Any], calibration: dict[str, float]) -> list[Any]:
+    """Return sample 0 of a scene, taken by a camera of the field 2 arctan(48 / 80) and by a calibrated one."""
+    plain = {"width_px": 96, "height_px": 80, "fov_deg": float(np.degrees(2 * np.arctan(0.6)))}
+    calibrated = {**plain, "calibration": {"fx": 80.0, "cx": 47.5, "cy": 39.5, **calibration}}
+    del calibrated["fov_deg"]
+    return [simulate(config.parse_scene({**table, "camera": c}, source="test"), 0) for c in (plain, calibrated)]
+
+
+def test_without_coefficients_the_image_is_that_of_the_plain_camera() -> None:
+    """Every effect of a scene at once. The rays come from a table in float32, which turns them by 1e-7; where they
+    pass an edge, a sample of a pixel changes."""
+    table = small_scene(
+        dataset={"samples": 1, "sites": 1, "layers": ["clean", "depth_m", "semantic", "radiance"]},
+        render={"samples_per_pixel": 4, "bounces": 1},
+        sky={"stars": "on"},
+        coma={"afrho_cm": 1200.0},
+        spacecraft={"model": "default"},
+        plan={"faulty_fraction": 1.0, "on_invisible": "drop"},
+    )
+    table["faults"] = {
+        "straylight": {"model": "traced"},
+        "vignetting": {"model": "lens"},
+        "dust_on_optics": {"model": "defocused"},
+        "particles": {},
+    }
+    plain, calibrated = rectilinear_twin(table, {})
+    for name in ("image", "clean"):
+        one, other = (sample.layers[name].astype(float) for sample in (plain, calibrated))
+        assert one.std() > 10
+        assert np.abs(one - other).mean() < 0.02
+    np.testing.assert_array_equal(plain.layers["semantic"], calibrated.layers["semantic"])
+    np.testing.assert_allclose(calibrated.layers["depth_m"], plain.layers["depth_m"], rtol=1e-4)
+    light = [sample.layers["radiance"].astype(float) for sample in (plain, calibrated)]
+    assert np.abs(light[0] - light[1]).mean() < 1e-3 * light[0].mean()
+    np.testing.assert_allclose(calibrated.scalars["sun_xy_px"], plain.scalars["sun_xy_px"], atol=1e-9)
+
+
+def test_opencv_undistorts_the_image_to_that_of_the_plain_camera() -> None:
+    """To 0.03 px in every quarter, by the least-squares shift along the gradient of the image (Lucas & Kanade 1981);
+    the image before is off by half a pixel and more."""
+    nadir = {"reference": "nadir", "roll_deg": [-20, 20], "pitch_deg": [-20, 20], "sun_elevation_deg": [30, 60]}
+    table = small_scene(
+        dataset={"samples": 1, "sites": 1, "layers": ["clean", "radiance"]},
+        render={"samples_per_pixel": 64},
+        geometry={"sun_averted": nadir, "sun_facing": nadir},
+    )
+    table["faults"] = {}
+    coefficients = {"k1": -0.35, "k2": 0.14, "p1": 5e-3, "p2": -5e-3}
+    plain, calibrated = (s.layers["radiance"][4].astype(float) for s in rectilinear_twin(table, coefficients))
+    matrix = np.array([[80.0, 0, 47.5], [0, 80.0, 39.5], [0, 0, 1]])
+    undistorted = cv2.undistort(calibrated, matrix, np.array([*coefficients.values()]))
+    for image, is_undone in ((undistorted, True), (calibrated, False)):
+        down, across = np.gradient((plain + image) / 2)
+        for y, x in ((12, 12), (12, 48), (40, 12), (40, 48)):
+            part = slice(y, y + 28), slice(x, x + 36)
+            columns = np.column_stack([across[part].ravel(), down[part].ravel(), np.ones(28 * 36)])
+            shift = np.linalg.lstsq(columns, (plain - image)[part].ravel(), rcond=None)[0][:2]
+            assert np.hypot(*shift) < 0.03 if is_undone else np.hypot(*shift) > 0.5
+
+
+def test_a_body_smaller_than_a_pixel_is_where_opencv_projects_it() -> None:
+    """Its light and its class; the light is that of the same body before a rectilinear camera."""
+    calibration = SIX["fisheye"]
+    direction = calibration.directions_of([28.4, 55.7])
+    far = ball(5.0, subdivisions=4, centre=POSITION_M + 3000 * L_FROM_C @ direction)
+    light = sun(-L_FROM_C @ direction + 0.3 * L_FROM_C[:, 0])
+    view = seen_by(calibration)
+    pinhole = replace(view, projection=None)
+    images = [render.radiance(far, scene(v, light)) for v in (view, pinhole)]
+    assert images[0].fine is not None
+    sums = [image.array[4].astype(float).sum() for image in images]
+    rows, columns = np.nonzero(images[0].array[4])
+    want = opencv_pixels(calibration, direction[None])[0]
+    assert (rows.mean() + 0.5, columns.mean() + 0.5) == pytest.approx((want[1], want[0]), abs=1)
+    solid = [v.pixel_map.solid_angle_sr(direction) for v in (view, pinhole)]
+    facing = 1 / direction[2]  # a fisheye's pupil turns
+    assert sums[0] * solid[0] == pytest.approx(sums[1] * solid[1] * facing, rel=2e-2)

@@ -48,6 +48,7 @@ _LENGTHS = {"opencv": (8, 12, 14), "undistorting": (12,), "fisheye": (4,)}
 
 EXACT = 1e-10  # largest error of an inversion, in focal lengths
 _STEPS = 60
+_AT_ONCE = 1 << 14  # positions that are inverted together, so that their arrays stay in the processor's cache
 _TABLE = 1025  # nodes of the first guess of an inversion
 # The polynomial is used up to this part of its fold: at the fold itself the image has no size.
 _BEFORE_FOLD = 0.9999
@@ -230,8 +231,20 @@ class Calibration:
         The pixel of each lies within 1e-10 focal lengths of the position; NaN where there is none.
         """
         xy = np.asarray(xy_px, dtype=np.float64)
+        flat = xy.reshape(-1, 2)
+        out = np.empty((len(flat), 3))
+        for start in range(0, len(flat), _AT_ONCE):
+            part = slice(start, start + _AT_ONCE)
+            out[part] = self._directions(self._on_plane(flat[part]))
+        return out.reshape(*xy.shape[:-1], 3)
+
+    def _on_plane(self, xy: F64) -> F64:
+        """Return pixel positions in focal lengths from the principal point, float64[..., 2]."""
         down = (xy[..., 1] - self.cy) / self.fy
-        p = np.stack([(xy[..., 0] - self.cx - self.skew * down) / self.fx, down], axis=-1)
+        return np.stack([(xy[..., 0] - self.cx - self.skew * down) / self.fx, down], axis=-1)
+
+    def _directions(self, p: F64) -> F64:
+        """Return the unit directions of positions on the plane, float64[n, 3]."""
         if self.model == "fisheye":
             height = np.hypot(p[..., 0], p[..., 1])
             theta = self._curve.inverse(height)
@@ -319,8 +332,7 @@ class Calibration:
 
     def _heights(self, xy: F64) -> F64:
         """Return distances from the principal point in focal lengths, float64[n], before the sensor's tilt."""
-        down = (xy[..., 1] - self.cy) / self.fy
-        p = np.stack([(xy[..., 0] - self.cx - self.skew * down) / self.fx, down], axis=-1)
+        p = self._on_plane(xy)
         p = p if self.model == "fisheye" else _by(np.linalg.inv(self._tilt), p)
         return np.hypot(p[..., 0], p[..., 1])
 
