@@ -487,7 +487,7 @@ def test_without_coefficients_the_image_is_that_of_the_plain_camera() -> None:
 
 
 def test_opencv_undistorts_the_image_to_that_of_the_plain_camera() -> None:
-    """To 0.03 px in every quarter, by the least-squares shift along the gradient of the image (Lucas & Kanade 1981);
+    """To 0.03 px in every quarter, by the least-squares shift along the image's gradient (Lucas & Kanade 1981);
     the image before is off by half a pixel and more."""
     nadir = {"reference": "nadir", "roll_deg": [-20, 20], "pitch_deg": [-20, 20], "sun_elevation_deg": [30, 60]}
     table = small_scene(
