@@ -46,6 +46,13 @@ COEFFICIENTS: dict[str, tuple[str, ...]] = {
 # Numbers of coefficients that OpenCV takes, and that are stored.
 _LENGTHS = {"opencv": (8, 12, 14), "undistorting": (12,), "fisheye": (4,)}
 
+# Limits of the numbers, in px and rad. A telescope of 0.1° may have coefficients of 1e15.
+_LARGEST = 1e30
+_LIMITS = {
+    **dict.fromkeys(("fx", "fy"), (1e-3, 1e9)),
+    **dict.fromkeys(("cx", "cy", "skew"), (-1e9, 1e9)),
+    **dict.fromkeys(("tau_x", "tau_y"), (-1.5, 1.5)),
+}
 EXACT = 1e-10  # largest error of an inversion, in focal lengths
 _STEPS = 60
 _AT_ONCE = 1 << 14  # positions that are inverted together, so that their arrays stay in the processor's cache
@@ -101,19 +108,14 @@ class Calibration:
         object.__setattr__(self, "coefficients", full)
         for name in ("fx", "fy", "cx", "cy", "skew"):
             object.__setattr__(self, name, float(getattr(self, name)))
-        for name, value in (("fx", self.fx), ("fy", self.fy)):
-            if not (np.isfinite(value) and value > 0):
-                raise InputError(f"{name} = {value:g}: must be a finite number above 0, in px")
-        values = {"cx": self.cx, "cy": self.cy, "skew": self.skew, **dict(zip(names, full, strict=True))}
-        for name, value in values.items():
-            if not np.isfinite(value):
-                raise InputError(f"{name} = {value}: must be a finite number")
         for name, size in (("width_px", self.width_px), ("height_px", self.height_px)):
             if size < 1:
                 raise InputError(f"{name} = {size}: must be at least 1")
-        for name in ("tau_x", "tau_y"):
-            if abs(values.get(name, 0.0)) >= np.pi / 2:
-                raise InputError(f"{name} = {values[name]:g}: must be between -π/2 and π/2, in rad")
+        values = {"cx": self.cx, "cy": self.cy, "skew": self.skew, **dict(zip(names, full, strict=True))}
+        for name, value in {"fx": self.fx, "fy": self.fy, **values}.items():
+            low, high = _LIMITS.get(name, (-_LARGEST, _LARGEST))
+            if not low <= value <= high:  # NaN is neither
+                raise InputError(f"{name} = {value:g}: must be from {low:g} to {high:g}")
 
     @classmethod
     def of_centres(cls, *, cx: float, cy: float, **fields: Any) -> Calibration:
@@ -309,8 +311,9 @@ class Calibration:
         height = self._heights(border)
         reached = self._reached
         if height.max() >= reached:
+            turns = "reaches 180 deg from the boresight" if self.valid_to_deg >= 180 else "folds back"
             raise InputError(
-                f"the {self.model} polynomial folds back {reached * self.focal_length_px:.1f} px from the "
+                f"the {self.model} polynomial {turns} {reached * self.focal_length_px:.1f} px from the "
                 "principal point, which is inside the frame: its corner lies "
                 f"{height.max() * self.focal_length_px:.1f} px away; give a calibration that holds up to the corner"
             )
@@ -346,6 +349,7 @@ class Calibration:
 
     @property
     def _curve(self) -> Any:
+        """Return the polynomial: an `_Angle` of the fisheye, else a `_PlaneCurve`."""
         return _curve(self.model, self.coefficients)
 
     @cached_property
@@ -375,6 +379,7 @@ def _ratio(value: F64, over: F64) -> F64:
 
 
 def _determinant(jacobian: F64) -> F64:
+    """Return the determinants of matrices float64[..., 2, 2]."""
     return np.asarray(jacobian[..., 0, 0] * jacobian[..., 1, 1] - jacobian[..., 0, 1] * jacobian[..., 1, 0])
 
 
@@ -408,6 +413,7 @@ class _Angle:
         return self._sum(np.minimum(theta, self.end), [1.0, 3, 5, 7, 9])
 
     def _sum(self, theta: F64, factors: list[float]) -> F64:
+        """Return Σ factor_i k_i θ²ⁱ with k_0 = 1."""
         square, total = np.asarray(theta) ** 2, np.zeros_like(theta)
         for factor, k in reversed(list(zip(factors, (1.0, *self.k), strict=True))):
             total = total * square + factor * k
@@ -510,6 +516,7 @@ class _PlaneCurve:
         return above / below, (above_rise * below - above * below_rise) / below**2
 
     def _polynomial(self, q: F64) -> F64:
+        """Return p within `end`."""
         x, y = q[..., 0], q[..., 1]
         p1, p2 = self.k[2:4]
         s1, s2, s3, s4 = self.k[8:12]
@@ -520,6 +527,7 @@ class _PlaneCurve:
         return np.stack([across, down], axis=-1)
 
     def _jacobian(self, q: F64) -> F64:
+        """Return dp/dq within `end`."""
         x, y = q[..., 0], q[..., 1]
         p1, p2 = self.k[2:4]
         s1, s2, s3, s4 = self.k[8:12]
