@@ -446,6 +446,37 @@ def test_the_sense_of_brown_and_conrady_counts(sense: str) -> None:
     assert farther == (sense == "distorting")
 
 
+def test_beyond_the_image_circle_the_frame_is_dark() -> None:
+    """The polynomial turns back at 1 / sqrt(-3 k1) rad, 44.8 px from the axis: in the frame, beyond the circle."""
+    fisheye = {"model": "fisheye", "fx": 26.0, "cx": 47.5, "cy": 39.5, "k1": -0.05}
+    with pytest.raises(InputError, match=r"folds back 44.8 px .* its corner lies 62.5 px away; .* circle_deg"):
+        config.parse_scene(with_calibration(fisheye), source="test")
+    with pytest.raises(InputError, match=r"folds back 44.8 px .* the rim of its image circle lies 4\d.\d px away"):
+        config.parse_scene(with_calibration({**fisheye, "circle_deg": 320.0}), source="test")
+    with pytest.raises(InputError, match=r"circle_deg = 185: must be below 180 for the model opencv"):
+        config.parse_scene(with_calibration({**TABLES["opencv"], "circle_deg": 185.0}), source="test")
+    nadir = {"reference": "nadir", "roll_deg": [-20, 20], "pitch_deg": [-20, 20], "sun_elevation_deg": [30, 60]}
+    table = with_calibration(
+        {**fisheye, "circle_deg": 190.0},
+        dataset={"samples": 1, "sites": 1, "layers": ["clean", "depth_m", "semantic"]},
+        geometry={"sun_averted": nadir, "sun_facing": nadir},
+    )
+    table["faults"] = {}
+    parsed = config.parse_scene(table, source="test")
+    sample, found = simulate(parsed, 0), parsed.camera.frame_calibration
+    assert found is not None
+    assert found.valid_to_deg == found.field_deg == 95.0
+    angle = np.radians(95)
+    y, x = np.indices((80, 96)) + 0.5
+    dark = np.hypot(x - 48, y - 40) > 26 * angle * (1 - 0.05 * angle**2)
+    semantic, clean = sample.layers["semantic"], sample.layers["clean"][..., 3].astype(float)
+    assert (semantic[dark] == 0).all()
+    assert np.isinf(sample.layers["depth_m"][dark]).all()
+    assert (semantic[~dark] == BODY).mean() > 0.5
+    assert clean[dark].max() < 8  # noise
+    assert clean[~dark & (semantic == BODY)].mean() > 40
+
+
 # --- beside the rectilinear camera
 
 

@@ -52,6 +52,7 @@ _LIMITS = {
     **dict.fromkeys(("fx", "fy"), (1e-3, 1e9)),
     **dict.fromkeys(("cx", "cy", "skew"), (-1e9, 1e9)),
     **dict.fromkeys(("tau_x", "tau_y"), (-1.5, 1.5)),
+    "circle_deg": (0.001, 360.0),
 }
 EXACT = 1e-10  # largest error of an inversion, in focal lengths
 _STEPS = 60
@@ -81,6 +82,8 @@ class Calibration:
         Those of `COEFFICIENTS`, in this order. Missing ones are 0.
     skew
         In px: by how much a step of one focal length down moves to the right.
+    circle_deg
+        Full angle of the image circle, beyond which the frame is dark; None: the whole frame has light.
 
     Raises
     ------
@@ -97,6 +100,7 @@ class Calibration:
     cy: float
     coefficients: tuple[float, ...] = ()
     skew: float = 0.0
+    circle_deg: float | None = None
 
     def __post_init__(self) -> None:
         names = COEFFICIENTS.get(self.model)
@@ -112,6 +116,7 @@ class Calibration:
             if size < 1:
                 raise InputError(f"{name} = {size}: must be at least 1")
         values = {"cx": self.cx, "cy": self.cy, "skew": self.skew, **dict(zip(names, full, strict=True))}
+        values |= {} if self.circle_deg is None else {"circle_deg": float(self.circle_deg)}
         for name, value in {"fx": self.fx, "fy": self.fy, **values}.items():
             low, high = _LIMITS.get(name, (-_LARGEST, _LARGEST))
             if not low <= value <= high:  # NaN is neither
@@ -184,6 +189,11 @@ class Calibration:
 
     @cached_property
     def valid_to_deg(self) -> float:
+        """Return the angle from the boresight up to which the polynomial holds, or that of the image circle."""
+        return min(self._holds_to_deg, np.inf if self.circle_deg is None else self.circle_deg / 2)
+
+    @cached_property
+    def _holds_to_deg(self) -> float:
         """Return the angle from the boresight up to which the polynomial itself holds."""
         if self.model == "fisheye":
             return float(np.degrees(min(self._curve.end, np.pi)))
@@ -194,16 +204,20 @@ class Calibration:
 
     @cached_property
     def field_deg(self) -> float:
-        """Return the largest angle from the boresight in the frame."""
+        """Return the largest angle from the boresight in the lit frame."""
         z = self.directions_of(self._border_px())[..., 2]
-        return float(np.degrees(np.arccos(np.clip(z.min(), -1, 1))))
+        angle_deg = float(np.degrees(np.arccos(np.clip(z.min(), -1, 1))))
+        return angle_deg if self.circle_deg is None else min(angle_deg, self.circle_deg / 2)
 
     @cached_property
     def fov_deg(self) -> float:
-        """Return the angle between the directions at the middles of the left and the right side of the frame."""
+        """Return the angle between the directions at the middles of the left and the right side of the frame.
+
+        It is at most that of the image circle.
+        """
         ends = self.directions_of([[0, self.height_px / 2], [self.width_px, self.height_px / 2]])
-        along = np.degrees(np.arctan2(ends[:, 0], ends[:, 2]))
-        return float(along[1] - along[0])
+        left, right = np.degrees(np.arctan2(np.abs(ends[:, 0]), ends[:, 2])) * np.sign(ends[:, 0])
+        return float(min(right - left, np.inf if self.circle_deg is None else self.circle_deg))
 
     # --- directions and pixels
 
@@ -250,7 +264,8 @@ class Calibration:
         if self.model == "fisheye":
             height = np.hypot(p[..., 0], p[..., 1])
             theta = self._curve.inverse(height)
-            theta = np.where(theta <= np.pi, theta, np.nan)
+            # beyond an image circle, any direction does
+            theta = np.where(theta <= np.pi, theta, np.nan if self.circle_deg is None else np.pi)
             across = p * _ratio(np.sin(theta), height)[..., None]
             return np.concatenate([across, np.cos(theta)[..., None]], axis=-1)
         p = _by(np.linalg.inv(self._tilt), p)
@@ -305,25 +320,43 @@ class Calibration:
             skew=self.skew * across,
         )
 
+    def is_lit(self, directions: F64) -> NDArray[np.bool_]:
+        """Return which unit directions, float64[..., 3], lie in the image circle."""
+        if self.circle_deg is None:
+            return np.ones(directions.shape[:-1], dtype=bool)
+        return np.asarray(directions[..., 2] >= np.cos(np.radians(self.circle_deg / 2)))
+
     def checked(self) -> Calibration:
-        """Return the calibration itself. Raises InputError if its polynomial folds back inside the frame."""
-        border = self._border_px()
-        height = self._heights(border)
-        reached = self._reached
+        """Return the calibration itself. Raises InputError if its polynomial folds back inside the lit frame."""
+        border, reached = self._border_px(), self._reached
+        height, end = self._heights(border), "its corner"
+        if self.circle_deg is not None:
+            turn = np.linspace(0, 2 * np.pi, 4 * _BORDER)
+            angle = np.full(len(turn), np.radians(self.circle_deg / 2))
+            rim = np.stack([np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), np.cos(angle)], axis=-1)
+            around = self.pixel_of(rim)
+            if not np.isfinite(around).all():
+                raise InputError(f"circle_deg = {self.circle_deg:g}: must be below 180 for the model {self.model}")
+            if self._heights(around).max() < height.max():
+                inside = ((around >= 0) & (around <= (self.width_px, self.height_px))).all(axis=-1)
+                border, height, end = around[inside], self._heights(around), "the rim of its image circle"
         if height.max() >= reached:
-            turns = "reaches 180 deg from the boresight" if self.valid_to_deg >= 180 else "folds back"
+            turns = "reaches 180 deg from the boresight" if self._holds_to_deg >= 180 else "folds back"
             raise InputError(
                 f"the {self.model} polynomial {turns} {reached * self.focal_length_px:.1f} px from the "
-                "principal point, which is inside the frame: its corner lies "
-                f"{height.max() * self.focal_length_px:.1f} px away; give a calibration that holds up to the corner"
+                f"principal point, which is inside the frame: {end} lies "
+                f"{height.max() * self.focal_length_px:.1f} px away; give a calibration that holds up to there, or "
+                "circle_deg, beyond which the frame is dark"
             )
+        if not len(border):
+            return self
         again = self.pixel_of(self.directions_of(border))
         off = np.abs(again - border)
         if not off.max() <= 1e-6:
-            worst = height[np.argmax(np.where(np.isnan(off), np.inf, off).max(axis=-1))]
+            worst = self._heights(border)[np.argmax(np.where(np.isnan(off), np.inf, off).max(axis=-1))]
             raise InputError(
                 f"the {self.model} polynomial has no inverse {worst * self.focal_length_px:.1f} px from the "
-                "principal point, inside the frame; give a calibration that holds up to the corner"
+                "principal point, inside the frame; give a calibration that holds up to there"
             )
         return self
 

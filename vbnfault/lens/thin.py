@@ -159,6 +159,8 @@ class ThinLens:
         (physics.md, section 6, warns of counting it twice).
         """
         sharp = self.on_axis(radiance)
+        if self.calibration is not None and self.calibration.circle_deg is not None:
+            sharp = replace(sharp, array=sharp.array * image_circle(self.calibration))
         if self.halo is None:
             return sharp
         return replace(sharp, array=np.asarray(self.halo.applied(sharp.array, self.pixel_rad)))
@@ -210,6 +212,16 @@ def natural_falloff(calibration: Calibration | None, shape: tuple[int, int], foc
         return cos4_map(shape, focal_length_px)
     seen = calibration.directions_at(*(np.arange(size) + 0.5 for size in shape[::-1]))
     out = (calibration.solid_angle_sr(seen) * calibration.fx * calibration.fy).astype(np.float32)
+    out *= image_circle(calibration)
+    out.flags.writeable = False
+    return out
+
+
+@lru_cache(maxsize=2)
+def image_circle(calibration: Calibration) -> NDArray[np.bool_]:
+    """Return the pixels of a calibration's frame whose centres lie in its image circle, bool[y, x], read-only."""
+    size = calibration.width_px, calibration.height_px
+    out = calibration.is_lit(calibration.directions_at(*(np.arange(n) + 0.5 for n in size)))
     out.flags.writeable = False
     return out
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core import spectra
+from ..core.calibration import Calibration
 from ..core.quantities import BODY, SKY, FarSource, FineLight, Radiance, Truth
 from ..core.sundisc import Projection, forward
 from ..lens.straylight.scene import RenderGrid, surrounding_grids
@@ -106,7 +107,23 @@ def seen_truth(spec: SampleSpec, scene: RenderInput) -> Truth:
     lens: dict[str, Any] = (
         {"directions": camera.seen_directions, "projection": camera.projection} if is_distorted else {}
     )
-    return render.truth(spec.terrain.surface, scene.view, scene.sun, angles=angles, **lens)
+    truth = render.truth(spec.terrain.surface, scene.view, scene.sun, angles=angles, **lens)
+    calibration = camera.lens.calibration
+    return truth if calibration is None else _in_circle(truth, calibration, camera.seen_directions)
+
+
+def _in_circle(truth: Truth, calibration: Calibration, directions: NDArray[np.float64]) -> Truth:
+    """Return truth that has the sky where no light reaches the frame, beyond the image circle."""
+    dark = ~calibration.is_lit(directions)
+    if not dark.any():
+        return truth
+    sky = {"depth_m": np.inf, "normal": 0, "semantic": SKY, "material": -1}
+    arrays = {}
+    for name, values in vars(truth).items():
+        if values is not None:
+            arrays[name] = values.copy()
+            arrays[name][dark] = sky.get(name, np.nan)
+    return replace(truth, **arrays)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 from typing import Literal
 
@@ -44,6 +45,10 @@ class CalibrationTable(Table):
     fy: float | None = Field(None, description="focal length down in px; default: fx")
     cx: float | None = Field(None, description="principal point in px")
     cy: float | None = Field(None, description="principal point in px")
+    circle_deg: float | None = Field(
+        None,
+        description="full angle of the image circle, beyond which the frame is dark; default: all of it is lit",
+    )
     skew: float = Field(0.0, description="shift to the right for a step of one focal length down, in px")
     k1: float = Field(0.0, description="radial, of r² (of a fisheye: of θ³)")
     k2: float = Field(0.0, description="radial, of r⁴ (θ⁵)")
@@ -97,9 +102,9 @@ class CalibrationTable(Table):
         """Return the calibration as it is; `width_px` and `height_px` are the frame's. Raises InputError."""
         if self.file:
             size = None if self.width_px is None or self.height_px is None else (self.width_px, self.height_px)
-            return Calibration.read(
-                self.file, camera=self.camera, model=self.of_lens if self.model else "", size_px=size
-            )
+            model = self.of_lens if self.model else ""
+            found = Calibration.read(self.file, camera=self.camera, model=model, size_px=size)
+            return replace(found, circle_deg=self.circle_deg)
         fx, cx, cy = (float(getattr(self, key)) for key in ("fx", "cx", "cy"))
         shift = 0.5 if self.origin == "pixel_centre" else 0.0
         return Calibration(
@@ -111,6 +116,7 @@ class CalibrationTable(Table):
             cx=cx + shift,
             cy=cy + shift,
             skew=self.skew,
+            circle_deg=self.circle_deg,
             coefficients=tuple(getattr(self, key) for key in COEFFICIENTS[self.of_lens]),
         )
 
@@ -130,6 +136,7 @@ class CalibrationTable(Table):
             cx=found.cx,
             cy=found.cy,
             skew=found.skew,
+            circle_deg=found.circle_deg,
             **dict(zip(COEFFICIENTS[found.model], found.coefficients, strict=True)),
         )
 
