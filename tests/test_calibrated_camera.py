@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from test_calibration import KALIBR, ROS, YAML_1_0
 from test_render import NODES, ball, box, join, scene, sun
 
-from vbnfault import dataset, render, store
+from vbnfault import cli, dataset, render, store
 from vbnfault.camera import Camera
 from vbnfault.core.calibration import Calibration
 from vbnfault.core.errors import InputError
@@ -27,7 +29,7 @@ from vbnfault.detector import ThreeColourDetector
 from vbnfault.faults import FaultContext
 from vbnfault.faults.straylight import TextureStraylight, flare_centres_px
 from vbnfault.faults.straylight_lens import TracedStraylight
-from vbnfault.lens import Halo, ThinLens
+from vbnfault.lens import Halo, RealLens, ThinLens, load_lens, scaled_to_field
 from vbnfault.pipeline import simulate
 from vbnfault.render.description import View
 from vbnfault.scene import config
@@ -475,6 +477,36 @@ def test_beyond_the_image_circle_the_frame_is_dark() -> None:
     assert (semantic[~dark] == BODY).mean() > 0.5
     assert clean[dark].max() < 8  # noise
     assert clean[~dark & (semantic == BODY)].mean() > 40
+
+
+def test_a_lens_is_printed_as_a_calibration_with_its_residual(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """The printed table is one of a scene, and takes directions where the chief rays of the lens go."""
+    frame = ["--width-px", 96, "--height-px", 80]
+    out = ["--out", tmp_path / "lens.png"]
+    arguments = ["lens", "nikkor_28_f2p8", "--fov-deg", 62.0, "--fit-opencv", *frame, *out]
+    monkeypatch.setattr("sys.argv", ["vbnfault", *map(str, arguments)])
+    assert cli.main() == 0
+    printed = capsys.readouterr().out
+    text = printed[printed.index("[camera.calibration]") :]
+    found = re.search(r"residual over the lit frame: ([\d.]+) px rms, ([\d.]+) px at most", text)
+    assert found is not None
+    assert float(found[1]) <= float(found[2]) <= 0.02
+    table = tomllib.loads(text[: text.index("#")])["camera"]["calibration"]
+    calibration = config.parse_scene(with_calibration(table), source="test").camera.frame_calibration
+    assert calibration is not None
+    lens = RealLens(
+        prescription=scaled_to_field(load_lens("nikkor_28_f2p8"), 62.0, 96 * PITCH_UM * 1e-3),
+        width_px=96,
+        height_px=80,
+        pixel_pitch_um=PITCH_UM,
+    )
+    xy = np.array([[0.5, 0.5], [90.0, 40.0], [30.0, 70.0]])
+    rays = calibration.directions_of(xy)
+    heights = lens.distorted(np.hypot(rays[:, 0], rays[:, 1]) / rays[:, 2]) * lens.focal_length_px
+    # the lens's own map is a table of 4097 slopes, off by 1e-3 px
+    np.testing.assert_allclose(heights, np.hypot(*(xy - (48, 40)).T), atol=2e-3)
 
 
 # --- beside the rectilinear camera

@@ -309,10 +309,14 @@ class Calibration:
                 f"calibrates an image of {self.width_px} x {self.height_px} px, which cannot be scaled to the "
                 f"camera's {width_px} x {height_px} px: they have different shapes"
             )
+        return self.scaled_by(across, down)
+
+    def scaled_by(self, across: float, down: float) -> Calibration:
+        """Return the calibration with so many times the columns and rows, rounded up."""
         return replace(
             self,
-            width_px=width_px,
-            height_px=height_px,
+            width_px=int(np.ceil(self.width_px * across - 1e-6)),
+            height_px=int(np.ceil(self.height_px * down - 1e-6)),
             fx=self.fx * across,
             fy=self.fy * down,
             cx=self.cx * across,

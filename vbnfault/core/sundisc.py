@@ -57,9 +57,6 @@ class Projection(Protocol):
     def directions_at(self, x_px: Floats, y_px: Floats) -> F64:
         """Return the directions that the positions of a grid see, float64[y, x, 3]."""
 
-    def directions_of(self, xy_px: F64) -> F64:
-        """Return the directions that positions float64[..., 2] see, float64[..., 3]."""
-
     def solid_angle_sr(self, directions: F64) -> F64:
         """Return the solid angle per pixel at directions in sr, float64[...].
 
@@ -101,7 +98,7 @@ class Pinhole:
         return forward(np.stack(np.meshgrid((x_px - cx) / fx, (y_px - cy) / fy), axis=-1))
 
     def directions_of(self, xy_px: F64) -> F64:
-        """Return directions as `Projection` defines."""
+        """Return the directions that positions float64[..., 2] see, float64[..., 3]."""
         return forward((xy_px - self.intrinsics[2:]) / self.intrinsics[:2])
 
     def solid_angle_sr(self, directions: F64) -> F64:
@@ -109,40 +106,6 @@ class Pinhole:
         fx, fy = self.intrinsics[:2]
         slopes = directions[..., :2] / directions[..., 2:]
         return np.asarray(1 / (fx * fy * (1 + (slopes**2).sum(axis=-1)) ** 2))
-
-
-@dataclass(frozen=True)
-class Zoomed:
-    """Show a projection with pixels that are `factor` times as small."""
-
-    of: Projection
-    factor: float
-
-    @property
-    def least_z(self) -> float:
-        """Return that of the projection."""
-        return self.of.least_z
-
-    @property
-    def foreshortens(self) -> bool:
-        """Return that of the projection."""
-        return self.of.foreshortens
-
-    def pixel_of(self, directions: F64) -> F64:
-        """Return pixel positions as `Projection` defines."""
-        return self.of.pixel_of(directions) * self.factor
-
-    def directions_at(self, x_px: Floats, y_px: Floats) -> F64:
-        """Return directions as `Projection` defines."""
-        return self.of.directions_at(x_px / self.factor, y_px / self.factor)
-
-    def directions_of(self, xy_px: F64) -> F64:
-        """Return directions as `Projection` defines."""
-        return self.of.directions_of(xy_px / self.factor)
-
-    def solid_angle_sr(self, directions: F64) -> F64:
-        """Return solid angles as `Projection` defines."""
-        return self.of.solid_angle_sr(directions) / self.factor**2
 
 
 @dataclass(frozen=True)

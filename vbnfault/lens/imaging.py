@@ -588,13 +588,6 @@ class ChiefRays:
         stretch = self.lens.undistorted(distance, self.wavelength_nm) / distance
         return forward(np.stack([x * stretch, y[:, None] * stretch], axis=-1))
 
-    def directions_of(self, xy_px: F64) -> F64:
-        """Return the directions in C, float64[..., 3], that positions float64[..., 2] see."""
-        x, y = np.moveaxis((xy_px - self._centre_px) / self.lens.focal_length_px, -1, 0)
-        distance = np.maximum(np.hypot(x, y), 1e-12)
-        stretch = self.lens.undistorted(distance, self.wavelength_nm) / distance
-        return forward(np.stack([x * stretch, y * stretch], axis=-1))
-
     def solid_angle_sr(self, directions: F64) -> F64:
         """Return the projected solid angle of a pixel, cos⁴θ · t / (h dh/dt) times its area, float64[...]."""
         mapped = self.lens._map(self.wavelength_nm)

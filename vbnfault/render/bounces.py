@@ -21,7 +21,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.quantities import Truth
-from ..core.sundisc import Zoomed
 from .bsdf import has_bands
 from .description import RenderInput, View
 from .light import WAVEFRONT, Cells, CellStrata, Light
@@ -85,7 +84,7 @@ def _halved(view: View) -> View:
     return replace(
         view,
         intrinsics=view.intrinsics / 2,
-        projection=None if view.projection is None else Zoomed(view.projection, 0.5),
+        projection=None if view.projection is None else view.projection.scaled_by(0.5, 0.5),
         width_px=-(-view.width_px // 2),
         height_px=-(-view.height_px // 2),
     )

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.sundisc import Pinhole, Projection
+from ..core.calibration import Calibration
+from ..core.sundisc import Pinhole
 from ..reflectance import BandReflectance
 
 F64 = NDArray[np.float64]
@@ -33,7 +34,7 @@ class View:
     start_m
         Distance from the camera at which its rays start. Before a far body, they keep the precision of float32.
     projection
-        Map between directions and pixels of a camera with distortion. None: the pinhole of the intrinsics.
+        Calibration of a camera with distortion. None: the pinhole of the intrinsics.
     """
 
     position_L_m: F64
@@ -44,10 +45,10 @@ class View:
     aperture_radius_m: float = 0.0
     focus_distance_m: float = float("inf")
     start_m: float = 0.0
-    projection: Projection | None = None
+    projection: Calibration | None = None
 
     @property
-    def pixel_map(self) -> Projection:
+    def pixel_map(self) -> Pinhole | Calibration:
         """Return the map between directions and pixels."""
         return Pinhole(self.intrinsics) if self.projection is None else self.projection
 

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.calibration import Calibration
 from ..core.sundisc import axes
 from .description import Sunlight, View
 from .runtime import dr, mi, packets
@@ -195,8 +196,7 @@ class Optics:
         fx, fy, cx, cy = (float(v) for v in view.intrinsics)
         self.scale = opaque_vector(mi.Vector2f, np.array([1 / fx, 1 / fy]))
         self.centre = opaque_vector(mi.Vector2f, np.array([cx, cy]))
-        projection: Any = view.projection
-        self._table = _directions(projection, self.width, self.height)
+        self._table = None if view.projection is None else _directions(view.projection)
         self.start_m = dr.opaque(mi.Float, view.start_m) if view.start_m else 0.0
         self.aperture = view.aperture_radius_m
         self._radius = dr.opaque(mi.Float, view.aperture_radius_m)
@@ -267,18 +267,12 @@ _NODES = (256, 1024)
 
 
 @lru_cache(maxsize=4)
-def _directions(projection: Any, width_px: int, height_px: int) -> tuple[Any, int, int, float] | None:
-    """Return directions in C at the nodes of a grid over a frame, its columns and rows, and its nodes per px.
-
-    None without a projection.
-    """
-    if projection is None:
-        return None
-    per_px = float(
-        2.0 ** np.round(np.log2(np.clip(2 * max(width_px, height_px), *_NODES) / max(width_px, height_px)))
-    )
-    columns, rows = (int(np.ceil(size * per_px)) + 1 for size in (width_px, height_px))
-    seen = projection.directions_at(np.arange(columns) / per_px, np.arange(rows) / per_px)
+def _directions(calibration: Calibration) -> tuple[Any, int, int, float]:
+    """Return directions in C at the nodes of a grid over a frame, its columns and rows, and its nodes per px."""
+    size = calibration.width_px, calibration.height_px
+    per_px = float(2.0 ** np.round(np.log2(np.clip(2 * max(size), *_NODES) / max(size))))
+    columns, rows = (int(np.ceil(n * per_px)) + 1 for n in size)
+    seen = calibration.directions_at(np.arange(columns) / per_px, np.arange(rows) / per_px)
     seen = np.concatenate([seen, np.zeros_like(seen[..., :1])], axis=-1)
     return packets(mi.Float, seen.astype(np.float32)), columns, rows, per_px
 
