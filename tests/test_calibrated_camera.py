@@ -17,9 +17,10 @@ from conftest import small_scene
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from test_calibration import KALIBR, ROS, YAML_1_0
+from test_cli import run
 from test_render import NODES, ball, box, join, scene, sun
 
-from vbnfault import cli, dataset, render, store
+from vbnfault import dataset, render, store
 from vbnfault.camera import Camera
 from vbnfault.core.calibration import Calibration
 from vbnfault.core.errors import InputError
@@ -485,9 +486,7 @@ def test_a_lens_is_printed_as_a_calibration_with_its_residual(
     """The printed table is one of a scene, and takes directions where the chief rays of the lens go."""
     frame = ["--width-px", 96, "--height-px", 80]
     out = ["--out", tmp_path / "lens.png"]
-    arguments = ["lens", "nikkor_28_f2p8", "--fov-deg", 62.0, "--fit-opencv", *frame, *out]
-    monkeypatch.setattr("sys.argv", ["vbnfault", *map(str, arguments)])
-    assert cli.main() == 0
+    assert run(monkeypatch, "lens", "nikkor_28_f2p8", "--fov-deg", 62.0, "--fit-opencv", *frame, *out) == 0
     printed = capsys.readouterr().out
     text = printed[printed.index("[camera.calibration]") :]
     found = re.search(r"residual over the lit frame: ([\d.]+) px rms, ([\d.]+) px at most", text)
