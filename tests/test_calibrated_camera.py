@@ -411,7 +411,7 @@ def test_a_calibration_is_scaled_only_when_asked() -> None:
         ({"k1": -2.0}, {}, r"calibration: the opencv polynomial folds back \d+\.\d px from the principal point"),
         ({"model": "omni"}, {}, "camera.calibration.model = 'omni': must be"),
         ({"fx": None}, {}, "fx: is missing; give fx, cx and cy, or file"),
-        ({"fx": -1.0}, {}, "calibration: fx = -1: must be from 0.001"),
+        ({"fx": -1.0}, {}, r"camera.calibration.fx = -1.0: must be a number from 0.001"),
         ({"fx": float("nan")}, {}, "fx"),
         ({"model": "fisheye"}, {}, "p1 = 0.001: the model fisheye has k1, k2, k3, k4"),
         ({"model": "brown_conrady"}, {}, "sense = '': must be distorting or undistorting"),

@@ -48,7 +48,8 @@ _LENGTHS = {"opencv": (8, 12, 14), "undistorting": (12,), "fisheye": (4,)}
 
 # Limits of the numbers, in px and rad. A telescope of 0.1° may have coefficients of 1e15.
 _LARGEST = 1e30
-_LIMITS = {
+LIMITS = {
+    **dict.fromkeys(_PLANE, (-_LARGEST, _LARGEST)),
     **dict.fromkeys(("fx", "fy"), (1e-3, 1e9)),
     **dict.fromkeys(("cx", "cy", "skew"), (-1e9, 1e9)),
     **dict.fromkeys(("tau_x", "tau_y"), (-1.5, 1.5)),
@@ -118,7 +119,7 @@ class Calibration:
         values = {"cx": self.cx, "cy": self.cy, "skew": self.skew, **dict(zip(names, full, strict=True))}
         values |= {} if self.circle_deg is None else {"circle_deg": float(self.circle_deg)}
         for name, value in {"fx": self.fx, "fy": self.fy, **values}.items():
-            low, high = _LIMITS.get(name, (-_LARGEST, _LARGEST))
+            low, high = LIMITS[name]
             if not low <= value <= high:  # NaN is neither
                 raise InputError(f"{name} = {value:g}: must be from {low:g} to {high:g}")
 

@@ -4,15 +4,22 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import lru_cache
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
-from ..core.calibration import COEFFICIENTS, Calibration
+from ..core.calibration import COEFFICIENTS, LIMITS, Calibration
 from ..core.errors import InputError
 from ..core.tables import Table
 
 _POINT = ("fx", "fy", "cx", "cy")
+_MOST_PX = 1_000_000
+
+
+def _number(key: str, text: str, default: float | None = 0.0) -> Any:
+    """Return the field of a number of a calibration, within its limits."""
+    low, high = LIMITS[key]
+    return Field(default, ge=low, le=high, description=text)
 
 
 class CalibrationTable(Table):
@@ -34,36 +41,41 @@ class CalibrationTable(Table):
     scale_to_frame: bool = Field(
         False, description="whether to scale the calibration of another image size of the same shape to the frame"
     )
-    width_px: int | None = Field(None, ge=1, description="width of the calibrated image; default: the frame's")
-    height_px: int | None = Field(None, ge=1, description="height of the calibrated image; default: the frame's")
+    width_px: int | None = Field(
+        None, ge=1, le=_MOST_PX, description="width of the calibrated image; default: the frame's"
+    )
+    height_px: int | None = Field(
+        None, ge=1, le=_MOST_PX, description="height of the calibrated image; default: the frame's"
+    )
     origin: Literal["pixel_centre", "pixel_corner"] = Field(
         "pixel_centre",
         description="where cx and cy are 0: at the centre of the first pixel, as for OpenCV, ROS and Kalibr, or at "
         "its corner, as for COLMAP and the arrays of a dataset",
     )
-    fx: float | None = Field(None, description="focal length across in px")
-    fy: float | None = Field(None, description="focal length down in px; default: fx")
-    cx: float | None = Field(None, description="principal point in px")
-    cy: float | None = Field(None, description="principal point in px")
-    circle_deg: float | None = Field(
+    fx: float | None = _number("fx", "focal length across in px", None)
+    fy: float | None = _number("fy", "focal length down in px; default: fx", None)
+    cx: float | None = _number("cx", "principal point in px", None)
+    cy: float | None = _number("cy", "principal point in px", None)
+    circle_deg: float | None = _number(
+        "circle_deg",
+        "full angle of the image circle, beyond which the frame is dark; default: all of it is lit",
         None,
-        description="full angle of the image circle, beyond which the frame is dark; default: all of it is lit",
     )
-    skew: float = Field(0.0, description="shift to the right for a step of one focal length down, in px")
-    k1: float = Field(0.0, description="radial, of r² (of a fisheye: of θ³)")
-    k2: float = Field(0.0, description="radial, of r⁴ (θ⁵)")
-    k3: float = Field(0.0, description="radial, of r⁶ (θ⁷)")
-    k4: float = Field(0.0, description="radial, of r² in the denominator (of a fisheye: of θ⁹)")
-    k5: float = Field(0.0, description="radial, of r⁴ in the denominator")
-    k6: float = Field(0.0, description="radial, of r⁶ in the denominator")
-    p1: float = Field(0.0, description="tangential, OpenCV's: 2 p1 x y across")
-    p2: float = Field(0.0, description="tangential, OpenCV's: p2 (r² + 2 x²) across")
-    s1: float = Field(0.0, description="thin prism, of r² across")
-    s2: float = Field(0.0, description="thin prism, of r⁴ across")
-    s3: float = Field(0.0, description="thin prism, of r² down")
-    s4: float = Field(0.0, description="thin prism, of r⁴ down")
-    tau_x: float = Field(0.0, description="tilt of the sensor about x, in rad")
-    tau_y: float = Field(0.0, description="tilt of the sensor about y, in rad")
+    skew: float = _number("skew", "shift to the right for a step of one focal length down, in px")
+    k1: float = _number("k1", "radial, of r² (of a fisheye: of θ³)")
+    k2: float = _number("k2", "radial, of r⁴ (θ⁵)")
+    k3: float = _number("k3", "radial, of r⁶ (θ⁷)")
+    k4: float = _number("k4", "radial, of r² in the denominator (of a fisheye: of θ⁹)")
+    k5: float = _number("k5", "radial, of r⁴ in the denominator")
+    k6: float = _number("k6", "radial, of r⁶ in the denominator")
+    p1: float = _number("p1", "tangential, OpenCV's: 2 p1 x y across")
+    p2: float = _number("p2", "tangential, OpenCV's: p2 (r² + 2 x²) across")
+    s1: float = _number("s1", "thin prism, of r² across")
+    s2: float = _number("s2", "thin prism, of r⁴ across")
+    s3: float = _number("s3", "thin prism, of r² down")
+    s4: float = _number("s4", "thin prism, of r⁴ down")
+    tau_x: float = _number("tau_x", "tilt of the sensor about x, in rad")
+    tau_y: float = _number("tau_y", "tilt of the sensor about y, in rad")
 
     @model_validator(mode="after")
     def _whole(self) -> CalibrationTable:
