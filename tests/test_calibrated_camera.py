@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import tomli_w
 import zarr
 from calibrations_kit import SIX, opencv_pixels
 from conftest import small_scene
@@ -22,6 +23,7 @@ from test_render import NODES, ball, box, join, scene, sun
 
 from vbnfault import dataset, render, store
 from vbnfault.camera import Camera
+from vbnfault.cli.options import SceneOptions
 from vbnfault.core.calibration import Calibration
 from vbnfault.core.errors import InputError
 from vbnfault.core.quantities import BODY, SUN, Electrons, SunInView
@@ -400,6 +402,17 @@ def test_a_calibration_is_scaled_only_when_asked() -> None:
     found = scaled.camera.frame_calibration
     assert found is not None
     np.testing.assert_allclose(found.intrinsics, np.array([160.0, 161.0, 99.0, 76.0]) / 2)
+
+
+def test_a_preview_with_fewer_pixels_sees_the_same_field(tmp_path: Path) -> None:
+    """Also where the numbers of a scene name no size: they are those of its frame."""
+    path = tmp_path / "scene.toml"
+    path.write_text(tomli_w.dumps(with_calibration(TABLES["opencv"])))
+    whole, half = (SceneOptions(scale=scale).load(str(path)).camera for scale in (1.0, 0.3))
+    assert (half.width_px, half.height_px) == (29, 24)
+    assert half.fov_deg == pytest.approx(whole.fov_deg, rel=1e-9)
+    assert half.frame_calibration is not None
+    assert half.frame_calibration.fx == pytest.approx(80 * 29 / 96)
 
 
 @pytest.mark.parametrize(

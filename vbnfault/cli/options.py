@@ -217,7 +217,8 @@ class SceneOptions(SceneValues):
         size = {f"camera.{k}": max(16, round(self.scale * getattr(camera, k))) for k in ("width_px", "height_px")}
         field: dict[str, Any] = {"camera.fov_deg": camera.fov_deg, "camera.focal_length_mm": None}
         if camera.calibration is not None:
-            field = {"camera.calibration.scale_to_frame": True}
+            numbers = camera.calibration.model_dump(exclude_none=True)
+            field = {"camera.calibration": numbers | {"scale_to_frame": True}}
         return config.load_scene(scene, self._values() | size | field)
 
 

@@ -304,8 +304,8 @@ class Calibration:
     def scaled_to(self, width_px: int, height_px: int) -> Calibration:
         """Return the calibration of the same field with other pixels. Raises InputError for another shape."""
         across, down = width_px / self.width_px, height_px / self.height_px
-        # a rounded number of rows may differ by half of one
-        if abs(self.height_px * across - height_px) > 0.5 + 1e-9:
+        # rounded numbers of columns and of rows may each be off by a half
+        if abs(self.height_px * across - height_px) > 0.5 * (1 + self.height_px / self.width_px) + 1e-9:
             raise InputError(
                 f"calibrates an image of {self.width_px} x {self.height_px} px, which cannot be scaled to the "
                 f"camera's {width_px} x {height_px} px: they have different shapes"

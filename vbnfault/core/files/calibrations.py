@@ -83,6 +83,7 @@ def _is_colmap(text: str) -> bool:
 
 
 def _colmap(text: str, camera: str) -> Calibration:
+    """Return a camera of a list of cameras of COLMAP."""
     row = _chosen({row[0]: row for row in _rows(text)}, camera)
     if len(row) < 4:
         raise InputError(f"camera {row[0]}: must have CAMERA_ID, MODEL, WIDTH, HEIGHT and parameters")
@@ -108,6 +109,7 @@ def _colmap(text: str, camera: str) -> Calibration:
 
 
 def _yaml(text: str, camera: str) -> Calibration:
+    """Return the calibration of a YAML file, which tells by its keys whose it is."""
     import yaml
 
     try:
@@ -129,6 +131,7 @@ def _yaml(text: str, camera: str) -> Calibration:
 
 
 def _kalibr(table: Mapping[str, Any]) -> Calibration:
+    """Return a camera of a chain of Kalibr."""
     if table["camera_model"] != "pinhole":
         raise InputError(f"camera_model = {shown(table['camera_model'])}: must be pinhole")
     kind = table.get("distortion_model", "none")
@@ -181,6 +184,7 @@ def _ros(table: Mapping[str, Any]) -> Calibration:
 
 
 def _opencv(text: str, camera: str, model: str, size_px: tuple[int, int] | None) -> Calibration:
+    """Return the calibration of a FileStorage; `camera` ends the names of what belongs to it, as in M1 and D1."""
     try:
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         root = storage.root()
@@ -215,6 +219,7 @@ def _opencv(text: str, camera: str, model: str, size_px: tuple[int, int] | None)
 
 
 def _opencv_size(nodes: Mapping[str, tuple[str, Any]]) -> tuple[float, float]:
+    """Return the size of the image that a FileStorage states. Raises InputError if there is none."""
     for names in (("imagewidth", "imageheight"), ("width", "height")):
         if all(name in nodes for name in names):
             width, height = (nodes[name][1].real() for name in names)
@@ -262,6 +267,7 @@ def _chosen(cameras: Mapping[str, Any], camera: str) -> Any:
 
 
 def _at(table: Mapping[str, Any], key: str) -> Any:
+    """Return the value of a key. Raises InputError where it is missing."""
     if key not in table:
         raise InputError(f"{key}: is missing")
     return table[key]
