@@ -237,8 +237,10 @@ def main() -> None:
         path = given.out / f"{scene}.png"
         figure = sheet(scene) if scene in SHEETS else SINGLE[scene]()
         if scene.startswith("flown"):
-            palette = Image.fromarray(figure).quantize(256, Image.Quantize.MAXCOVERAGE, 2, None, Image.Dither.NONE)
-            palette.save(path, optimize=True)
+            # smooth veils would show steps of a palette without dither
+            image = Image.fromarray(figure)
+            palette = image.quantize(256, Image.Quantize.MAXCOVERAGE, 2)
+            image.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG).save(path, optimize=True)
         else:
             write_png(path, without_colour(figure), smallest=True)
         print(f"{path}: {path.stat().st_size / 1e3:.0f} kB", flush=True)

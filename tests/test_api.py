@@ -44,7 +44,7 @@ def test_every_public_name_resolves_and_is_listed() -> None:
                     public = name.asname or name.name
                     module = line.module or f"{name.name}:"
                     homes[public] = module if public == name.name else f"{module}:{name.name}"
-    assert homes == vbnfault._HOMES | {"study": "study.run"}
+    assert homes == vbnfault._HOMES | {"study": "study.run", "inject": "inject"}
     for public in vbnfault.__all__:
         assert getattr(vbnfault, public) is vars(vbnfault)[public] is not None
     with pytest.raises(AttributeError, match="module 'vbnfault' has no attribute 'nothing'"):

@@ -53,7 +53,7 @@ ONLY = {  # distribution → the packages or modules that import it
     "obstore": {"store.bucket"},
     "dask": {"dataset.dask"},
     "distributed": {"dataset.dask"},
-    "torch": {"train.datasets", "train.loader", "train.slots"},
+    "torch": {"inject.transform", "train.datasets", "train.loader", "train.slots"},
     "typer": {"cli"},
     "pyarrow": {"output.export.formats.huggingface", "scene.trajectory", "study"},
     "SALib": {"study"},
@@ -61,6 +61,7 @@ ONLY = {  # distribution → the packages or modules that import it
     "spiceypy": {"core.files.spice"},
     "OpenEXR": {"core.files.images"},
     "tifffile": {"core.files.tiff"},
+    "astropy": {"inject.files"},
 }
 
 
@@ -205,7 +206,17 @@ def test_every_required_package_that_is_imported_is_declared() -> None:
     imported = {i.target.partition(".")[0] for i in imports() if i.target_unit is None}
     names = importlib.metadata.packages_distributions()
     needed = {name.replace("_", "-") for module in imported for name in names.get(module, [])}
-    optional = {"SALib", "dask", "distributed", "obstore", "scikit-learn", "spiceypy", "torch", "vbnfault"}
+    optional = {
+        "SALib",
+        "astropy",
+        "dask",
+        "distributed",
+        "obstore",
+        "scikit-learn",
+        "spiceypy",
+        "torch",
+        "vbnfault",
+    }
     assert needed - optional <= declared.keys() | {"pydantic-core"}  # pydantic requires one version of it
     for name, version in (("mitsuba", "3.10.0"), ("drjit", "1.6.0"), ("zarr", "4.0.0"), ("pydantic", "3.0.0")):
         assert version not in declared[name]

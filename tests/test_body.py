@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import sys
 import warnings
@@ -248,6 +249,19 @@ def test_points_on_an_edge_with_and_without_slivers(tmp_path: Path, points: int,
     assert signed_volume(mended_vertices, mended) == pytest.approx(1024 * 2048 * 4096, rel=1e-12)
     assert trimesh.Trimesh(mended_vertices, mended, process=False).is_watertight
     assert len(mended_vertices) == 8 + 4 * points
+
+
+def test_a_corner_of_one_face_beside_its_vertex_is_closed_or_refused() -> None:
+    """The hole between both is filled with slivers, which may share their three corners with faces beyond them."""
+    vertices, faces = ball(2.0)
+    for face, corner in itertools.product(range(len(faces)), range(3)):
+        for away in ([1e-9, 0, 0], [1e-37, 0, 0]):
+            moved = np.vstack([vertices, vertices[faces[face, corner]] + away])
+            apart = faces.copy()
+            apart[face, corner] = len(vertices)
+            with warnings.catch_warnings(), contextlib.suppress(InputError):
+                warnings.simplefilter("ignore", UserWarning)  # what was mended
+                assert signed_volume(*check_mesh(moved, apart, "ball")) > 0
 
 
 # --- the embedded nucleus -----------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ import trimesh
 from conftest import small_scene
 
 from vbnfault.body import Body, PatchSpec, build_patch, site_at
-from vbnfault.body.fields import Octaves
+from vbnfault.body.fields import _UNITS_M, Octaves, smooth_step
 from vbnfault.body.geometry import mean_edge_m
 from vbnfault.body.relief import _contour_scarps, _unevenness
 from vbnfault.body.roughness import Roughness
@@ -187,14 +187,19 @@ def test_contour_scarps_gather_the_rise_of_a_slope_in_steep_lines() -> None:
 def test_dust_covers_over_metres_where_facets_are_coarse() -> None:
     """The cover depends on the height over rock; the relief that coarse facets do not show widens its edge."""
     law = Roughness(deviation_m=5.0, baseline_m=75.0, hurst=0.8)
-    place = np.random.default_rng(0).uniform(0, 5000.0, (4000, 3))
-    spread = []
+    rng = np.random.default_rng(0)
+    place, deviates, spread = rng.uniform(0, 5000.0, (4000, 3)), rng.normal(size=100_000), []
     for facet_m in (0.1, 20.0):
         noise = Octaves(place, np.full(len(place), facet_m), 3, law, 400.0)
         above = [noise.dust_cover(np.full(len(place), h, np.float32), 0.5) for h in (-40.0, -1.0, 1.0, 40.0)]
         assert [cover.mean() for cover in above] == sorted(cover.mean() for cover in above)
         assert above[0].max() < 0.05
-        assert above[3].mean() > 0.75
+        # deep dust differs by units with normal deviations of these sizes, as far as the facets show them
+        sigma = np.sqrt(sum((part * noise.shown(wavelength)[0]) ** 2 for wavelength, part in _UNITS_M))
+        expected = smooth_step(-1.6, 2.0, 1 + sigma * deviates)
+        # 0.16 over the root of 4000 points is 0.003; gradient noise has shorter tails than the normal law
+        assert above[3].mean() == pytest.approx(expected.mean(), abs=0.015)
+        assert above[3].std() == pytest.approx(expected.std(), rel=0.1)
         spread.append(above[2].mean() - above[1].mean())
         assert above[2].std() > 0.05  # units of 30 to 300 m differ
     assert spread[1] < 0.6 * spread[0]

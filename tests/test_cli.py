@@ -266,7 +266,7 @@ def test_commands_print_what_is_there(scene: Path, tmp_path: Path, call: Call) -
         ("list faults", "straylight / texture (default model)\n"),
         ("list bodies", "bennu    asteroid Bennu, the target of OSIRIS-REx"),
         ("list detectors", "rosetta_navcam   Rosetta NAVCAM: 1024 x 1024 px, monochrome\n"),
-        ("list effects", "\nfull_well     Limit the charge of each pixel to the full well.\n"),
+        ("list effects", "\nfull_well               Limit the charge of each pixel to the full well.\n"),
         ("list reflectances", "\n    phase_slope_mag_deg = 0.0    fading with phase angle"),
         ("list glasses", "N-BK7   nd 1.51680  Abbe number 64.17  formula sellmeier\n"),
         ("doctor", "as it should be"),

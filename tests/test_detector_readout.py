@@ -401,3 +401,14 @@ def test_a_stretched_image_shows_powers_of_the_fraction_of_white_and_the_bias_as
         Device(replace(warm, black=black), 1).rgbi(dark, 3.0).array[..., 3] for black in ("bias", "dark")
     )
     assert np.median(at_zero) <= 1 < np.median(above)
+
+
+def test_columns_that_stand_out_keep_the_standard_deviation() -> None:
+    """Student's t with 5 degrees of freedom has a kurtosis of 6; its quantile at 0.75, 0.7267, is in tables."""
+    spec = replace(IDEAL, column_pattern_e_rms=4.0, column_pattern_freedom=5.0, bits=8)
+    column = ReadoutIndividual.draw((2, 100_000), spec, np.random.default_rng(2)).column_e
+    assert column is not None
+    # of kurtosis 6, the variance of 1e5 variates errs by √(8/1e5) = 0.9 %
+    assert column.std() == pytest.approx(4.0, rel=4 * 0.0045)
+    # half of them lie within 0.7267 of t, whose standard deviation is √(5/3); the median errs by 0.4 %
+    assert np.median(np.abs(column)) == pytest.approx(4.0 * 0.7267 / np.sqrt(5 / 3), rel=0.02)

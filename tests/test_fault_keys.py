@@ -46,6 +46,8 @@ COMPANIONS: dict[tuple[str, str], dict[str, Any]] = {
     ("broken_lines", "duplicated_weight"): {"count": 20},
     ("pixel_overwriting", "strength"): {"blend": "mixture"},
     ("particles", "farthest_m"): {"nearest_m": 0.05},
+    ("persistence", "shift_px"): {"source": "frame"},
+    ("persistence", "exposure_factor"): {"source": "frame"},
 }
 # A packet is by default half of the small picture; a small picture shows few grains, and before the Sun only their
 # night sides.

@@ -140,12 +140,14 @@ def test_orders() -> None:
     # light first meets the optics, then the pixels, then the readout (design document, "Order"); within the
     # detector: charge collected, moved, read, converted, assembled and sent
     assert order == [
+        "frozen_frame",
         "particles",
         "straylight",
         "dust_on_optics",
         "optics_degradation",
         "vignetting",
         "broken_pixels",
+        "persistence",
         "smear",
         "cosmic_rays",
         "blooming",
@@ -179,9 +181,9 @@ def test_a_class_acts_directly_behind_the_class_that_it_names() -> None:
         declare("on_a_of_a_test", after="a_of_a_test")
         declare("first_of_all", after="")
         order = physical_order(registry())
-        first = ["first_of_all", "particles", "straylight", "a_of_a_test", "on_a_of_a_test", "b_of_a_test"]
-        assert order[:6] == first
-        assert order[6:] == before[2:]
+        first = ["first_of_all", *before[:3], "a_of_a_test", "on_a_of_a_test", "b_of_a_test"]
+        assert order[:7] == first
+        assert order[7:] == before[3:]
         assert list(registry())[: len(ALL_FAULTS)] == list(ALL_FAULTS)
     assert physical_order(registry()) == before
 

@@ -16,6 +16,7 @@ from vbnfault import cli
 from vbnfault.camera.characterise import Settings, VirtualCamera, characterise
 from vbnfault.core.errors import InputError
 from vbnfault.detector.chain import Device, MosaicNoise
+from vbnfault.detector.measured import smooth_surface
 from vbnfault.detector.sensor import load_sensor
 from vbnfault.fit.exposures import (
     Exposure,
@@ -24,7 +25,6 @@ from vbnfault.fit.exposures import (
     noise_before_rounding,
     read_exposures,
     rounded_moments,
-    smooth_surface,
     variance_estimate,
 )
 from vbnfault.fit.sensor_fit import Bend, Darks, fit_sensor

@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from vbnfault.detector.effects.downlink import Companding, Compression
 from vbnfault.pipeline import masks, record
 
 images = arrays(np.uint8, (3, 5, 4), elements=st.sampled_from([0, 1, 128, 254, 255]))
@@ -68,7 +69,7 @@ FAULTS: Any = {
     "straylight": Labelled(effect_mask=True),
     "ghost": Labelled(has_footprint=False),
 }
-CONTEXT: Any = SimpleNamespace(shape=SHAPE)
+CONTEXT: Any = SimpleNamespace(shape=SHAPE, camera=None)
 
 
 def test_mask_layers_in_the_order_of_the_faults() -> None:
@@ -130,9 +131,10 @@ def test_outline_is_the_part_of_the_mask_with_a_neighbour_outside(mask: np.ndarr
 
 def test_in_a_ccd_charge_that_runs_out_of_a_footprint_is_labelled_too() -> None:
     fault, seen = {"rays": Labelled(steps=("light", "raw"))}, np.zeros(SHAPE, bool)
+    detector = SimpleNamespace(mosaic=None)
     seen[:, 2] = True
     for ccd in (True, False):
-        context: Any = SimpleNamespace(shape=SHAPE, camera=SimpleNamespace(is_ccd=ccd))
+        context: Any = SimpleNamespace(shape=SHAPE, camera=SimpleNamespace(is_ccd=ccd, detector=detector))
         effects = {"rays": seen} if ccd else {}
         (mask,) = masks.mask_layers(fault, {"rays": {"row": 1}}, context, effects)  # type: ignore[arg-type]
         assert mask[1].all()
@@ -149,23 +151,28 @@ def test_strong_effect_is_any_channel_differing_by_its_level(a: np.ndarray, b: n
 
 
 @pytest.mark.parametrize(
-    ("effect_mask", "level_dn", "steps", "of_a_ccd", "of_cmos"),
+    ("effect_mask", "level_dn", "steps", "of_a_ccd", "of_cmos", "compressed"),
     [
-        (True, 1.0, ("electrons",), "effect", "effect"),
-        (True, 0.5, ("electrons",), "effect", "effect"),
-        (True, 2.0, ("electrons",), "strong effect", "strong effect"),
-        (False, 1.0, ("electrons", "rgbi"), "footprint", "footprint"),
-        (False, 1.0, ("rgbi", "charge"), "footprint and effect", "footprint"),
-        (False, 1.0, ("light",), "footprint and effect", "footprint"),
+        (True, 1.0, ("electrons",), "effect", "effect", "effect"),
+        (True, 0.5, ("electrons",), "effect", "effect", "effect"),
+        (True, 2.0, ("electrons",), "strong effect", "strong effect", "strong effect"),
+        (False, 1.0, ("electrons", "rgbi"), "footprint", "footprint", "footprint"),
+        (False, 1.0, ("rgbi", "charge"), "footprint and effect", "footprint", "footprint and effect"),
+        (False, 1.0, ("light",), "footprint and effect", "footprint", "footprint and effect"),
+        (False, 1.0, ("offsets",), "footprint", "footprint", "footprint and effect"),
+        (False, 1.0, ("raw",), "footprint", "footprint", "footprint"),
     ],
 )
 def test_kind_of_a_mask(
-    effect_mask: bool, level_dn: float, steps: tuple[str, ...], of_a_ccd: str, of_cmos: str
+    effect_mask: bool, level_dn: float, steps: tuple[str, ...], of_a_ccd: str, of_cmos: str, compressed: str
 ) -> None:
     fault: Any = SimpleNamespace(effect_mask=effect_mask, effect_level_dn=level_dn, steps=steps)
-    for is_ccd, kind in ((True, of_a_ccd), (False, of_cmos)):
-        assert masks.kind(fault, is_ccd=is_ccd) == kind
-        where: Any = SimpleNamespace(camera=SimpleNamespace(is_ccd=is_ccd))
+    effects = (Companding(bits=12), Compression(codec="jpeg2000"))
+    spread: Any = SimpleNamespace(mosaic=SimpleNamespace(sensor=SimpleNamespace(effects=effects)))
+    three: Any = SimpleNamespace(mosaic=None)
+    for is_ccd, detector, kind in ((True, three, of_a_ccd), (False, three, of_cmos), (False, spread, compressed)):
+        where: Any = SimpleNamespace(camera=SimpleNamespace(is_ccd=is_ccd, detector=detector))
+        assert masks.kind(fault, where.camera) == kind
         assert masks.spreads(fault, where) == (kind == "footprint and effect")
 
 

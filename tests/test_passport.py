@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from poses_kit import row
+from scipy.special import ndtr
 from typer.testing import CliRunner
 
 import vbnfault
@@ -18,6 +19,7 @@ from vbnfault import cli
 from vbnfault.core.errors import InputError
 from vbnfault.fit import passport as fit_passport
 from vbnfault.fit.replay import Replay
+from vbnfault.fit.stars import encircled_radii
 from vbnfault.scene.trajectory import COLUMNS, load_trajectory
 
 SMALL = {
@@ -155,3 +157,48 @@ def test_distances_are_those_of_shifted_values() -> None:
     none = fit_passport.Statistic.of("sky", np.full(5, np.nan), np.arange(5.0))
     assert none.frames == 0
     assert np.isnan(none.distance)
+
+
+# --- stars ------------------------------------------------------------------------------------------------------
+
+
+def star_field(sigma_px: float, stretch: float, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return levels of a field of Gaussian stars with noise and hits of single pixels, and their light."""
+    rng, axis = np.random.default_rng(3), np.arange(257) - 0.5
+    light = np.full((256, 256), 20.0)
+    for _ in range(count):
+        sides = [np.diff(ndtr((axis - middle) / sigma_px)) for middle in rng.uniform(12, 244, 2)]
+        light += rng.uniform(300, 1200) * sigma_px**2 * np.outer(*sides)
+    light += rng.normal(0, 0.3, light.shape)
+    light[tuple(rng.integers(5, 250, (2, 15)))] += 150
+    light[100:112, 60] += 120  # a track
+    levels = np.rint(255 * np.clip(light / 255, 0, 1) ** stretch).astype(np.float32)
+    return levels, (levels / 255) ** (1 / stretch)
+
+
+@pytest.mark.parametrize(("sigma_px", "stretch"), [(0.8, 1.0), (1.2, 0.5), (1.6, 1.0)])
+def test_radii_of_stars_are_those_of_a_gaussian(sigma_px: float, stretch: float) -> None:
+    """A Gaussian holds 1 - exp(-r²/2σ²); pixels widen it by 1/12 px² when it is taken, and when it is summed."""
+    levels, light = star_field(sigma_px, stretch, 25)
+    wide = np.sqrt(sigma_px**2 + 2 / 12)
+    found = encircled_radii(levels, light, np.ones(levels.shape, bool))
+    # half a level of rounding in 78 px is 5 % of the light of the faintest, and less of the median star
+    assert found == pytest.approx((wide * np.sqrt(2 * np.log(2)), wide * np.sqrt(2 * np.log(5))), rel=0.06)
+
+
+def test_a_sky_without_stars_says_nothing() -> None:
+    levels, light = star_field(1.2, 1.0, 0)
+    everywhere = np.ones(levels.shape, bool)
+    for good in (everywhere, ~everywhere):
+        assert np.isnan(encircled_radii(levels, light, good)).all()
+    assert np.isnan(encircled_radii(np.zeros_like(levels), np.zeros_like(levels), everywhere)).all()
+
+
+def test_too_few_frames_with_stars_are_said_and_no_failure() -> None:
+    none = np.full(4, np.nan)
+    found = fit_passport.Statistic.of("ee50", none, none)
+    result = {"statistics": [vars(found)], "classifiers": {}, "part": "all"}
+    assert (
+        "radius of half the light of stars: nothing, since too few frames show it"
+        in (fit_passport.conclusions(result)["may_not"])
+    )

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from .detector.effects import Effect, Exposure
     from .detector.sensor import Sensor, load_sensor
     from .faults import Fault, FaultContext, Interval, bounds, choice, flag, number, path, rows, text
+    from .inject import Injected, Injector, inject
     from .lens import Prescription, load_lens
     from .output.export import export_store as export
     from .output.flare_images import Flare, trace_flare
@@ -49,6 +50,8 @@ _HOMES = {
     "Fault": "faults",
     "FaultContext": "faults",
     "Flare": "output.flare_images",
+    "Injected": "inject",
+    "Injector": "inject",
     "InputError": "core.errors",
     "Interval": "faults",
     "Prescription": "lens",
@@ -62,6 +65,7 @@ _HOMES = {
     "choice": "faults",
     "flag": "faults",
     "export": "output.export:export_store",
+    "inject": "inject:",
     "load_lens": "lens",
     "load_scene": "scene.config",
     "load_sensor": "detector.sensor",

@@ -185,6 +185,22 @@ def case_texture(seeds: Seeds, rng: random.Random, here: Path) -> Case:
     return dry(whole_scene(seeds, here, faults=faults)), {}
 
 
+def case_image(seeds: Seeds, rng: random.Random, here: Path) -> Case:
+    """Damage an image into which faults go, or what describes it, or options."""
+    name = rng.choice(list(seeds.images))
+    path = here / name
+    damaged = rng.random() < 0.7
+    path.write_bytes(flipped(seeds.images[name], rng, seeds.images["a.png"]) if damaged else seeds.images[name])
+    keys = ("black_dn", "white_dn", "response", "gamma", "response_file", "sun", "raw")
+    table = {} if rng.random() < 0.6 else {key: hostile(rng) for key in rng.sample(keys, rng.choice((1, 2)))}
+    models = {"dust_on_optics": {}, "broken_pixels": {"model": "texture"}, "straylight": {}}
+    scene = whole_scene(seeds, here, faults=models, **({"image": table} if table else {}))
+    arguments = ["inject", str(path), "--scene", str(scene), "--out", str(here / "injected")]
+    if rng.random() < 0.5:
+        arguments += ["--sun", rng.choice(["auto", "10,12", "0,0,1", "1,2,3,4", "nan,1", "0,0,0", "1e300,1", ""])]
+    return [*arguments, *rng.choice([[], [], ["--labels", "zarr"], ["--seed", "-1"], ["--workers", "0"]])], {}
+
+
 def case_poses(seeds: Seeds, rng: random.Random, here: Path) -> Case:
     """Damage a table of poses: values of a CSV file, or bytes of either kind of file."""
     name = rng.choice(list(seeds.poses))
@@ -408,6 +424,7 @@ CASES: dict[str, tuple[Callable[[Seeds, random.Random, Path], Case], int]] = {  
     "mesh": (case_mesh, 12),
     "spacecraft": (case_spacecraft, 8),
     "texture": (case_texture, 5),
+    "image": (case_image, 5),
     "poses": (case_poses, 3),
     "kernel": (case_kernel, 3),
     "special": (case_special, 4),

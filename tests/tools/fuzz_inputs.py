@@ -184,6 +184,7 @@ class Seeds:
         self.kernels = _kernels(folder)
         self.textures = _textures()
         self.poses = _poses()
+        self.images = _images(folder)
 
 
 def _study() -> dict[str, Any]:
@@ -307,6 +308,29 @@ def _textures() -> dict[str, bytes]:
         image = rng.integers(0, 255, shape).astype(dtype)
         found[name] = cv2.imencode(name[-4:], image)[1].tobytes()
     return found
+
+
+def _images(folder: Path) -> dict[str, bytes]:
+    """Return small valid images into which faults may go, by file name."""
+    import numpy as np
+    import tifffile
+    from astropy.io import fits
+
+    from vbnfault.core.files.images import write_exr, write_png
+
+    rng = np.random.default_rng(4)
+    grey, colours = rng.integers(0, 60000, (20, 24), np.uint16), rng.integers(0, 250, (20, 24, 3), np.uint8)
+    made = folder / "images"
+    made.mkdir()
+    write_png(made / "a.png", grey)
+    write_png(made / "b.png", np.dstack([colours, colours[..., :1]]))
+    tifffile.imwrite(made / "a.tif", grey, compression="zlib", predictor=True)
+    tifffile.imwrite(made / "b.tiff", colours, photometric="rgb", tile=(16, 16), bigtiff=True)
+    fits.writeto(made / "a.fits", grey)
+    fits.writeto(made / "b.fits", grey.astype(np.float32))
+    np.save(made / "a.npy", grey)
+    write_exr(made / "a.exr", {name: grey.astype(np.float32) / 60000 for name in ("R", "G", "B", "Z")})
+    return {path.name: path.read_bytes() for path in sorted(made.iterdir())}
 
 
 def _poses() -> dict[str, bytes]:

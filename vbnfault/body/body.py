@@ -31,7 +31,7 @@ _HURST = 0.9
 _RELIEF_SEED = 20_260
 _GRADIENT_NOISE_STD = 0.22  # `noise.gradient_noise`
 
-_PLACES = 200  # at which a body's gravity is sampled; one takes 5 ms on 20,000 facets
+_PLACES = 400  # at which a body's gravity is sampled; one takes 5 ms on 20,000 facets
 
 _laws: dict[str, Roughness] = {}  # of the shapes that this process has measured, by their content
 

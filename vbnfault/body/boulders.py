@@ -135,7 +135,10 @@ def _strewn(
     favour = np.zeros(len(faces))
     favour[bearing] = _favour(ground, normals[bearing], faces[bearing], spec)
     law = SizeLaw(per_m2=1e-6 * spec.boulders_per_km2, index=spec.boulder_index, largest_m=spec.largest_boulder_m)
-    diameter, face, position, least = scatter(points, faces, favour, smallest, law, rng)
+    # the law holds where boulders are drawn, which is a small part of a moon
+    drawn = np.flatnonzero(bearing if spec.regolith is not None and bearing.any() else favour >= 0)
+    diameter, face, position, least = scatter(points, faces[drawn], favour[drawn], smallest[drawn], law, rng)
+    face = drawn[face]
 
     coarser = _COARSER if spec.regolith is None else _COARSER + _COARSEST
     level = _levels(diameter, ground.facet_m[faces[face, 0]], distance[face], budget, coarser)

@@ -10,11 +10,12 @@ the facets can show it.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from ..core.process.llvm import backend, flat
 from .geometry import Float64
@@ -30,6 +31,16 @@ _OFFSET_CELLS = 0.37
 # Standard deviation of `Points.gradient`, measured over a million points.
 GRADIENT_STD = 0.191
 PLANES_STD = 0.1826
+
+_CRATER_REACH = 1.5  # radii up to which a crater changes the ground
+_AT_ONCE = 0.8  # difference in age, over a lifetime of the octave's largest, of craters that share their ground
+# Complex craters of the Moon are 1.044 D^0.301 km deep, and their peaks 0.6 m (D / km)^1.97 high, a fifth of D wide
+# (Pike 1977): at twice the largest simple diameter, 0.03 radii
+_SHALLOWER, _PEAK, _PEAK_WIDTH = -0.7, 0.03, 0.15
+_HOLLOW = 0.4  # depth of a hollow that a younger crater of like size leaves of an older one
+_OUTLINE, _LOBES = 0.03, 8.0  # how far outlines depart from circles, and how quickly around them
+# square root of 2 κt over the radius: Gaussians whose widths wear a crater; the first rounds its rim by 0.1 radii
+_CRATER_WORN = (0.036, 0.06, 0.1, 0.15, 0.2, 0.26, 0.33, 0.42, 0.54, 0.7, 0.9, 1.2, 1.7)
 
 
 def octave_rotation(number: int) -> Float64:
@@ -47,11 +58,14 @@ class Points:
     ----------
     position_m
         float64[n, 3], metres.
+    normals
+        float64[n, 3]: unit normals of the ground, which `impacts` needs.
     """
 
-    def __init__(self, position_m: Float64) -> None:
+    def __init__(self, position_m: Float64, normals: Float64 | None = None) -> None:
         d = backend()
         self.count = len(position_m)
+        self._normals = normals
         self._axes = [d.Float64(flat(position_m[:, k])) for k in range(3)]
 
     def gradient(self, wavelength_m: float, key: int, count: int) -> Float32:
@@ -86,15 +100,35 @@ class Points:
         (value,) = self._run(_craters, width_m, key, count, fraction)
         return np.float32(width_m) * value
 
-    def impacts(self, width_m: float, key: int, count: int, *law: float) -> tuple[Float32, Float32]:
-        """Return the height of craters in metres, and where the freshest are bright, float32[count] each.
+    def impacts(
+        self, width_m: float, key: int, age_m: Float32, layers: int, *law: float
+    ) -> tuple[Float32, Float32, Float32]:
+        """Return height of craters in metres, brightness of the freshest, and age of the ground, float32[n] each.
 
-        A cell of this width holds at most one sphere, with a diameter of a third to two thirds of the width. `law`
-        is the fraction of the cells that hold one, the exponent of their cumulative size law in space, the power
-        of a uniform number that gives the depth over a fresh crater's, and the fraction of level floors.
+        A cell of this width holds at most one sphere per layer, with a diameter of a third to two thirds of the
+        width. The ground cuts it in a circle, in which the crater lies. It lasts for a time in proportion to its
+        width, in metres: 1.5 times its width. It erases what is older inside of its rim, and ever less up to
+        1.5 radii.
+
+        Parameters
+        ----------
+        age_m
+            Of the ground at the first n positions before these craters, which are the smaller ones: the ground of
+            a larger, younger crater holds none of them.
+        law
+            Fraction of the cells of a layer that hold a sphere, exponent of their cumulative size law in space,
+            power of a uniform number that gives the depth over a fresh crater's, fraction of level floors, and
+            the diameter of the largest simple craters in metres.
         """
-        height, bright = self._run(_impacts, width_m, key, count, *law)
-        return np.float32(width_m) * height, bright
+        if not len(age_m):
+            return age_m, age_m, age_m
+        d, width = backend(), np.float32(width_m)
+        assert self._normals is not None
+        normals = self._normals[: len(age_m)] @ octave_rotation(key & 0xFFFF).T
+        upright = [d.Float(flat(normals[:, k].astype(np.float32))) for k in range(3)]
+        kernel = partial(_impacts, d.Float(flat(age_m / width)), upright, layers)
+        height, bright, age = self._run(kernel, width_m, key, len(age_m), *law[:-1], law[-1] / width_m)
+        return width * height, bright, width * age
 
     def clods(self, width_m: float, key: int, count: int, fraction: float) -> Float32:
         """Return the height above the ground of half-buried stones, float32[count] in metres.
@@ -258,32 +292,111 @@ def _craters(d: Any, q: list[Any], word: Any, fraction: Any) -> tuple[Any, ...]:
     return (total,)
 
 
-def _impacts(d: Any, q: list[Any], word: Any, *law: Any) -> tuple[Any, ...]:
-    """Return the sum of the craters' heights at positions in cells, and where the freshest are bright."""
+def _impacts(before: Any, up: Any, layers: int, d: Any, q: list[Any], word: Any, *law: Any) -> tuple[Any, ...]:
+    """Return the craters' height in cells, where the freshest are bright, and the age of the ground."""
     words, f = _nearest_cells(d, q)
-    fraction, index, wear, ponds = law
-    total, bright = d.Float(0), d.Float(0)
-    for i, j, k, h in _corners(words, word):
+    fraction, index, wear, ponds, simple = law
+    craters = []
+    youngest, next_youngest = d.Float(np.inf), d.Float(np.inf)
+    for i, j, k, h in [corner for n in range(layers) for corner in _corners(words, word + 0x51ED27 * n)]:
         h = _mix(d, h)
         g = _mix(d, h + 0x9E3779B9)
+        e = _mix(d, g)
         offset = [f[axis] - (step + _unit(d, h, 10 * axis)) for axis, step in enumerate((i, j, k))]
-        distance = d.dr.sqrt(offset[0] * offset[0] + offset[1] * offset[1] + offset[2] * offset[2])
         # the radius inverts N(>= R) ~ R^-index; what lies beyond 1.5 radii may be in no cell of the eight
-        radius = (1.0 / 6) * d.dr.power(1 - (1 - d.dr.power(d.Float(2), -index)) * _unit(d, g, 0), -1 / index)
-        x = distance / radius
-        occupied = d.Float(_mix(d, g) >> 8) * 2.0**-24 < fraction  # few cells are: ten bits are too coarse
-        fresh = d.dr.power(_unit(d, g, 20) + 0.5 / 1024, wear)
-        # a fresh crater is a parabola 0.4 radii deep, a worn one rounded and without a rim
-        hollow = d.dr.maximum(1 - x * x, 0)
-        bowl = 0.32 * d.dr.lerp(hollow * hollow, hollow, fresh)
-        bowl = d.dr.select(_unit(d, g, 10) < ponds, d.dr.minimum(bowl, 0.2), bowl)
-        skirt = d.dr.maximum(3 - 2 * x, 0)
-        rim = 0.08 * fresh * d.dr.select(x < 1, x * x, skirt * skirt)
-        present = occupied & (x < 1.5)
-        total = total + d.dr.select(present, radius * fresh * (rim - bowl), 0)
-        newest = d.dr.maximum(8 * fresh - 7, 0)
-        bright = bright + d.dr.select(present, newest * d.dr.minimum(3 - 2 * x, 1), 0)
-    return total, bright
+        sphere = (1.0 / 6) * d.dr.power(1 - (1 - d.dr.power(d.Float(2), -index)) * _unit(d, g, 0), -1 / index)
+        depth = sum(a * b for a, b in zip(offset, up, strict=True))
+        radius = d.dr.sqrt(d.dr.maximum(sphere * sphere - depth * depth, 1e-8))
+        square = d.dr.maximum(sum(a * a for a in offset), 1e-12)
+        lobes = sum((_unit(d, e, 8 * axis) - 0.5) * offset[axis] for axis in range(3)) * d.dr.rsqrt(square)
+        x = d.dr.sqrt(d.dr.maximum(square - depth * depth, 0)) / radius
+        x = x * (1 + _OUTLINE * d.dr.sin(_LOBES * lobes + 6.3 * _unit(d, e, 2)))
+        x = d.dr.select(d.Float(e >> 8) * 2.0**-24 < fraction, x, np.inf)  # ten bits are too coarse
+        early = _unit(d, g, 20) + 0.5 / 1024  # 1: just formed
+        age = 3 * radius * (1 - early)
+        outward = x / _CRATER_REACH
+        hides = age + (1 + _AT_ONCE) * outward * outward * outward
+        next_youngest = d.dr.minimum(next_youngest, d.dr.maximum(youngest, hides))
+        youngest = d.dr.minimum(youngest, hides)
+        craters.append((x, radius, early, age, hides, _unit(d, g, 10) < ponds))
+    total, bright = d.Float(0), d.Float(0)
+    profiles = _Profiles(d)
+    for x, radius, early, age, hides, pond in craters:
+        # one of like size leaves a hollow without a rim where a younger one lies on it, a smaller one nothing
+        fresh = d.dr.power(early, wear)
+        kept = _later(d, d.dr.select(hides == youngest, next_youngest, youngest) - age)
+        left = fresh * d.dr.lerp(_HOLLOW, 1, kept)
+        height = _with_level_floor(d, profiles(x, left), left, x, pond, 2 * radius / simple)
+        stays = _later(d, before - age)
+        total = total + stays * radius * height
+        shine = d.dr.maximum(8 * fresh - 7, 0) * d.dr.clip(2 * (_CRATER_REACH - x), 0, 1)
+        bright = bright + stays * kept * shine
+    return total, bright, d.dr.minimum(before, youngest)
+
+
+def _with_level_floor(d: Any, height: Any, left: Any, x: Any, pond: Any, size: Any) -> Any:
+    """Return the height over the radius of a crater that is a pond or complex.
+
+    `size` is its diameter over that of the largest simple craters.
+    """
+    complex_ = d.dr.select(size > 1, 0.33 * d.dr.power(d.dr.maximum(size, 1), _SHALLOWER), 1)
+    floor = -left * d.dr.minimum(d.dr.select(pond, 0.2, 1), complex_)
+    over = height - floor
+    curve = 1e-6 - 0.3 * floor  # over which the floor meets the wall
+    near = d.dr.maximum(curve - d.dr.abs(over), 0)
+    peak = _PEAK * d.dr.clip(size - 1, 0, 1) * left * d.dr.exp(-d.dr.square(x / _PEAK_WIDTH))
+    return floor + d.dr.maximum(over, 0) + 0.25 * near * near / curve + peak
+
+
+def _later(d: Any, age_difference: Any) -> Any:
+    """Return whether a crater is later than what it lies on, 0 to 1, from how much older that is."""
+    t = d.dr.clip(0.5 + age_difference / _AT_ONCE, 0, 1)
+    return t * t * (3 - 2 * t)
+
+
+class _Profiles:
+    """Interpolate `_worn_craters` at the distance and depth of each point."""
+
+    def __init__(self, d: Any) -> None:
+        table = _worn_craters()
+        self._d, self._table, (self._rows, self._columns) = d, d.Float(table.ravel()), table.shape
+
+    def __call__(self, x: Any, fresh: Any) -> Any:
+        d, inside = self._d, x < _CRATER_REACH
+        column = d.dr.select(inside, x, 0) * ((self._columns - 1.001) / _CRATER_REACH)
+        row = fresh * (self._rows - 1.001)
+        place = d.UInt32(row) * self._columns + d.UInt32(column)
+        near, far = (
+            [d.dr.gather(d.Float, self._table, place + below + step, inside) for step in (0, 1)]
+            for below in (0, self._columns)
+        )
+        across = column - d.dr.floor(column)
+        return d.dr.lerp(d.dr.lerp(*near, across), d.dr.lerp(*far, across), row - d.dr.floor(row))
+
+
+@lru_cache(maxsize=1)
+def _worn_craters() -> Float32:
+    """Return heights over the radius of craters of the depths 0, 1/31 … 1 of a fresh one, float32[32, 96].
+
+    Columns are distances from the centre from 0 to `_CRATER_REACH` radii. Fresh simple craters are those of Fassett
+    & Thomson 2014 (JGR Planets 119, 2255, eq. 4), a fifth as deep as wide. Diffusion wears them and rounds rims.
+    """
+    step = 0.02
+    axis = np.arange(-4.0, 4.0 + step / 2, step)
+    x = np.hypot(axis, axis[:, None])
+    wall = np.polynomial.Polynomial((-0.22881, 0.227534, 0.083117, -0.039499))(x)
+    outside = np.polynomial.Polynomial((0.188253, -0.18705, 0.018447, 0.015056))(x)
+    fresh = 2 * np.select([x < 0.98, x < 1.02, x < 1.5], [np.maximum(wall, 0.0368 - 0.2), 0.0368, outside], 0.0)
+    middle = len(axis) // 2
+    worn = [ndimage.gaussian_filter(fresh, width / step)[middle, middle:] for width in _CRATER_WORN]
+    depth = np.array([profile.max() - profile[0] for profile in worn])
+    at = np.linspace(0, _CRATER_REACH, 96)
+    # worn ones reach farther
+    taper = [smooth_step(0.0, min(0.1 + 1.5 * width, 0.8), _CRATER_REACH - at) for width in _CRATER_WORN]
+    profiles = [part * np.interp(at, axis[middle:], one) for part, one in zip(taper, worn, strict=True)]
+    wanted = np.linspace(0, 1, 32) * depth[0]
+    rows = [np.interp(wanted, depth[::-1], column[::-1]) for column in np.transpose(profiles)]
+    return np.transpose(rows).astype(np.float32)
 
 
 def _clods(d: Any, q: list[Any], word: Any, fraction: Any) -> tuple[Any, ...]:
@@ -303,7 +416,7 @@ def _clods(d: Any, q: list[Any], word: Any, fraction: Any) -> tuple[Any, ...]:
     return (highest,)
 
 
-_OUTPUTS = {_blocks: 3, _impacts: 2}  # arrays that a kernel returns, if not one
+_OUTPUTS = {_blocks: 3}  # arrays that a kernel returns, if not one
 
 # --- fields on a mesh -------------------------------------------------------------------------------------------
 
@@ -341,12 +454,18 @@ class Octaves:
     """Evaluate noise at points that are sorted by the size of their facets; it is 0 where facets are too coarse."""
 
     def __init__(
-        self, place_m: Float64, facet_m: Float64, seed: int, roughness: Roughness, longest_m: float
+        self,
+        place_m: Float64,
+        facet_m: Float64,
+        seed: int,
+        roughness: Roughness,
+        longest_m: float,
+        normals: Float64 | None = None,
     ) -> None:
         self.place_m = place_m
         self.facet_m = facet_m
         self.seed = seed
-        self._points = Points(place_m)
+        self._points = Points(place_m, normals)
         self._roughness = roughness
         self.longest_m = longest_m
         self._unit = 1.0 / windowed_deviation(roughness.hurst)
@@ -439,12 +558,15 @@ class Octaves:
             total += self._full(part, shows)
         return total
 
-    def impacts(self, width_m: float, stream: int, *law: float) -> tuple[Float32, Float32]:
-        """Return the height in metres and the brightness of craters on cells of one width, see `Points.impacts`."""
-        shows = width_m / 6  # half of the smallest bowls: with fewer facets they would be dots
-        both = self._points.impacts(width_m, noise_key(self.seed, stream), self._count(shows), *law)
-        height, bright = (self._full(part, shows) for part in both)
-        return height, bright
+    def impacts(
+        self, width_m: float, stream: int, age_m: Float32, layers: int, *law: float
+    ) -> tuple[Float32, Float32, Float32]:
+        """Return height in metres, brightness, and age of the ground with craters, see `Points.impacts`."""
+        shows = width_m / 4.5  # with fewer than four facets across, bowls would be dots
+        count = self._count(shows)
+        key = noise_key(self.seed, stream)
+        height, bright, age = self._points.impacts(width_m, key, age_m[:count], layers, *law)
+        return self._full(height, shows), self._full(bright, shows), np.concatenate([age, age_m[count:]])
 
     def clods(self) -> Float32:
         """Return the height of half-buried stones of all sizes, metres."""

@@ -3,7 +3,7 @@
 Heights are added along the model's normal, as in `relief`. The ground consists of:
 
 - undulations that continue the roughness of the model, rougher in some regions than in others;
-- craters of the size law of `CraterLaw`, from fresh bowls with rims to ghosts;
+- craters of the size law of `CraterLaw`, from fresh bowls with rims to ghosts, the later ones on top;
 - fine material that levels low and gentle ground: ponds on Eros, the Muses Sea on Itokawa;
 - rubble: stones too small to be boulders of their own, heaped on each other.
 
@@ -13,11 +13,11 @@ has slid, and in the freshest craters.
 References
 ----------
 Gault 1970, Radio Science 5, 273: at geometric saturation, craters number 1.54 D^-2; at equilibrium between those
-that form and those that are worn away, 1 to 10 % of that. Pike 1977, in Impact and Explosion Cratering, 489:
-fresh simple craters are a fifth as deep as wide, with rims of 4 % of the diameter. Fassett & Thomson 2014, JGR
-Planets 119, 2255: wear by diffusion rounds and fills them until nothing is left. Murchie et al. 2002, Icarus 155,
-145: steep walls on Eros are up to a third brighter. Miyamoto et al. 2007, Science 316, 1011: fine material
-gathers where the potential is low.
+that form and those that are worn away, 1 to 10 % of that. Fassett & Thomson 2014, JGR Planets 119, 2255: fresh
+simple craters are a fifth as deep as wide, with rims of 4 % of the diameter; wear by diffusion rounds and fills
+them until nothing is left. Pike 1977, in Impact and Explosion Cratering, 489: depths and peaks of complex craters.
+Murchie et al. 2002, Icarus 155, 145: steep walls on Eros are up to a third brighter. Miyamoto et al. 2007, Science
+316, 1011: fine material gathers where the potential is low.
 """
 
 from __future__ import annotations
@@ -38,9 +38,11 @@ SATURATION = 1.54  # craters of the diameter D or more in an area of D², at geo
 FRESH_DEPTH = 0.2  # of a fresh crater, over its diameter
 _MOST_LAYERS = 4
 _UNITS_M = (900.0, 300.0, 110.0, 40.0, 14.0, 5.0)  # wavelengths of units of the ground with albedos of their own
+_LARGE_UNITS_M = (27e3, 8e3, 2.7e3)  # of bodies whose model has no units as small
 _BRIGHT_DEG = (24.0, 38.0)  # on slopes from the second, no weathered material is left
 _LEVEL_DEG = (8.0, 22.0)  # fine material levels slopes up to the first, and none from the second
 _STONES_STAY_DEG = (33.0, 48.0)
+_STREWN = 20.0  # how much denser boulders lie in the freshest craters: assumed
 _REGIONS = 2.5  # size of rough and smooth regions, in longest octaves
 _LARGEST_STONE, _MOST_STONE_M = 5.0, 20.0  # width of the largest stones of rubble, in the smallest boulders
 _STONE_HEIGHT = 0.4  # per unit of their random level, over their width
@@ -52,7 +54,7 @@ class CraterLaw:
 
     N(>= D) = per_m2 · (D / 10 m)^-index craters per m², but no more than the fraction `equilibrium` of geometric
     saturation; none exceeds `largest_m`. The depth over the diameter is 0.2 of fresh craters, 0 of ghosts, and
-    `depth` in the mean.
+    `depth` in the mean. Those beyond `simple_m` are complex: shallower, with level floors and central peaks.
     """
 
     per_m2: float
@@ -60,6 +62,7 @@ class CraterLaw:
     largest_m: float
     equilibrium: float
     depth: float
+    simple_m: float = 1e9
 
     def above(self, diameter_m: ArrayLike) -> Float64:
         """Return the number per square metre of craters of a diameter or more, without regard to `largest_m`."""
@@ -81,13 +84,8 @@ class CraterLaw:
 
     @property
     def wear(self) -> float:
-        """Return the power of a uniform number that is a crater's depth over a fresh one's.
-
-        In the mean, a circle is shallower than its sphere by B((b + 3) / 2, 1 / 2) / B((b + 2) / 2, 1 / 2), for
-        the index b.
-        """
-        cut = special.beta((self.index + 3) / 2, 0.5) / special.beta((self.index + 2) / 2, 0.5)
-        return float(max(FRESH_DEPTH * cut / self.depth - 1, 0.0))
+        """Return the power of a uniform number that is a crater's depth over a fresh one's."""
+        return max(FRESH_DEPTH / self.depth - 1, 0.0)
 
 
 def crater_law(per_km2: float, spec: Regolith) -> CraterLaw:
@@ -98,21 +96,22 @@ def crater_law(per_km2: float, spec: Regolith) -> CraterLaw:
         largest_m=spec.largest_crater_m,
         equilibrium=spec.equilibrium,
         depth=spec.crater_depth,
+        simple_m=spec.simple_crater_m,
     )
 
 
 def craters(noise: Octaves, law: CraterLaw, ponds: float) -> tuple[Float32, Float32]:
     """Return the height of all craters in metres, and where the freshest are bright, both float32[n]."""
     height, bright = (np.zeros(len(noise.facet_m), dtype=np.float32) for _ in range(2))
+    age_m = np.full(len(height), np.inf, dtype=np.float32)
     diameter_m = 0.5 * law.largest_m
     number = 0
     while law.per_m2 and diameter_m > float(noise.facet_m[0]):
         cells, index = law.octave(diameter_m)
         layers = int(np.clip(np.ceil(cells), 1, _MOST_LAYERS))
-        for layer in range(layers):
-            stream = 2000 + 8 * number + layer
-            both = noise.impacts(3 * diameter_m, stream, cells / layers, index + 1, law.wear, ponds)
-            height, bright = height + both[0], bright + both[1]
+        shape = (cells / layers, index + 1, law.wear, ponds, law.simple_m)
+        *both, age_m = noise.impacts(3 * diameter_m, 2000 + number, age_m, layers, *shape)
+        height, bright = height + both[0], bright + both[1]
         diameter_m, number = 0.5 * diameter_m, number + 1
     return height, bright
 
@@ -179,12 +178,17 @@ def brightness(noise: Octaves, slope_deg: Float32, fine: Float32, bright: Float3
 
     Rubble has no weathered cover that could slide off its slopes.
     """
-    units = sum(np.float32(0.08) * noise.gradient(width, 680 + k) for k, width in enumerate(_UNITS_M))
+    widths = [width for width in _LARGE_UNITS_M if width < noise.longest_m] + list(_UNITS_M)
+    units = sum(np.float32(0.08) * noise.gradient(width, 680 + k) for k, width in enumerate(widths[::-1]))
     fresh = (1 - rubble) * smooth_step(*_BRIGHT_DEG, slope_deg)
     return np.asarray(np.clip(units + 1.2 * fresh + 0.9 * bright - 0.2 * fine, -1, 1.5), dtype=np.float32)
 
 
-def stony(slope_deg: Float32, fine: Float32, rubble: float) -> Float32:
-    """Return the density of boulders over that of level, bare ground, float32[n]; on heaps they lie steeper."""
+def stony(slope_deg: Float32, fine: Float32, bright: Float32, rubble: float) -> Float32:
+    """Return the density of boulders over that of level, bare ground, float32[n]; on heaps they lie steeper.
+
+    Most boulders of cratered ground lie in and around the freshest craters.
+    """
     low, high = (slope + 15 * rubble for slope in _STONES_STAY_DEG)
-    return np.asarray((1 - 0.95 * fine) * (1 - smooth_step(low, high, slope_deg)), dtype=np.float32)
+    strewn = 1 + _STREWN * (1 - rubble) * bright
+    return np.asarray(strewn * (1 - 0.95 * fine) * (1 - smooth_step(low, high, slope_deg)), dtype=np.float32)

@@ -55,11 +55,17 @@ _DUST_LEAVES_DEG = (27.0, 40.0)  # dust lies on slopes below the first, and has 
 _BARE_DEG = (30.0, 44.0)  # slopes below the first are loose ground, slopes above the second consolidated
 _CLIFF_DEG = (38.0, 52.0)
 _GRAVITY_STEP_M = 250.0  # step of the differences that give the gradient of gravity
-_GRAVITY_REACH_M = 1500.0  # gravity is linear up to this distance from the site
-_GRAVITY_REACH = 0.33  # and, where it is sampled elsewhere, up to this distance in mean radii of the body
+# Gravity is linear up to half of this distance from the site and interpolated beyond it
+_GRAVITY_REACH_M, _GRAVITY_REACH = 1500.0, 0.33  # the smaller one counts; the second in mean radii of the body
+_GRAVITY_PLACES = 6  # nearest ones from which gravity is interpolated, with the one that has no weight
 
 _STEEPEST = 1.5  # tangent of the relief's largest slope against the model
 _SLUMPS, _SLUMP_STEPS = 4, 25
+
+_LOW, _MEAN_SLOPE_DEG = (
+    0.18,
+    30.0,
+)  # elevations in mean radii and slopes that make airfall depart by 1 from its mean
 
 _TALUS_CELL_M = 4.0
 _TALUS_REACH_M = 480.0
@@ -75,7 +81,8 @@ class Ground:
     height_m
         float64[n], along the model's normal.
     dust
-        float32[n] in [0, 1]; 1 is covered by dust. Of regolith: deviation of the albedo from its mean, -1 to 1.5.
+        float32[n]: 1 is covered by dust, 0 bare; airfall goes beyond both. Of regolith: deviation of the albedo
+        from its mean, -1 to 1.5.
     talus
         float32[n] in [0, 1]; 1 is debris at the foot of a cliff. Of regolith: the density of boulders.
     """
@@ -112,20 +119,21 @@ def add_relief(
         Wavelength of the longest octave; longer relief belongs to the model.
     """
     points, normals, faces = mesh
-    vertical = _vertical if spec.regolith is None else _vertical_anywhere
-    up, elevation = vertical(body, site, points)
+    up, elevation = _vertical(body, site, points)
     if spec.relief == 0:
         slope = _slope_deg(points, normals, faces, up)
         return Ground(
             height_m=np.zeros(len(points)),
-            dust=1 - smooth_step(*_DUST_LEAVES_DEG, slope),
+            dust=1 - smooth_step(*_DUST_LEAVES_DEG, slope) + _airfall(body, elevation, slope, spec.airfall),
             talus=np.zeros(len(points), dtype=np.float32),
         )
     # Points are sorted by facet size, so that each octave is evaluated at a leading part of them only.
     order = np.argsort(facet_m, kind="stable")
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
-    noise = Octaves(points[order] + site.position_T_m, facet_m[order], spec.seed, roughness, longest_m)
+    noise = Octaves(
+        points[order] + site.position_T_m, facet_m[order], spec.seed, roughness, longest_m, normals[order]
+    )
     if spec.regolith is not None:
         return _of_regolith(body, mesh, noise, (order, rank), (up, elevation), spec)
     scale: Float64 | float = spec.relief
@@ -171,6 +179,7 @@ def add_relief(
     if spec.fractured is not None:
         slope = _slope_deg(points + height_m[:, None] * normals, normals, faces, up)
         dust = dust * fractured.dust_that_rests(slope, spec.fractured)
+    dust = dust + _airfall(body, elevation[order], model_slope, spec.airfall)[rank]
     return Ground(height_m=height_m, dust=dust, talus=talus)
 
 
@@ -193,8 +202,22 @@ def _of_regolith(
     return Ground(
         height_m=_slumped(points, faces, height[rank].astype(np.float64)),
         dust=regolith.brightness(noise, slope[order], fine, bright, spec.regolith.rubble)[rank],
-        talus=regolith.stony(slope, fine[rank], spec.regolith.rubble),
+        talus=regolith.stony(slope, fine[rank], bright[rank], spec.regolith.rubble),
     )
+
+
+def _airfall(body: Body, elevation_m: Float64, slope_deg: Float32, factor: float) -> Float32:
+    """Return what airfall adds to the cover of dust, float32[n], -2 to 2 times the factor.
+
+    It gathers on level and on low ground: the neck of 67P is the brightest of its regions (Fornasier et al. 2015,
+    A&A 583, A30; Keller et al. 2015, A&A 583, A34). Slope and elevation count alike; with both, the ranks of
+    brightness in 11 flight frames correlate by 0.027 more, with either alone by 0.008.
+    """
+    if not factor:
+        return np.zeros(len(slope_deg), dtype=np.float32)
+    radius_m = (body.volume_m3 / (4 / 3 * np.pi)) ** (1 / 3)
+    low = np.clip((np.median(body.places[2]) - elevation_m) / (_LOW * radius_m), -1, 1)
+    return np.asarray(factor * (low + np.clip(1 - slope_deg / _MEAN_SLOPE_DEG, -1, 1)), dtype=np.float32)
 
 
 def _unevenness(body: Body, noise: Octaves, slope_deg: Float32, strength: float) -> Float64:
@@ -218,47 +241,46 @@ def _unevenness(body: Body, noise: Octaves, slope_deg: Float32, strength: float)
 def _vertical(body: Body, site: Site, points: Float64) -> tuple[Float64, Float64]:
     """Return the unit vertical float64[n, 3] (T axes) and the elevation float64[n] in metres.
 
-    Both follow from gravity and its gradient at the site: gravity is linear within 1.5 km and constant beyond.
-    Elevation is the effective potential divided by the body's mean gravity. It hardly depends on the site, nor do
-    the strata that follow it.
+    Near the site, gravity is linear: it follows from gravity and its gradient there. Far from it, gravity at places
+    all over the body is interpolated. Elevation is the effective potential divided by the body's mean gravity. It
+    hardly depends on the site, nor do the strata that follow it.
     """
     centre = site.position_T_m
     steps = _GRAVITY_STEP_M * np.concatenate([np.eye(3), -np.eye(3)])
     gravity = body.effective_gravity(np.concatenate([centre[None], centre + steps]))
     gradient = (gravity[1:4] - gravity[4:7]) / (2 * _GRAVITY_STEP_M)
-    distance = np.sqrt(np.einsum("ni,ni->n", points, points))
-    near = points * np.minimum(1.0, _GRAVITY_REACH_M / np.maximum(distance, 1e-9))[:, None]
-    bend = np.einsum("ni,ij->nj", near, gradient)
-    up = -(gravity[0] + bend)
-    up /= np.maximum(np.sqrt(np.einsum("ni,ni->n", up, up)), 1e-30)[:, None]
+    bend = np.einsum("ni,ij->nj", points, gradient)
     at_site = float(body.gravity.evaluate(centre).potential_m2_s2[0])
     at_site += 0.5 * body.omega_rad_s**2 * float(centre[0] ** 2 + centre[1] ** 2)
-    potential = at_site + np.einsum("ni,ni->n", near, gravity[0] + 0.5 * bend)
-    return up, -potential / body.mean_gravity_m_s2
-
-
-def _vertical_anywhere(body: Body, site: Site, points: Float64) -> tuple[Float64, Float64]:
-    """Return what `_vertical` does, far from the site from gravity at places all over the body.
-
-    Far is a third of the body's radius, or 1.5 km. Potentials are extrapolated from the three nearest places by the
-    gravity at each.
-    """
-    up, elevation = _vertical(body, site, points)
+    potential = at_site + np.einsum("ni,ni->n", points, gravity[0] + 0.5 * bend)
+    pull, elevation = gravity[0] + bend, -potential / body.mean_gravity_m_s2
     reach_m = min(_GRAVITY_REACH_M, _GRAVITY_REACH * (body.volume_m3 / (4 / 3 * np.pi)) ** (1 / 3))
-    far = np.einsum("ni,ni->n", points, points) > reach_m**2
-    if far.any():
-        place, gravity, level = body.places
-        distance, near = cKDTree(place).query(points[far] + site.position_T_m, k=3)
-        weight = 1 / np.maximum(distance, 1e-3) ** 2
-        weight /= weight.sum(axis=1)[:, None]
-        pull, height = np.zeros((len(near), 3)), np.zeros(len(near))
-        for k in range(3):
-            g, off = gravity[near[:, k]], points[far] + site.position_T_m - place[near[:, k]]
-            pull += weight[:, k, None] * g
-            height += weight[:, k] * (level[near[:, k]] - np.einsum("ni,ni->n", g, off) / body.mean_gravity_m_s2)
-        up[far] = -pull / np.maximum(np.sqrt(np.einsum("ni,ni->n", pull, pull)), 1e-30)[:, None]
-        elevation[far] = height
-    return up, elevation
+    distance = np.sqrt(np.einsum("ni,ni->n", points, points))
+    far = distance > 0.5 * reach_m
+    there, height = _interpolated(body, points[far] + centre)
+    weight = smooth_step(0.5 * reach_m, reach_m, distance[far])
+    pull[far] += weight[:, None] * (there - pull[far])
+    elevation[far] += weight * (height - elevation[far])
+    return -pull / np.maximum(np.sqrt(np.einsum("ni,ni->n", pull, pull)), 1e-30)[:, None], elevation
+
+
+def _interpolated(body: Body, points_T_m: Float64) -> tuple[Float64, Float64]:
+    """Return gravity float64[n, 3] in m/s² and elevation float64[n] in m, interpolated from `body.places`.
+
+    Potentials are extrapolated by the gravity at each of the nearest places. The weights (Franke & Little in Franke
+    1982, Math. Comp. 38, 181) vanish for the place beyond them, so that nothing jumps.
+    """
+    place, gravity, level = body.places
+    distance, near = cKDTree(place).query(points_T_m, k=min(_GRAVITY_PLACES, len(place)))
+    distance = np.maximum(distance, 1e-3)
+    weight = (1 / distance[:, :-1] - 1 / distance[:, -1:]) ** 2 + 1e-12 / distance[:, :-1] ** 2
+    weight /= weight.sum(axis=1)[:, None]
+    pull, elevation = np.zeros_like(points_T_m), np.zeros(len(points_T_m))
+    for k in range(weight.shape[1]):
+        g, off = gravity[near[:, k]], points_T_m - place[near[:, k]]
+        pull += weight[:, k, None] * g
+        elevation += weight[:, k] * (level[near[:, k]] - np.einsum("ni,ni->n", g, off) / body.mean_gravity_m_s2)
+    return pull, elevation
 
 
 def _slope_deg(points: Float64, normals: Float64, faces: Int32, up: Float64) -> Float32:

@@ -359,10 +359,11 @@ def _without_slivers(vertices: Float64, faces: NDArray) -> NDArray:
         k = slivers.popleft()
         length, a, b, c = longest(k)
         beyond = owner.get((b, a))
-        if beyond is None or (beyond in slivers and longest(beyond)[0] > length):
+        if beyond is None or c in table[beyond] or (beyond in slivers and longest(beyond)[0] > length):
             slivers.append(k)
             continue
         (d,) = set(table[beyond]) - {a, b}
+        del owner[a, b], owner[b, a]
         table[k], table[beyond] = (c, a, d), (d, b, c)
         slivers = deque(face for face in slivers if face != beyond)
         for face in (k, beyond):

@@ -51,6 +51,8 @@ class Regolith:
         Mean depth over diameter; fresh craters have 0.2.
     largest_crater_m
         Larger craters belong to the shape model.
+    simple_crater_m
+        Larger craters are complex: shallower, with level floors and central peaks.
     equilibrium
         Fraction of geometric saturation that the number of craters does not exceed.
     ponds
@@ -66,6 +68,7 @@ class Regolith:
     crater_index: float = 2.0
     crater_depth: float = 0.12
     largest_crater_m: float = 300.0
+    simple_crater_m: float = 1e9
     equilibrium: float = 0.05
     ponds: float = 0.0
     smooth: float = 0.0
@@ -110,6 +113,9 @@ class PatchSpec:
     angularity
         Part of the variance of the relief longer than 20 m that is of planes which meet in edges; the rest is of
         rounded waves.
+    airfall
+        How much more dust covers low and level ground, and how much less high and steep ground, than the relief
+        alone would let lie there; 0: no more.
     largest_boulder_m
         Diameter of the largest boulder.
     fractured
@@ -134,6 +140,7 @@ class PatchSpec:
     contour_scarps: float = 0.0
     intermittency: float = 0.0
     angularity: float = 0.0
+    airfall: float = 0.0
     largest_boulder_m: float = 45.0
     fractured: Fractured | None = None
     regolith: Regolith | None = None

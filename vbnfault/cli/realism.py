@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
+from ..core.errors import InputError
 from .app import app
 from .options import (
     MOST_PROCESSES,
@@ -70,6 +71,54 @@ def passport(
     for text in result["conclusions"]["may_not"]:
         typer.echo(f"may not: {text}")
     typer.echo(f"page: {out / PAGE}")
+
+
+@app.command(rich_help_panel=_PANEL)
+def inject(
+    images: Annotated[
+        list[str], typer.Argument(help="Images, folders and globs: PNG, TIFF, FITS, EXR, NPY.", metavar="IMAGE...")
+    ],
+    scene: SceneOption,
+    out: Annotated[Path, local_path("Folder for the images, masks and parameters, to make or to continue.")],
+    labels: Annotated[
+        Literal["png", "zarr"],
+        typer.Option(help="Masks as PNG beside the images, and a store that holds all, if zarr."),
+    ] = "png",
+    sun: Annotated[
+        str | None,
+        typer.Option(
+            help="Position of the Sun: auto, none, X,Y in pixels, or X,Y,Z in the camera's axes.",
+            show_default="image.sun of the scene",
+        ),
+    ] = None,
+    seed: Annotated[int | None, whole(0, 2**63 - 1, "Seed.", unset="the scene's")] = None,
+    workers: Annotated[int, whole(1, MOST_PROCESSES, "Number of processes.")] = 1,
+    settings: Annotated[list[str] | None, replaced("scene", "camera.fov_deg=5")] = None,
+) -> None:
+    """Put the faults of a scene into images of one's own, with a mask for each fault and its parameters. Size,
+    depth and metadata of the images stay. The same command continues after an interruption.
+    """
+    from ..inject.batch import inject_files
+    from ..scene.config import load_scene
+
+    changes = overrides(settings)
+    if seed is not None:
+        changes["dataset.seed"] = seed
+    batch = inject_files(images, load_scene(scene, changes), out, labels=labels, sun=_sun(sun), workers=workers)
+    for sentence in batch.assumptions:
+        typer.echo(f"assumed: {sentence}")
+    typer.echo(f"{len(batch.names)} images: {out}")
+
+
+def _sun(text: str | None) -> str | tuple[float, ...] | None:
+    """Return what --sun says. Raises InputError if it is neither a word nor two or three numbers."""
+    if text is None or text in ("auto", "none"):
+        return text
+    with contextlib.suppress(ValueError):
+        numbers = tuple(map(float, text.split(",")))
+        if len(numbers) in (2, 3):
+            return numbers
+    raise InputError(f"--sun {text}: must be auto, none, X,Y in pixels, or X,Y,Z in the camera's axes")
 
 
 @app.command(rich_help_panel=_PANEL)

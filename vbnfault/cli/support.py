@@ -89,7 +89,7 @@ def _list_faults() -> None:
 
 
 def _list_effects() -> None:
-    """Print the effects of a detector in the order of the chain, those of plug-ins with their keys."""
+    """Print the effects of a detector in the order of the chain, with the keys of those that have some."""
     from ..detector import effects
 
     classes = effects.registry()

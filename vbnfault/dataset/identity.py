@@ -27,7 +27,7 @@ from ..camera import Camera
 from ..core.errors import InputError, VbnfaultError, in_file
 from ..core.files import file_contents, resources, user_files
 from ..core.process import llvm
-from ..detector import Detector
+from ..detector import Detector, load_sensor
 from ..faults import Fault, belongs_here, is_packaged, loaded_plugin, plugins_of, registry
 from ..lens import load_lens
 from ..pipeline import masks
@@ -47,6 +47,8 @@ _LIBRARIES = ("mitsuba", "drjit", "numpy", "scipy", "trimesh", "scikit-image", "
 # [first, last] of the other's plan that it holds; `repeats`, how often it holds each; `source`, what identifies the
 # other store and its plan.
 RETAKE = "retake"
+# Root attribute of a store of images into which faults were put: digests of their files, and where the Sun is.
+IMAGES = "images"
 # Keys that came after version 0.1 of the store: a scene that has their defaults has the identity of before.
 _LEFT_OUT_AT_DEFAULT = (
     "body.atmosphere",
@@ -62,6 +64,8 @@ _LEFT_OUT_AT_DEFAULT = (
     "camera.exposure_stops",
     "dataset.variants_per_view",
     "dataset.radiance_dtype",
+    "image",
+    "patch.airfall",
     "patch.fractured",
     "patch.contour_scarps",
     "patch.facet_px",
@@ -195,8 +199,10 @@ def _contents_of_files(identity: dict[str, Any], scene: Scene) -> None:
     if scene.camera.lens:
         identity["camera"]["lens"] = _lens_digest(scene.camera.lens)
     if scene.camera.detector:
-        identity["camera"]["detector"] = _digest(
-            resources.find("scenes/detectors", scene.camera.detector), "detector"
+        path = resources.find("scenes/detectors", scene.camera.detector)
+        measured = load_sensor(path).measured
+        identity["camera"]["detector"] = "+".join(
+            [_digest(path, "detector"), *(measured.digests if measured else ())]
         )
     if scene.body.albedo_map is not None and scene.body.albedo_map.file != EARTH:
         identity["body"]["albedo_map"]["file"] = _digest(scene.body.albedo_map.file, "texture")
@@ -240,7 +246,7 @@ def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
     layers = tuple(name for name in stored_layers(scene, session.faults) if name != "clean")
     individuals = scene.camera.individuals
     _check_origins(session.faults)
-    kinds = tuple(masks.kind(fault, is_ccd=camera.is_ccd) for fault in session.faults.values())
+    kinds = tuple(masks.kind(fault, camera) for fault in session.faults.values())
     references = ephemeris.attitude_references(scene)
     return StoreSpec(
         height=camera.height_px,
@@ -371,7 +377,7 @@ def is_exact(attributes: Mapping[str, Any]) -> bool:
     redraws = scene.get("plan", {}).get("on_invisible") == "redraw_view"
     as_drawn = scene.get("geometry", {}).get("sun_visibility") == "as_drawn"
     flown = scene.get("spice", {}).get("spacecraft") or scene.get("trajectory")
-    return bool(redraws and not as_drawn and not flown and RETAKE not in attributes)
+    return bool(redraws and not as_drawn and not flown and not {RETAKE, IMAGES} & set(attributes))
 
 
 def stored_scene(attributes: Mapping[str, Any]) -> Scene:
@@ -467,7 +473,7 @@ def planned(attributes: Mapping[str, Any], faults: Sequence[str]) -> Callable[[i
         drawn = table.view(scene, index, tries - 1)
         # the plan does not set these angles if a trajectory places camera and Sun, or if the camera aims
         names = ("sun_azimuth_deg", "sun_elevation_deg", "roll_deg", "pitch_deg", "yaw_deg")
-        angles = () if scene.is_flown or scene.is_aimed else names
+        angles = () if scene.is_flown or scene.is_aimed or IMAGES in attributes else names
         return {
             **{name: drawn[name] for name in angles},
             "stratum": int(table.stratum[index]),

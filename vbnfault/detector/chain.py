@@ -26,9 +26,11 @@ from .charge import transfer_dark_e
 from .demosaic import bounded_at_edges, correct_defects, demosaic, interpolate
 from .effects import Acts, Effect, Exposure, chain_of, is_packaged
 from .effects.electrons import upper_fraction
+from .effects.output import Nonlinearity
 from .efficiency import white_balance
 from .individual import Individual, IndividualSpec, dark_rate_e_s, make_individual, offset_e, response
 from .interface import luminance
+from .measured import as_measured
 from .mosaic import channel_of
 from .noise import NormalField, draw_normals
 from .readout import ReadoutIndividual, ReadoutNoise, read_out
@@ -97,15 +99,20 @@ class Device:
         self.sensor, self.seed, self.direction = sensor, seed, direction
         self.shape = (sensor.height_px, sensor.width_px) if shape is None else shape
         self.temperature_K = sensor.temperature_K if temperature_K is None else temperature_K
-        self.individual = individual(sensor.individual, self.shape, sensor.pixel_pitch_um, seed)
+        self.drawn = individual(sensor.individual, self.shape, sensor.pixel_pitch_um, seed)
+        self.individual = as_measured(self.drawn, sensor)
         self.response = response(self.individual)
         self.offset_e = offset_e(self.individual)
         drawn = ReadoutIndividual.draw(
             self.shape, sensor.readout, np.random.default_rng(np.random.SeedSequence([seed, *b"readout"]))
         )
+        if sensor.measured is not None and sensor.measured.offset_e is not None:
+            drawn = replace(drawn, row_e=None, column_e=None)  # the measured offsets have these patterns
         self.readout_individual = replace(drawn, pixel_e=self.offset_e)
         self.dark_rate_e_s = dark_rate_e_s(self.individual, self.temperature_K)
-        self.transfer_dark_e = transfer_dark_e(sensor, self.dark_rate_e_s, direction)
+        self.transfer_dark_e = None  # a dark frame has this signal, too
+        if sensor.measured is None or sensor.measured.dark_e_s is None:
+            self.transfer_dark_e = transfer_dark_e(sensor, self.dark_rate_e_s, direction)
         self.telegraph = self.individual.rts.at(self.temperature_K)
         self.chain = chain_of(sensor.effects)
 
@@ -178,11 +185,20 @@ class Device:
         noise can take away (interference whole, the rest four standard deviations).
         """
         readout = self.sensor.readout
-        full = np.full(self.shape, readout.full_well_e, np.float32)
+        full = np.full(self.shape, self._full_e, np.float32)
         temporal_e = math.hypot(readout.noise_e_rms, readout.row_noise_e_rms)
         margin_dn = (4 * temporal_e + 2 * readout.banding_seen_e) * readout.system_gain_dn_per_e
         level = read_out(full, readout, None, self.readout_individual) - np.float32(margin_dn)
         return np.ceil(np.maximum(level, 0)).astype(np.uint16)
+
+    @cached_property
+    def _full_e(self) -> float:
+        """Return the electrons as which a full well reads, by the table of `nonlinearity` if the sensor has it."""
+        full_e = self.sensor.readout.full_well_e
+        for effect in self.chain:
+            if isinstance(effect, Nonlinearity):
+                full_e = float(effect.read(np.asarray(full_e, np.float32)))
+        return full_e
 
     @cached_property
     def bad(self) -> NDArray[np.bool_]:
@@ -227,7 +243,8 @@ class Device:
             mosaic, highest = mosaic - self.row_black_dn, float(self.row_black_dn.max())
         # white is the range above the highest black level. A saturated pixel then stays white, even if its full
         # well lies below the top code or dark signal alone fills it (1 % of the range is then left)
-        white = sensor.readout.bias_dn + sensor.readout.system_gain_dn_per_e * sensor.readout.white_e
+        white_e = min(sensor.readout.white_e, self._full_e)
+        white = sensor.readout.bias_dn + sensor.readout.system_gain_dn_per_e * white_e
         black = min(black, white - highest - 0.01 * (white - sensor.readout.bias_dn))
         full = 255.0 / (white - black - highest)
         scale = {

@@ -473,13 +473,9 @@ def _hot(
     count = len(born)
     fraction = np.where(np.arange(count) < earlier[0], earlier[1], spec.hot_clustered_fraction)
     row, column = _clustered(*_places(seed, "hot", count, shape), fraction, shape, seed)
-    # inverse distribution function of a power law between two limits
-    seen, most = spec.hot_rate_e_s
-    least = min(seen * _RATES_ISO / spec.iso, most)
-    power = 1.0 if growth is None else growth.iso_power
-    rate = least * (1 - _uniform(seed, "hot rate", count) * (1 - (least / most) ** power)) ** (-1 / power)
+    rate = hot_rates_e_s(spec, _uniform(seed, "hot rate", count))
     # those that only a higher ISO shows are faint, so they have no offset either
-    sticks = (_uniform(seed, "hot sticks", count) < spec.hot_offset_fraction) & (rate >= min(seen, most))
+    sticks = (_uniform(seed, "hot sticks", count) < spec.hot_offset_fraction) & (rate >= min(spec.hot_rate_e_s))
     offset = -np.log1p(-_uniform(seed, "hot offset", count)) * spec.hot_offset_e
     return HotPixelTable(
         row=row,
@@ -488,6 +484,15 @@ def _hot(
         offset_e=np.where(sticks, offset, 0.0),
         born_yr=born / max(per_yr, 1e-300),
     )
+
+
+def hot_rates_e_s(spec: IndividualSpec, chance: F64) -> F64:
+    """Return the rates of hot pixels at the reference temperature, float64[n], for uniform variates."""
+    # inverse distribution function of a power law between two limits
+    seen, most = spec.hot_rate_e_s
+    least = min(seen * _RATES_ISO / spec.iso, most)
+    power = 1.0 if spec.hot_growth is None else spec.hot_growth.iso_power
+    return least * (1 - chance * (1 - (least / most) ** power)) ** (-1 / power)
 
 
 def _clustered(row: I32, column: I32, fraction: F64, shape: tuple[int, int], seed: int) -> tuple[I32, I32]:
@@ -531,7 +536,14 @@ def _rts(spec: IndividualSpec, shape: tuple[int, int], pixel_pitch_um: float, se
     interactions = spec.radiation(pixel_pitch_um).interactions
     expected = (spec.rts_fraction + spec.rts_per_interaction * interactions) * shape[0] * shape[1]
     count = len(_births(seed, "rts", expected))
-    row, column = _places(seed, "rts", count, shape)
+    return rts_pixels(spec, pixel_pitch_um, seed, "rts", *_places(seed, "rts", count, shape))
+
+
+def rts_pixels(
+    spec: IndividualSpec, pixel_pitch_um: float, seed: int, name: str, row: I32, column: I32
+) -> RtsPixels:
+    """Draw the telegraph signals of given pixels, by the random streams of a name."""
+    count = len(row)
     mean = rate_e_s(spec.rts_amplitude_nA_cm2, pixel_pitch_um) * arrhenius_factor(
         spec.reference_K, _RTS_REFERENCE_K
     )
@@ -539,9 +551,9 @@ def _rts(spec: IndividualSpec, shape: tuple[int, int], pixel_pitch_um: float, se
     return RtsPixels(
         row=row,
         column=column,
-        amplitude_e_s=-np.log1p(-_uniform(seed, "rts amplitude", count)) * mean,
-        high_s=shortest * (longest / shortest) ** _uniform(seed, "rts high", count),
-        low_s=shortest * (longest / shortest) ** _uniform(seed, "rts low", count),
+        amplitude_e_s=-np.log1p(-_uniform(seed, f"{name} amplitude", count)) * mean,
+        high_s=shortest * (longest / shortest) ** _uniform(seed, f"{name} high", count),
+        low_s=shortest * (longest / shortest) ** _uniform(seed, f"{name} low", count),
         reference_K=spec.reference_K,
     )
 

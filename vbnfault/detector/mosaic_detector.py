@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from typing import Any, ClassVar
 
@@ -51,6 +51,8 @@ class MosaicDetector(Detector):
                 raise InputError(
                     f"{key} = {getattr(self, key)}: {sensor.name} has {getattr(sensor, key)}; must be at most that"
                 )
+        if sensor.measured is not None:
+            sensor.measured.corner((self.height_px, self.width_px), np.shape(sensor.pattern.tile))
 
     @property
     def name(self) -> str:
@@ -174,7 +176,7 @@ class MosaicDetector(Detector):
             "row_readout_s": sensor.transfer.row_readout_s,
             "demosaic": sensor.method,
             # the whole description of the sensor, with the sources of its values
-            "sensor": json.loads(json.dumps(asdict(sensor), default=_plain)),
+            "sensor": json.loads(json.dumps(_plain_sensor(sensor), default=_plain)),
         }
 
     @property
@@ -187,6 +189,13 @@ class MosaicDetector(Detector):
 def _device(sensor: Sensor, seed: int, shape: tuple[int, int], direction: str) -> Device:
     """Return a device from the cache, or make it."""
     return Device(sensor, seed, shape=shape, direction=direction)
+
+
+def _plain_sensor(sensor: Sensor) -> dict[str, Any]:
+    """Return the description of a sensor as plain data; measured files have names and digests, not paths."""
+    plain = asdict(replace(sensor, defects=None, measured=None))
+    del plain["measured"], plain["defects"]
+    return plain if sensor.measured is None else plain | {"defects": sensor.measured.description}
 
 
 def _plain(effect: Effect) -> dict[str, Any]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
+
 from .charge import TrapSpecies
 from .individual import IndividualSpec
 from .readout import ReadoutSpec
@@ -46,6 +48,7 @@ def binned(sensor: Sensor, pixels: int) -> Sensor:
         individual=_individual(sensor.individual, n),
         readout=_readout(sensor.readout, area, readouts),
         transfer=_transfer(sensor.transfer, n),
+        measured=sensor.measured and sensor.measured.binned(n, np.shape(sensor.pattern.tile)),
     )
 
 

@@ -16,6 +16,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
+from scipy.special import ndtr, stdtrit
 
 from ..core.errors import InputError
 from ..core.process.llvm import backend, evaluated, on_device
@@ -72,6 +73,12 @@ class ReadoutSpec:
     )
     row_pattern_e_rms: float = Field(default=0.0, ge=0, description="fixed pattern of rows; devices differ")
     column_pattern_e_rms: float = Field(default=0.0, ge=0, description="fixed pattern of columns; devices differ")
+    column_pattern_freedom: float | None = Field(
+        default=None,
+        gt=2,
+        description="degrees of freedom of Student's t, which the pattern then follows: a few columns stand out; "
+        "default: normal",
+    )
     row_noise_e_rms: float = Field(default=0.0, ge=0, description="noise with one value per row and exposure")
     banding_amplitude_e: float = Field(
         default=0.0, ge=0, description="amplitude of sinusoidal interference during the readout"
@@ -256,8 +263,11 @@ class ReadoutIndividual:
 
     @classmethod
     def draw(cls, shape: tuple[int, int], spec: ReadoutSpec, rng: np.random.Generator) -> ReadoutIndividual:
-        """Draw normal patterns of the spec's spreads. It always draws one variate per row, column and code."""
+        """Draw patterns of the spec's spreads. It always draws one variate per row, column and code."""
         row, column = (rng.standard_normal(n, dtype=np.float32) for n in shape)
+        if (freedom := spec.column_pattern_freedom) is not None:  # scaled to the same standard deviation
+            tailed = stdtrit(freedom, ndtr(column.astype(np.float64)))
+            column = (tailed * (1 - 2 / freedom) ** 0.5).astype(np.float32)
         widths = rng.standard_normal(spec.top_dn + 1, dtype=np.float32)
         return cls(
             row_e=row * np.float32(spec.row_pattern_e_rms),

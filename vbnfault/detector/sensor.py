@@ -11,7 +11,8 @@ from dataclasses import field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, InstanceOf
+from pydantic.json_schema import SkipJsonSchema
 
 from ..core import spectra, tables
 from ..core.errors import InputError, shown
@@ -24,6 +25,7 @@ from .demosaic import Method
 from .effects import Effects
 from .efficiency import Curve, QuantumEfficiency
 from .individual import IndividualSpec
+from .measured import DefectFiles, Measured, with_measured
 from .mosaic import PATTERNS, Pattern
 from .mosaic import pattern as pattern_of
 from .readout import ReadoutSpec
@@ -142,7 +144,11 @@ class Sensor:
     )
     readout: ReadoutSpec = Field(default_factory=ReadoutSpec, description="the chain from charge to DN")
     transfer: Transfer = Field(default_factory=Transfer, description="how charge is moved")
-    effects: Effects = Field(default_factory=tuple, description="effects of plug-ins, by their names")
+    effects: Effects = Field(default_factory=tuple, description="effects that not every sensor has, by their names")
+    defects: DefectFiles | None = Field(default=None, description="files that show one device; default: none")
+    measured: SkipJsonSchema[InstanceOf[Measured] | None] = Field(
+        default=None, description="what these files show; no key of a sensor file"
+    )
     sources: Annotated[
         Mapping[str, str], Field(description="where each number comes from, by its key, or 'assumed'")
     ] = field(default_factory=dict, hash=False)
@@ -157,6 +163,8 @@ class Sensor:
                 f"response = {shown(self.response)}: must be one of {', '.join(responses)}; {MONOCHROME}"
             )
         self._check_channels()
+        for effect in self.effects:
+            effect.check(self)
         if self.architecture != "cmos":
             for traps, clock in (("parallel_traps", "row_readout_s"), ("serial_traps", "pixel_transfer_s")):
                 if getattr(self.transfer, traps) and not getattr(self.transfer, clock) > 0:
@@ -219,7 +227,7 @@ def parse_sensor(table: Mapping[str, Any], *, source: str) -> Sensor:
     if sensor.architecture != "cmos" and "hot_growth" not in table.get("individual", {}):
         grows = dataclasses.replace(sensor.individual, hot_growth=CCD_GROWTH)
         sensor = dataclasses.replace(sensor, individual=grows)
-    return sensor
+    return with_measured(sensor, source)
 
 
 def _check_sources(numbers: list[str], sources: Mapping[str, str], source: str) -> None:

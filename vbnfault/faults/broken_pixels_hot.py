@@ -213,7 +213,7 @@ def _damage(params: Params, context: FaultContext) -> _Damage:
     """Return the damage that the older device has and the device of today lacks."""
     detector = context.camera.mosaic
     device = detector.device
-    own = device.individual
+    own = device.drawn  # what was measured does not age
     old = _older(own, _ageing(own.spec, params))
     exposure_s = context.camera.exposure_s
 
@@ -223,12 +223,12 @@ def _damage(params: Params, context: FaultContext) -> _Damage:
     rts = RtsPixels(**new, reference_K=old.rts.reference_K)
     signals = rts.at(device.temperature_K)
     high = upper_fraction(signals, exposure_s, params["telegraph_seed"]) if len(rts) else np.zeros(0)
-    more = dark_rate_e_s(old, device.temperature_K) - device.dark_rate_e_s
+    more = dark_rate_e_s(old, device.temperature_K) - dark_rate_e_s(own, device.temperature_K)
     np.maximum(more, 0, out=more)  # annealing must not remove dark current of the device itself
     jumps = np.zeros(device.shape, dtype=np.float32)
     np.add.at(jumps, (rts.row, rts.column), signals.amplitude_e_s * high)
     charge = np.asarray((more + jumps) * np.float32(exposure_s), dtype=np.float32)
-    offset = np.asarray(offset_e(old) - device.offset_e, dtype=np.float32)
+    offset = np.asarray(offset_e(old) - offset_e(own), dtype=np.float32)
 
     least_e = np.float32(detector.step_e * params["least_dn"])
     kinds = np.where(charge + offset >= least_e, HOT, np.uint8(0))

@@ -192,7 +192,7 @@ class ComaGrains(_Particles):
 
     model = "coma_grains"
     default = True
-    after = ""
+    after = "frozen_frame"
 
 
 @dataclass(frozen=True, kw_only=True)

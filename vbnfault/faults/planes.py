@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -13,6 +14,8 @@ from scipy import fft
 from ..camera import Camera
 from ..core.quantities import LUMINANCE
 from ..lens.image_frame import ImageFrame
+from .context import FaultContext
+from .fields import Interval
 
 F32 = NDArray[np.float32]
 
@@ -82,6 +85,27 @@ def scale_by_intensity(
         np.rint(value, out=value)
         out[..., channel] = np.clip(value, 0, 255, out=value)
     return out
+
+
+def draw_shift(size_px: Interval, context: FaultContext, rng: np.random.Generator) -> list[int]:
+    """Return a displacement in x and y of a drawn size, in px of a 1024 px wide image, and any direction.
+
+    With a mosaic it is a multiple of the tile, so that every pixel keeps its colour.
+    """
+    size, turn = size_px.uniform(rng) * context.scale, rng.uniform(0, 2 * math.pi)
+    mosaic = context.camera.detector.mosaic
+    rows, columns = (1, 1) if mosaic is None else np.shape(mosaic.sensor.pattern.tile)
+    return [round(size * math.cos(turn) / columns) * columns, round(size * math.sin(turn) / rows) * rows]
+
+
+def displaced(array: F32, dx: int, dy: int) -> F32:
+    """Return an image [y, x, …] that is moved to the right and down by whole pixels, mirrored beyond its edges."""
+    height, width = array.shape[:2]
+    rows, columns = (
+        np.abs((np.arange(size) - by + size - 1) % (2 * size - 2) - (size - 1))
+        for size, by in ((height, dy), (width, dx))
+    )
+    return array[rows[:, None], columns]
 
 
 def cell_px(frame: ImageFrame) -> int:

@@ -41,7 +41,7 @@ class FrameTransferSmear(Fault):
     fault = "smear"
     model = "frame_transfer"
     default = True
-    after = "broken_pixels"
+    after = "persistence"
     step = "pixels"
     severity = Severity(key="row_transfer_s", low=1e-7, high=1e-2, width_power=-1)
     needs_mosaic = True

@@ -21,17 +21,15 @@ from numpy.typing import NDArray
 from scipy import ndimage, stats
 from scipy.special import ndtr, ndtri
 
-from ..core.errors import InputError, in_file, shown, suggestion
+from ..core.errors import InputError, shown, suggestion
 from ..core.files import user_files
-from ..core.files.images import decoded_image
 from ..core.files.path_checks import why_absent
-from ..core.files.tiff import check_values
+from ..core.files.raw_frames import FRAME_TYPES, read_frame
 
 Kind = Literal["dark", "flat", "star", "frame"]
 TABLE = "frames.csv"
 _COLUMNS = ("name", "kind", "exposure_s", "temperature_K")
-_FITS, _IMAGES = (".fits", ".fit", ".fts"), (".png", ".tif", ".tiff")
-_MOST_VALUES, _LEAST_PX = 400_000_000, 64
+_LEAST_PX = 64
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -42,8 +40,6 @@ TWO_SIDED = float(ndtri(0.975))
 LEAST_VARIANCE_DN2 = 0.02  # below, rounding hides the noise
 _DITHERED_DN = 0.6
 _PIXELS, _LINE = 11, 31  # widths over which pixels and lines are compared with their neighbours
-_FITS_BLOCK, _FITS_CARD = 2880, 80
-_FITS_TYPES = {8: "u1", 16: ">i2", 32: ">i4", -32: ">f4", -64: ">f8"}
 _MOST_SECONDS, _KELVIN = 1e6, (50.0, 400.0)
 
 
@@ -86,7 +82,7 @@ def _in_path(path: Path, kind: Kind) -> list[Exposure]:
             raise InputError(f"{path}: {why_absent(path)}; must be a folder of frames, or one frame")
         return [_read(path, kind, {})]
     table = _read_table(path / TABLE) if (path / TABLE).is_file() else {}
-    files = sorted(one for one in path.iterdir() if one.suffix.lower() in (*_IMAGES, *_FITS))
+    files = sorted(one for one in path.iterdir() if one.suffix.lower() in FRAME_TYPES)
     spare = sorted(set(table) - {key for file in files for key in (file.name, file.stem)})
     if spare:
         raise InputError(f"{path / TABLE}: name = {shown(spare[0])}: the folder has no such frame")
@@ -135,16 +131,10 @@ def _number(text: str, low: float, high: float, where: str) -> float:
 
 def _read(path: Path, kind: Kind, row: Mapping[str, Any]) -> Exposure:
     """Return the frame of a file and of its row. Raises InputError."""
-    data = user_files.read_input(path, "data", types=(*_IMAGES, *_FITS))
-    with in_file(str(path)):
-        header: dict[str, float] = {}
-        if path.suffix.lower() in _FITS:
-            image, header = _fits(data)
-        else:
-            image = _numbers(decoded_image(data, _MOST_VALUES)[0])
-        if min(image.shape) < _LEAST_PX or not np.isfinite(image).all():
-            size = f"{image.shape[1]}x{image.shape[0]}"
-            raise InputError(f"is {size} px; must be at least {_LEAST_PX} px each way, of finite numbers")
+    image, header = read_frame(path)
+    if min(image.shape) < _LEAST_PX:
+        size = f"{image.shape[1]}x{image.shape[0]}"
+        raise InputError(f"{path}: is {size} px; must be at least {_LEAST_PX} px each way")
     return Exposure(
         name=str(path),
         kind=row.get("kind", kind),
@@ -152,60 +142,6 @@ def _read(path: Path, kind: Kind, row: Mapping[str, Any]) -> Exposure:
         exposure_s=row.get("exposure_s", header.get("exposure_s")),
         temperature_K=row.get("temperature_K", header.get("temperature_K")),
     )
-
-
-def _numbers(values: NDArray[np.float32]) -> NDArray[Any]:
-    """Return the raw numbers of an image of one channel whose white is 1, uint8 or uint16[y, x].
-
-    Floating-point images stay as they are. Raises InputError for an image with colours.
-    """
-    if values.shape[2] > 1 and (values != values[..., :1]).any():
-        raise InputError("has colours; must hold the raw numbers of a mosaic, or grey ones")
-    grey = values[..., 0]
-    for top, kind in ((255, np.uint8), (65535, np.uint16)):
-        whole = np.rint(grey * np.float32(top))
-        # sixteen bits lie off the steps of eight bits by 1/257 at least
-        if np.abs(grey * np.float32(top) - whole).max() < (1e-3 if top == 255 else 0.05) and whole.min() >= 0:
-            return whole.astype(kind)
-    return grey
-
-
-def _fits(data: bytes) -> tuple[NDArray[Any], dict[str, float]]:
-    """Return the numbers of the first image of a FITS file (FITS standard 4.0), and exposure and temperature.
-
-    Raises InputError for what is no plain image of two axes.
-    """
-    cards: dict[str, str] = {}
-    end = 0
-    while "END" not in cards:
-        block = data[end : end + _FITS_BLOCK]
-        end += _FITS_BLOCK
-        if len(block) < _FITS_BLOCK or not data.startswith(b"SIMPLE  ="):
-            raise InputError("is no FITS file with an image in its first part")
-        for start in range(0, _FITS_BLOCK, _FITS_CARD):
-            key, _, value = block[start : start + _FITS_CARD].decode("latin-1").partition("=")
-            cards.setdefault(key[:8].strip(), value.partition("/")[0].strip())
-    try:
-        kind, axes = _FITS_TYPES.get(int(cards["BITPIX"])), int(cards["NAXIS"])
-        columns, rows = (int(cards[f"NAXIS{k}"]) for k in (1, 2))
-        scale, zero = float(cards.get("BSCALE", 1)), float(cards.get("BZERO", 0))
-        known = {
-            name: float(cards[key]) + more
-            for key, name, more in (("EXPTIME", "exposure_s", 0.0), ("CCD-TEMP", "temperature_K", 273.15))
-            if key in cards
-        }
-    except (KeyError, ValueError):
-        raise InputError("is no FITS file with an image in its first part") from None
-    if axes != 2 or kind is None:
-        raise InputError(f"has an image of {axes} axes; must have two, as raw frames have")
-    check_values(rows, columns, 1, _MOST_VALUES)
-    if len(data) < end + rows * columns * np.dtype(kind).itemsize:
-        raise InputError("is a damaged FITS file: it ends within its image")
-    image = np.frombuffer(data, kind, rows * columns, end).reshape(rows, columns) * scale + zero
-    whole = np.rint(image)
-    if (image == whole).all() and whole.min() >= 0 and whole.max() <= 65535:
-        return whole.astype(np.uint16), known
-    return image.astype(np.float32), known
 
 
 # --- estimates and moments ----------------------------------------------------------------------------------------
@@ -342,20 +278,6 @@ def smoothed_pixels(image: F32) -> F32:
     out[:edge] = out[-edge:] = 0
     out[:, :edge] = out[:, -edge:] = 0
     return np.asarray(out, dtype=np.float32)
-
-
-def smooth_surface(image: F32) -> F32:
-    """Return the polynomial of fourth degree in x and y that fits an image best, float32[y, x]."""
-    y, x = (np.linspace(-1, 1, size) for size in image.shape)
-    step = max(min(image.shape) // 64, 1)
-    powers = [(i, j) for i in range(5) for j in range(5 - i)]
-
-    def terms(y: F64, x: F64) -> F64:
-        return np.array([np.outer(y**i, x**j) for i, j in powers])
-
-    design = terms(y[::step], x[::step]).reshape(len(powers), -1).T
-    best, *_ = np.linalg.lstsq(design, image[::step, ::step].ravel(), rcond=None)
-    return np.asarray(np.tensordot(best, terms(y, x), 1), dtype=np.float32)
 
 
 def planes_of(image: NDArray[Any], tile: tuple[int, int]) -> list[F32]:

@@ -14,6 +14,7 @@ Statistics of each image, whose distributions over many frames are compared:
 - `sky`, `glow_0.5` to `glow_3`: background, and mean of the sky up to so many radii of the body, over `bright`;
 - `noise`, `column`: deviation of the sky from its local median, and of the means of columns from a smooth curve;
 - `tracks`: spots and streaks of 2 px or more in the sky;
+- `ee50`, `ee80`: radii that hold 50 and 80 % of the light of the stars of the sky;
 - `noise_lit`: deviation from the local mean in the smoothest tenth of the lit body;
 - `floor`: fraction of the body's outline that is darker than 0.03; `stretch`: median brightness of the lit body;
 - `spikes`: lit pixels in 10,000 that exceed their neighbourhood by 8 deviations;
@@ -37,6 +38,7 @@ from scipy import ndimage, stats
 from ..core.errors import InputError
 from ..core.files import user_files
 from ..core.files.images import decoded_image
+from .stars import encircled_radii
 
 F32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -283,11 +285,15 @@ def _limb_rise_px(one: Look, sun_xy: NDArray[np.float64]) -> float:
 
 
 def compare(
-    real: Look, rendered: Look, sun_xy: NDArray[np.float64], plate_px: float = _PLATE_PX
+    real: Look,
+    rendered: Look,
+    sun_xy: NDArray[np.float64],
+    plate_px: float = _PLATE_PX,
+    stretch: float = 1.0,
 ) -> dict[str, float]:
     """Return all figures of one aligned pair; the statistics as `NAME real` and `NAME rendered`.
 
-    `plate_px` is the mean width of the shape's plates in the frame.
+    `plate_px` is the mean width of the shape's plates in the frame; levels are light to the power `stretch`.
     """
     both, either = real.lit & rendered.lit, real.lit | rendered.lit
     inside = ndimage.binary_erosion(both, iterations=3)
@@ -302,6 +308,8 @@ def compare(
         of_sky = sky_figures(one, either)
         if real.clipped:
             of_sky |= dict.fromkeys(set(of_sky) - {"tracks"}, float("nan"))
+        radii = encircled_radii(one.image, (one.image / np.float32(255)) ** np.float32(1 / stretch), one.sky)
+        of_sky |= dict(zip(("ee50", "ee80"), radii, strict=True))
         values = of_sky | body_figures(one, sun_xy) | octave_variances(one.level, inside)
         out |= {f"{name} {which}": value for name, value in values.items()}
     return out

@@ -22,6 +22,7 @@ from ..detector.noise import draw_normals, poisson
 from ..detector.sensor import Sensor
 from .exposures import F32, F64, OUTLIER, TWO_SIDED, Estimate, Exposure, Mask, Transfer, planes_of
 from .replay import Display, reduced
+from .stars import STAR_PX, stars
 
 # Immerkær 1996, doi 10.1006/cviu.1996.0060: levels that change linearly, and those of rows and columns, cancel
 _LAPLACE = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], dtype=np.float32) / 6
@@ -34,7 +35,7 @@ _SMOOTH = 2.0  # blocks of up to so many times the variance of their level count
 _MODEL_ERROR = 0.01  # of a simulated variance: that of a quantile of its 256 blocks
 _PROCESSING_ERROR = 0.25  # of a simulated shared pattern: processed frames may share more than offsets of pixels
 _COLUMN_PX, _FEWEST_ROWS, _FEWEST_COLUMNS = 15, 32, 32
-_STAR_PX, _APART_PX, _FEWEST_STARS, _MOST_STARS, _STAR_SIGMAS = 5, 8, 5, 100, 12.0
+_FEWEST_STARS = 5
 _CORE_PX = (0.3, 4.0)
 _RESPONSE_ERROR = 0.005  # of the width of a star, for what a bent response and neighbours make of its shape
 
@@ -335,8 +336,8 @@ def fit_point_spread(frames: Sequence[Exposure], sensor: Sensor, good: Mask | No
     for one in frames:
         image = one.image.astype(np.float32)
         top = 0.9 * min(float(image.max()), sensor.readout.top_dn)
-        for row, column in _stars(image, top, good):
-            part = slice(row - _STAR_PX, row + _STAR_PX + 1), slice(column - _STAR_PX, column + _STAR_PX + 1)
+        for row, column in stars(image, top, good):
+            part = slice(row - STAR_PX, row + STAR_PX + 1), slice(column - STAR_PX, column + STAR_PX + 1)
             if (width := _width_px(image[part], channel[part])) is not None:
                 widths.append(width)
     if len(widths) < _FEWEST_STARS:
@@ -347,32 +348,12 @@ def fit_point_spread(frames: Sequence[Exposure], sensor: Sensor, good: Mask | No
     return Estimate.normal(value, error, f"images of {len(widths)} stars")
 
 
-def _stars(image: F32, top: float, good: Mask | None) -> list[tuple[int, int]]:
-    """Return (row, column) of the brightest isolated peaks below `top`."""
-    sky = image - cv2.blur(cv2.medianBlur(image, 5), (15, 15))
-    noise = max(1.4826 * float(np.median(np.abs(sky))), 0.3)
-    peak = (sky == cv2.dilate(sky, np.ones((3, 3)))) & (sky > _STAR_SIGMAS / 2 * noise)
-    rows, columns = np.nonzero(peak)
-    order = np.argsort(-sky[rows, columns])
-    places = np.column_stack([rows, columns])[order]
-    out = []
-    for place in places[: 10 * _MOST_STARS]:
-        row, column = (int(k) for k in place)
-        edge = min(row, column, image.shape[0] - 1 - row, image.shape[1] - 1 - column) <= _STAR_PX
-        near = np.abs(places - place).max(axis=1) <= _APART_PX
-        if edge or near.sum() > 1 or image[row, column] > top or sky[row, column] < _STAR_SIGMAS * noise:
-            continue
-        if good is None or good[row - 1 : row + 2, column - 1 : column + 2].all():
-            out.append((row, column))
-    return out[:_MOST_STARS]
-
-
 def _width_px(part: F32, channel: NDArray[Any]) -> float | None:
     """Return the standard deviation of a star's image, or None if none fits.
 
     Each channel has a flux and a background of its own.
     """
-    axis = np.arange(len(part)) - _STAR_PX
+    axis = np.arange(len(part)) - STAR_PX
     kinds = [channel == k for k in np.unique(channel)]
 
     def columns(x: F64) -> NDArray[Any]:

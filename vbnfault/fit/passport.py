@@ -50,6 +50,8 @@ STATISTICS: dict[str, tuple[str, str, str]] = {
     "noise_lit": ("noise of the smoothest lit ground", "of bright", "noise of features"),
     "column": ("pattern of columns", "of bright", "detection of lost lines"),
     "tracks": ("spots and streaks of 2 px or more", "a frame", "false stars and tracks"),
+    "ee50": ("radius of half the light of stars", "px", "point spread and centroids of stars"),
+    "ee80": ("radius of 80 % of the light of stars", "px", "point spread and centroids of stars"),
     "spikes": ("spikes on lit ground", "in 10,000 px", "false features"),
     "floor": ("fraction of the outline in the dark", "1", "shadows"),
     "stretch": ("median brightness of lit ground", "of bright", "photometry and exposure"),

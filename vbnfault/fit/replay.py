@@ -191,7 +191,8 @@ class Replay:
         pixel_m = (
             float(np.linalg.norm(pose.camera_position_T_m)) * 2 * np.tan(np.radians(self.scene.camera.fov_deg) / 2)
         )
-        figures = compare(real, rendered, sun_xy, self._plate_m / (pixel_m / frame.shape[1]))
+        plate_px = self._plate_m / (pixel_m / frame.shape[1])
+        figures = compare(real, rendered, sun_xy, plate_px, self.display.stretch)
         return Pair(name=trajectory.name[row], real=real, rendered=rendered, figures=figures, settings=settings)
 
     def _raw(self, row: int, trajectory: Trajectory, settings: dict[str, Any]) -> NDArray[Any]:

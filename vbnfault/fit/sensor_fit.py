@@ -22,6 +22,7 @@ from scipy import optimize, stats
 
 from ..core.errors import InputError
 from ..core.files import resources, toml_files
+from ..detector.measured import smooth_surface
 from ..detector.sensor import Sensor, parse_sensor
 from .exposures import (
     F32,
@@ -42,7 +43,6 @@ from .exposures import (
     noise_before_rounding,
     ordinary_pixels,
     planes_of,
-    smooth_surface,
     smoothed_pixels,
     variance_estimate,
 )
@@ -212,7 +212,9 @@ def _begin(exposures: Sequence[Exposure], sensor: str | None, stretch: float | N
     else:
         path = resources.find("scenes/detectors", sensor)
         base, source = toml_files.read_toml(path, "detector"), str(path)
-    made = parse_sensor(base, source=source)
+    made = replace(parse_sensor(base, source=source), defects=None, measured=None)
+    if base.pop("defects", None):  # of one device; the fit is of the type
+        base["sources"] = {key: text for key, text in base["sources"].items() if not key.startswith("defects.")}
     if stretch is None:
         if most > made.readout.top_dn:
             raise InputError(

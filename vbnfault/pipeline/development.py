@@ -168,7 +168,7 @@ class Development:
         key = (*self._image_key(draws, noisy), _keys(draws, readout))
         if key not in self._images:
             before = self._before_readout(draws, noisy, keep_signals)
-            self._images[key] = self._read_out(before, draws) if readout else before
+            self._images[key] = self.read_out(before, draws) if readout else before
         return self._images[key]
 
     def _image_key(self, draws: Draws, noisy: bool) -> tuple[Any, ...]:
@@ -184,12 +184,12 @@ class Development:
             signal = self.signal(draws, acting_at(draws, "electrons"), keep=keep_signals).merged
             noise = self.noise if noisy else None
             if noisy and camera.detector.mosaic is not None:
-                raw = camera.mosaic.raw(signal, camera.exposure_s, noise, self._acts(draws))
+                raw = camera.mosaic.raw(signal, camera.exposure_s, noise, self.acts(draws))
                 self._raws[key] = raw  # a fifth of the memory of the image, and needed by `raw`
                 self._images[key] = camera.mosaic.rgbi(raw, camera.exposure_s)
             else:
                 self._images[key] = camera.detector.develop(
-                    signal, camera.exposure_s, noise, self._acts(draws), self._clean(draws, noisy)
+                    signal, camera.exposure_s, noise, self.acts(draws), self._clean(draws, noisy)
                 )
         return self._images[key]
 
@@ -214,14 +214,14 @@ class Development:
         camera, noise = self.exposure.camera, self.noise if noisy else None
         return camera.detector.develop(self._part(draws, name), camera.exposure_s, noise, base=whole)
 
-    def _read_out(self, image: RGBI, draws: Draws) -> RGBI:
+    def read_out(self, image: RGBI, draws: Draws) -> RGBI:
         """Return the image with the drawn faults that act on the finished image."""
         for name in acting_at(draws, "rgbi"):
             draw = draws[name]
             image = draw.fault.apply(image, draw.params, self.context_of(draw.fault, draws))
         return image
 
-    def _acts(self, draws: Draws) -> dict[str, list[Callable[[Any], Any]]]:
+    def acts(self, draws: Draws) -> dict[str, list[Callable[[Any], Any]]]:
         """Return the changes that the drawn faults make inside a detector with a mosaic, by its steps."""
         return {
             step: [
@@ -278,7 +278,7 @@ class Development:
             return masks.effect(with_it, lacking, least_dn)
         before = self._lacking(draws, name, noisy=False)
         with_it = self.image(draws, noisy=False).array
-        return masks.effect(with_it, self._read_out(before, others).array, least_dn)
+        return masks.effect(with_it, self.read_out(before, others).array, least_dn)
 
     def effect_on(self, rows: slice, draws: Draws, name: str, least_dn: float) -> Mask:
         """Return `effect` of a local fault on some rows, bool[row, x], before the faults that act on the image."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..faults import FaultContext
 from .development import Development, Draws, acting_at, informs
-from .spec import Draw, Injection, Pose, Rendering, SampleSpec, SceneExposure, stored_layers
+from .spec import Draw, Drawing, Injection, Pose, Rendering, SampleSpec, SceneExposure, stored_layers
 
 _DRAW_TRIES = 8
 # A fault that changes the light by less than a count moves the noise-free image across a few roundings. The image
@@ -47,19 +47,30 @@ def inject_faults(
     if redrawn and asking_for_another_view(spec, in_vain):
         return Injection(draws={}, development=development, in_vain=in_vain)
     commanded = [name for name in commanded if name not in in_vain]
+    stored = "mask_effect" in stored_layers(spec.scene, spec.faults)
+    draws = visible_draws(spec, development, commanded, views, stored=stored)
+    return Injection(draws=draws, development=development, in_vain=in_vain)
+
+
+def visible_draws(
+    spec: Drawing, development: Development, commanded: Sequence[str], views: int = 1, *, stored: bool = False
+) -> dict[str, Draw]:
+    """Return draws of the faults that each change the image; a fault that none of a few draws shows is left out.
+
+    `stored` says that all effects will be needed. `views` is as for `inject_faults`.
+    """
     # every view uses new draws: a draw that is invisible in one view is not tried again in the next
     attempt = (views - 1) * _DRAW_TRIES
     last = attempt + _DRAW_TRIES - 1
     development.image({})  # pixels of the other images are taken from the clean one
     draws = draw_faults(spec, development, commanded, {}, attempt)
     _prepare_signals(development, draws)
-    stored = "mask_effect" in stored_layers(spec.scene, spec.faults)
     while invisible := _invisible(development, draws, stored=stored):
         draws = {name: draw for name, draw in draws.items() if name not in invisible}
         attempt += 1
         if attempt <= last:
             draws = draw_faults(spec, development, commanded, draws, attempt)
-    return Injection(draws=draws, development=development, in_vain=in_vain)
+    return draws
 
 
 def asking_for_another_view(spec: SampleSpec, unseen: Sequence[str]) -> list[str]:
@@ -104,7 +115,7 @@ def fault_context(pose: Pose, rendering: Rendering, exposure: SceneExposure) -> 
 
 
 def draw_faults(
-    spec: SampleSpec, development: Development, commanded: Sequence[str], draws: Draws, attempt: int
+    spec: Drawing, development: Development, commanded: Sequence[str], draws: Draws, attempt: int
 ) -> dict[str, Draw]:
     """Return the draws, and a new one for each commanded fault without a draw; those that inform others first."""
     complete = dict(draws)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,18 +16,29 @@ from .spec import Injection, Labels, SampleSpec, mask_any_faults, stored_layers
 
 def label(spec: SampleSpec, injection: Injection) -> Labels:
     """Compute the masks of every class by footprint or by effect, and the effects and strengths that are stored."""
+    return labels_of(
+        spec.faults,
+        injection,
+        mask_any_faults(spec.scene, spec.faults),
+        stored_layers(spec.scene, spec.faults),
+    )
+
+
+def labels_of(
+    faults: Mapping[str, Fault], injection: Injection, members: Sequence[str], layers: Sequence[str]
+) -> Labels:
+    """Return the labels of an image: `members` are the classes united in mask_any, `layers` the optional layers."""
     draws, development = injection.draws, injection.development
-    layers = stored_layers(spec.scene, spec.faults)
     changed = {
         name: development.effect(draws, name, draw.fault.effect_level_dn)
         for name, draw in draws.items()
         if draw.fault.effect_mask or masks.spreads(draw.fault, development.context)
     }
-    together = [name for name in mask_any_faults(spec.scene, spec.faults) if name in draws]
+    together = [name for name in members if name in draws]
     params = {name: draw.params for name, draw in draws.items()}
-    soft = {fault.soft_layer: fault for fault in spec.faults.values() if fault.soft_layer}
-    its_masks = masks.mask_layers(spec.faults, params, development.context, changed)
-    mask_any = masks.union(its_masks, spec.faults, together)
+    soft = {fault.soft_layer: fault for fault in faults.values() if fault.soft_layer}
+    its_masks = masks.mask_layers(faults, params, development.context, changed)
+    mask_any = masks.union(its_masks, faults, together)
     if together:
         mask_any |= development.joint_effect(draws, together)
     return Labels(

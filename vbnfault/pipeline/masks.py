@@ -2,8 +2,9 @@
 
 The mask of a class is its *footprint*. Classes that label by *effect* (straylight) are the exception. Their mask is
 the pixels of the noise-free image that change by at least `Fault.effect_level_dn` DN (1 by default) when the fault
-is switched off. So where a broken line or saturation overwrites a flare, the mask of the flare is empty. In a CCD,
-charge may leave the footprint of a fault; then the mask is the union of footprint and effect.
+is switched off. So where a broken line or saturation overwrites a flare, the mask of the flare is empty. In a CCD
+charge may leave the footprint of a fault, and effects such as compression spread what happens to a pixel; then the
+mask is the union of footprint and effect.
 """
 
 from __future__ import annotations
@@ -16,12 +17,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..camera import Camera
 from ..faults import Fault, FaultContext, Params
 
 Mask = NDArray[np.bool_]
 
-# Steps of a mosaic detector after which charge may still leave the pixels on which a fault acts.
+# Steps of a mosaic detector after which charge may still leave the pixels on which a fault acts, and those after
+# which effects of a sensor may spread what it does.
 _MOVES = {"light", "pixels", "charge"}
+_SPREADS = {*_MOVES, "offsets"}
 
 
 def effect(image: NDArray[np.uint8], without: NDArray[np.uint8], least_dn: float = 1.0) -> Mask:
@@ -33,19 +37,24 @@ def effect(image: NDArray[np.uint8], without: NDArray[np.uint8], least_dn: float
     return np.asarray(a != b)
 
 
-def kind(fault: Fault, *, is_ccd: bool) -> str:
+def kind(fault: Fault, camera: Camera) -> str:
     """Return what the mask of a fault is: "footprint", "effect", "footprint and effect" or "strong effect".
 
     A strong effect is one whose threshold is above 1 DN.
     """
     if fault.effect_mask:
         return "effect" if fault.effect_level_dn <= 1 else "strong effect"
-    return "footprint and effect" if is_ccd and _moves(fault) else "footprint"
+    return "footprint and effect" if _leaves(fault, camera) else "footprint"
 
 
-def _moves(fault: Fault) -> bool:
-    """Return whether a fault acts at a step after which charge may still move."""
-    return not _MOVES.isdisjoint(fault.steps)
+def _leaves(fault: Fault, camera: Camera) -> bool:
+    """Return whether a fault acts at a step after which its signal may still leave the pixels."""
+    if _SPREADS.isdisjoint(fault.steps):
+        return False
+    mosaic = camera.detector.mosaic
+    if mosaic is not None and any(effect.spreads for effect in mosaic.sensor.effects):
+        return True
+    return camera.is_ccd and not _MOVES.isdisjoint(fault.steps)
 
 
 def footprint_rule(fault: Fault) -> str:
@@ -92,11 +101,11 @@ def no_masks(shape: tuple[int, ...]) -> Mask:
 
 
 def spreads(fault: Fault, context: FaultContext) -> bool:
-    """Return whether a fault's charge may leave its footprint.
+    """Return whether a fault's signal may leave its footprint.
 
-    In a CCD, charge overflows along columns and traps make trails.
+    In a CCD, charge overflows along columns and traps make trails; some sensors have effects that spread it.
     """
-    return _moves(fault) and kind(fault, is_ccd=context.camera.is_ccd) == "footprint and effect"
+    return not fault.effect_mask and _leaves(fault, context.camera)
 
 
 def union(masks: Mask, faults: Iterable[str], members: Iterable[str]) -> Mask:

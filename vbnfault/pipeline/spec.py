@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,6 +71,17 @@ class Pose:
     def sees_sun(self) -> bool:
         """Return whether the whole Sun is visible before the camera."""
         return self.sun_visible_fraction == 1.0 and float(self.L_from_C[:, 2] @ self.sun_L) > 0
+
+
+class Drawing(Protocol):
+    """Hold the faults of a sample and its keyed random numbers."""
+
+    @property
+    def faults(self) -> Mapping[str, Fault]:
+        """Return the faults by class, in dataset order."""
+
+    def rng(self, stage: str, name: str) -> np.random.Generator:
+        """Return the random generator of the sample for (stage, name)."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -22,7 +22,7 @@ from ..core.tables import Table
 from ..reflectance import is_packaged
 from .bodies import with_named_body
 from .coma import ComaTable
-from .instrument import OF_A_SENSOR_FILE, CameraTable, RenderTable
+from .instrument import OF_A_SENSOR_FILE, CameraTable, ImageTable, RenderTable
 from .sampling import DEFAULT_TWINS, OF_AN_AIM, DatasetTable, GeometryTable, PlanTable, StratumTable
 from .surroundings import OrbitTable, SkyTable, SpacecraftTable, SpiceTable, SunTable
 from .target import EARTH, BodyTable, PatchTable
@@ -70,6 +70,7 @@ class Scene(Table):
     spacecraft: SpacecraftTable = SpacecraftTable()
     sky: SkyTable = SkyTable()
     camera: CameraTable = CameraTable()
+    image: ImageTable | None = Field(None, description="images of one's own, for vbnfault inject")
     render: RenderTable = RenderTable()
     geometry: GeometryTable = GeometryTable()
     plan: PlanTable = PlanTable()

@@ -354,3 +354,32 @@ class RenderTable(Table):
             if n & (n - 1) or (n.bit_length() - 1) % 2:
                 raise ValueError(f"{key} = {n}: must be 1, 4, 16, 64, 256, 1024 or 4096")
         return self
+
+
+ResponseCurve = Literal["linear", "srgb", "gamma", "table"]
+
+
+class ImageTable(Table):
+    """Describe images of one's own, into which `vbnfault inject` puts faults."""
+
+    black_dn: float | None = Field(None, description="number without light; default: 0, of a raw mosaic the bias")
+    white_dn: float | None = Field(
+        None,
+        description="number at white; default: the largest of the data type, 1 of floats, of a raw mosaic that "
+        "of the detector",
+    )
+    response: ResponseCurve = Field(
+        "linear",
+        description="how the numbers rise with the light: linear, srgb, gamma (to the power 1 / gamma), or table",
+    )
+    gamma: float = Field(2.2, ge=0.2, le=10, description="exponent of response = 'gamma'")
+    response_file: str = Field(
+        "",
+        description="CSV of two rising columns, light and number, for response = 'table', from the file's folder",
+    )
+    sun: Literal["none", "auto"] | tuple[float, float] | tuple[float, float, float] = Field(
+        "none",
+        description="position of the Sun: 'auto' finds it as the saturated disc, two numbers are x and y in "
+        "pixels, also beyond the frame, three a direction in the camera's axes",
+    )
+    raw: bool = Field(False, description="whether grey images are the raw mosaic of camera.detector")

@@ -214,8 +214,11 @@ class RegolithTable(Table):
     largest_crater_m: float = Field(
         300.0,
         ge=1,
-        le=1e5,
+        le=1e6,
         description="larger ones belong to the shape; a shape file holds those of two of its edges or more",
+    )
+    simple_crater_m: float = Field(
+        1e9, ge=1, le=1e9, description="larger craters are complex: shallower, with level floors and central peaks"
     )
     equilibrium: float = Field(
         0.05, ge=0.001, le=0.2, description="most craters, over those of geometric saturation (Gault 1970)"
@@ -272,6 +275,9 @@ class PatchTable(Table):
         ge=0,
         le=1,
         description="part of the variance of relief over 20 m that is of planes which meet in edges; 0: none",
+    )
+    airfall: float = Field(
+        0.0, ge=0, le=2, description="how much more dust covers low and level ground than high and steep ground"
     )
     craters_per_km2: float = Field(60.0, ge=0, le=1e5, description="of 10 m or more; 600 at most without regolith")
     boulders: bool = Field(True, description="whether boulders lie on the ground")

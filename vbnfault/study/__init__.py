@@ -10,24 +10,11 @@ Each public name, listed in `__init__.pyi`, loads its module when it is first us
 """
 
 import sys
-from types import ModuleType
-from typing import Any
 
 import lazy_loader
 
+from ..core.callable_package import CallablePackage
+
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
-
-class _Callable(ModuleType):
-    """Run a study when the module is called.
-
-    The attribute `study` of `vbnfault` cannot be the function: the import of any module of this package sets it to
-    the package.
-    """
-
-    def __call__(self, *arguments: Any, **keywords: Any) -> Any:
-        """Run a study; see `vbnfault.study.study`."""
-        return self.study(*arguments, **keywords)
-
-
-sys.modules[__name__].__class__ = _Callable
+sys.modules[__name__].__class__ = CallablePackage

@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from ..detector import load_sensor
 from ..detector.chain import Device, MosaicNoise
-from ..detector.effects import Effect, Exposure, is_packaged, order, registry
+from ..detector.effects import Effect, Exposure, acts_always, order, registry
 from .examples import naming, pickled
 
 _MAX_DRAWS = 100
@@ -202,7 +202,7 @@ def _draw_exposure(effect: Effect, example: int, rng: np.random.Generator) -> _R
     """Return a random exposure of a small device that has the effect; every fourth one is without noise."""
     name, architecture = _SENSORS[example % len(_SENSORS)]
     changes: dict[str, Any] = {"architecture": architecture}
-    if not is_packaged(type(effect)):
+    if not acts_always(type(effect)):
         changes["effects"] = (effect,)
     sensor = replace(load_sensor(name), **changes)
     device = Device(sensor, example, shape=_SHAPE, direction=("up", "down")[rng.integers(2)])
@@ -275,6 +275,6 @@ def _check_apply(effect: Effect, exposure: _Recorded, rng: np.random.Generator) 
     darker = exposure.again()
     effect.apply(np.zeros_like(signal), darker)
     assert again.states == darker.states, "apply draws a number of variates that depends on the signal"
-    if not is_packaged(type(effect)):
+    if not acts_always(type(effect)):
         light = rng.uniform(0, 2 * exposure.sensor.readout.full_well_e, _SHAPE).astype(np.float32)
         exposure.device.raw(light, exposure.exposure_s, exposure.noise)

@@ -87,6 +87,11 @@ def _detector_of(scene: Scene, sensor: Sensor, individual: int, direction: str) 
     # a mosaic detector is read along its columns only
     towards = direction if direction in ("up", "down") else "up"
     seed = int(rng(scene.dataset.seed, individual, "detector", "device").integers(2**31))
+    if sensor.measured is not None and scene.camera.individuals > 1:
+        raise InputError(
+            f"camera.individuals = {scene.camera.individuals}: must be 1, since the sensor file's defects are of "
+            "one device"
+        )
     with under_key("camera.detector"):
         made = MosaicDetector(
             sensor=sensor,

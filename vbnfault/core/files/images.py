@@ -62,6 +62,71 @@ def decoded_image(data: bytes, most_values: int) -> tuple[F32, F32 | None]:
     return values[..., :colours], values[..., -1] if values.shape[2] > colours else None
 
 
+def png_numbers(data: bytes, most_values: int) -> NDArray[Any]:
+    """Return the numbers of a PNG file, uint8 or uint16 [y, x, channel], its alpha last.
+
+    Raises InputError if it is damaged, too large, has a palette or fewer than 8 bits.
+    """
+    if len(data) >= 26:
+        columns, rows = struct.unpack(">II", data[16:24])
+        check_values(rows, columns, _PNG_CHANNELS.get(data[25:26], 1), most_values)
+        if data[25:26] == b"\3" or data[24] < 8:
+            raise InputError("is a PNG file with a palette or packed bits; save it as grey or RGB of 8 or 16 bits")
+    chunks = _chunks(data)
+    image = cv2.imdecode(np.frombuffer(chunks, np.uint8), cv2.IMREAD_UNCHANGED) if chunks else None
+    if image is None:
+        raise InputError("is a damaged PNG file")
+    return np.ascontiguousarray(np.atleast_3d(_swapped(image)))
+
+
+def with_png_numbers(data: bytes, numbers: NDArray[Any], text: str) -> bytes:
+    """Return a PNG file with other numbers [y, x, channel], the chunks of the former one, and a text chunk."""
+    done, encoded_data = cv2.imencode(".png", np.ascontiguousarray(_swapped(numbers)))
+    if not done:
+        raise VbnfaultError("the image cannot be encoded as PNG")
+    body = encoded_data.tobytes()
+    head = body.index(b"IDAT") - 4
+    kept, start = [], len(_PNG)
+    while start + 12 <= len(data):
+        length, kind = struct.unpack_from(">I4s", data, start)
+        if kind not in (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND"):
+            kept.append(data[start : start + 12 + length])
+        start += 12 + length
+    words = b"vbnfault\0" + text.encode("latin-1", "replace")
+    note = struct.pack(">I4s", len(words), b"tEXt") + words + struct.pack(">I", zlib.crc32(b"tEXt" + words))
+    return body[:head] + b"".join(kept) + note + body[head:]
+
+
+def read_exr(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    """Return the header of an OpenEXR file, and its channels by name, [y, x] each.
+
+    Raises InputError, whose message goes on from the file's name, if it is damaged or has channels of unlike size.
+    """
+    import OpenEXR
+
+    try:
+        part = OpenEXR.File(str(path), separate_channels=True).parts[0]
+        channels = {name: np.asarray(channel.pixels) for name, channel in part.channels.items()}
+    except Exception:  # a damaged file fails anywhere in OpenEXR
+        raise InputError("is a damaged OpenEXR file") from None
+    if not channels or len({array.shape for array in channels.values()}) > 1:
+        raise InputError("is an OpenEXR file without channels, or with channels of unlike size")
+    return dict(part.header), channels
+
+
+def write_exr_like(path: Path, header: Mapping[str, Any], channels: Mapping[str, NDArray[Any]]) -> None:
+    """Write channels to an OpenEXR file with the attributes of another one. Raises as `write_exr`."""
+    import OpenEXR
+
+    kept = {key: value for key, value in header.items() if key not in ("channels", "chunkCount", "dataWindow")}
+    with replacing(real(path)) as temporary:
+        temporary.write_bytes(b"")
+        try:
+            OpenEXR.File(kept, {name: np.array(array) for name, array in channels.items()}).write(str(temporary))
+        except RuntimeError as error:
+            raise VbnfaultError(f"{path}: cannot be written: {error}") from None
+
+
 def _chunks(png: bytes) -> bytes:
     """Return a PNG file with only the chunks that its pixels need; b"" if it is damaged.
 

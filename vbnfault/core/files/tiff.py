@@ -62,6 +62,65 @@ def tiff_pixels(data: bytes, most_values: int) -> tuple[F32, F32 | None]:
         raise InputError("is a damaged TIFF file") from None
 
 
+def tiff_numbers(data: bytes, most_values: int) -> NDArray[Any]:
+    """Return the numbers of a TIFF file as stored, [y, x, sample] of 8 to 64 bits.
+
+    Raises InputError as `tiff_pixels`, and for a palette.
+    """
+    import tifffile
+
+    try:
+        with _without_log_lines(), tifffile.TiffFile(io.BytesIO(data)) as file:
+            page = _only_page(file)
+            check_values(page.imagelength, page.imagewidth, page.samplesperpixel, most_values)
+            _check_kind(page)
+            if page.photometric in (_WHITE_IS_0, _PALETTE) or page.bitspersample < 8:
+                raise InputError(
+                    "is a TIFF file with a palette, inverted grey or packed bits; save it as plain grey or RGB"
+                )
+            return _samples(page, data, most_values)
+    except InputError:
+        raise
+    except Exception:
+        raise InputError("is a damaged TIFF file") from None
+
+
+def with_numbers(data: bytes, numbers: NDArray[Any], text: str) -> bytes:
+    """Return a TIFF file with other numbers, [y, x, sample] in the data type of the former ones.
+
+    The new blocks are appended without compression, and the tags that say where they lie are overwritten, so that
+    all other tags stay as they are. `text` becomes the tag 270, ImageDescription, if the file has none.
+    """
+    import tifffile
+
+    stream = io.BytesIO(data)
+    with _without_log_lines(), tifffile.TiffFile(stream, mode="r+") as file:
+        page = _only_page(file)
+        height, width, every = page.imagelength, page.imagewidth, page.samplesperpixel
+        together = every if page.planarconfig == 1 else 1
+        tall, wide = (page.tilelength, page.tilewidth) if page.is_tiled else (min(page.rowsperstrip, height), width)
+        order, offsets, counts = file.byteorder, [], []
+        kind = numbers.dtype.newbyteorder(order)
+        stream.seek(0, io.SEEK_END)
+        for plane in range(every // together):
+            for top in range(0, height, tall):
+                for left in range(0, width, wide):
+                    rows = tall if page.is_tiled else min(tall, height - top)
+                    block = np.zeros((rows, wide, together), kind)
+                    part = numbers[top : top + rows, left : left + wide, plane * together : (plane + 1) * together]
+                    block[: part.shape[0], : part.shape[1]] = part
+                    stream.seek(stream.tell() % 2, io.SEEK_CUR)  # blocks start at even offsets
+                    offsets.append(stream.tell())
+                    counts.append(stream.write(block.tobytes()))
+        where, sizes = (324, 325) if page.is_tiled else (273, 279)
+        for tag, value in ((where, tuple(offsets)), (sizes, tuple(counts)), (259, 1), (317, 1)):
+            if tag in page.tags:
+                page.tags[tag].overwrite(value[0] if isinstance(value, tuple) and len(value) == 1 else value)
+        if 270 in page.tags and not str(page.tags[270].value).strip():
+            page.tags[270].overwrite(text)
+    return stream.getvalue()
+
+
 def check_values(rows: int, columns: int, channels: int, most_values: int) -> None:
     """Raise InputError for an image without pixels, or with too many of them to decode."""
     if not 0 < rows * columns * channels <= most_values:

@@ -2,7 +2,7 @@
 
 An effect is a frozen class. Its class attribute `name` gives its name, and the definition of the class registers
 it. `after` names the effect or the step behind which it acts. Its fields are the keys of the table `[effects.NAME]`
-of a sensor file, and an effect outside vbnfault acts where the sensor has this table:
+of a sensor file. An effect acts where the sensor has this table; one of vbnfault without keys acts in every sensor:
 
     class Persistence(Effect):
         \"\"\"Add a fraction of the light of a bright exposure before this one.\"\"\"
@@ -21,14 +21,16 @@ and including "analogue", which returns it in DN, float32[y, x]. "converter" rec
 uint16[y, x], which all later effects receive and return. An effect with `after = "full_well"` acts on the charge
 that the wells hold, and what it adds is not clipped.
 
-    response, light, smear, dark_current, telegraph, pixels, shot_noise, charge, blooming, deep_traps,
-    parallel_cti, serial_cti, full_well, analogue, converter, stuck_pixels, raw
+    response, light, crosstalk, smear, dark_current, telegraph, pixels, shot_noise, charge, blooming, deep_traps,
+    parallel_cti, serial_cti, full_well, interpixel_capacitance, nonlinearity, analogue, converter, stuck_pixels,
+    companding, compression, raw
 
 "light", "pixels", "charge" and "raw" are the steps at which faults act; "offsets" belongs to "analogue".
 """
 
 from __future__ import annotations
 
+import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -131,10 +133,13 @@ class Effect(Table):
         Name of the effect, and of its table in a sensor file.
     after
         Name of the effect or the step directly behind which it acts.
+    spreads
+        True if what happens to a pixel reaches others, so that faults may change pixels beyond their footprint.
     """
 
     name: ClassVar[str]
     after: ClassVar[str]
+    spreads: ClassVar[bool] = False
 
     @classmethod
     def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
@@ -160,6 +165,9 @@ class Effect(Table):
             raise DeclarationError([], text)
         _REGISTRY.add(cls.name, cls, module=cls.__module__, qualname=cls.__qualname__)
 
+    def check(self, sensor: Sensor) -> None:
+        """Raise ValueError with one sentence if the effect does not fit the sensor."""
+
     @abstractmethod
     def apply(self, signal: Any, exposure: Exposure) -> Any:
         """Return the signal [y, x] with this effect; the input may be changed in place only if it is returned."""
@@ -182,8 +190,13 @@ def registry() -> dict[str, type[Effect]]:
 
 
 def is_packaged(cls: type[Effect]) -> bool:
-    """Return whether an effect belongs to vbnfault, so that it acts in every sensor."""
+    """Return whether an effect belongs to vbnfault."""
     return _REGISTRY.is_packaged(cls)
+
+
+def acts_always(cls: type[Effect]) -> bool:
+    """Return whether an effect acts in every sensor, and not only where the sensor file has its table."""
+    return is_packaged(cls) and not cls.model_fields
 
 
 def order() -> tuple[str, ...]:
@@ -207,7 +220,7 @@ def chain_of(effects: Sequence[Effect]) -> tuple[Effect, ...]:
     return tuple(
         own[name] if name in own else classes[name]()
         for name in order()
-        if name in own or is_packaged(classes[name])
+        if name in own or acts_always(classes[name])
     )
 
 
@@ -230,17 +243,19 @@ def parse(tables: Any) -> tuple[Effect, ...]:
 
 def _parse_effect(name: str, table: Any) -> Effect:
     """Return the effect of one table."""
-    known = {key: cls for key, cls in registry().items() if not is_packaged(cls)}
+    known = {key: cls for key, cls in registry().items() if not acts_always(cls)}
     cls = known.get(name)
     if cls is None:
-        hint = did_you_mean(name, list(known)) if known else "; none is known"
         reason = (
-            f"no such effect{hint}; name the plug-in that defines it in the scene's key plugins, or by --plugin"
+            f"no such effect{did_you_mean(name, list(known))}; name the plug-in that defines another one in the "
+            "scene's key plugins, or by --plugin"
         )
         error = PydanticCustomError("value_error", "{reason}", {"reason": reason})
         raise ValidationError.from_exception_data("effects", [{"type": error, "loc": (name,), "input": {}}])
     try:
-        return cls.model_validate(table, strict=not isinstance(table, Effect))
+        if isinstance(table, Effect):
+            return cls.model_validate(table)
+        return cls.model_validate_json(json.dumps(table), strict=True)  # in which arrays may stand for tuples
     except ValidationError as error:
         details: list[Any] = [
             {**detail, "loc": (name, *detail["loc"]), "type": _reason(detail)}
@@ -269,7 +284,7 @@ class _EffectTables:
 
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
         properties = {
-            name: handler(cls.__pydantic_core_schema__) for name, cls in registry().items() if not is_packaged(cls)
+            name: handler(cls.__pydantic_core_schema__) for name, cls in registry().items() if not acts_always(cls)
         }
         return {"type": "object", "properties": properties, "additionalProperties": False}
 

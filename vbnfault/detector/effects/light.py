@@ -34,7 +34,7 @@ class Smear(Effect):
     """Add light that falls on charge while it moves through a CCD, or waits in the store of a global shutter."""
 
     name = "smear"
-    after = "light"
+    after = "crosstalk"
 
     def apply(self, signal: F32, exposure: Exposure) -> F32:
         """Return the electrons with the added light."""

@@ -1,17 +1,21 @@
-"""Define what happens at the output: full well, analogue chain, converter and pixels that are stuck."""
+"""Define what happens at the output: full well, response by a table, analogue chain, converter, stuck pixels."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, field_validator
 
 from ..individual import StuckPixels
 from ..readout import ReadoutIndividual, analogue_dn, clip_full_well, convert
 from .contract import F32, Effect, Exposure, FaultStep
 
 Raw = NDArray[np.uint16]
+_Electrons = Annotated[float, Field(gt=0, le=1e9)]
 
 
 class FullWell(Effect):
@@ -25,11 +29,47 @@ class FullWell(Effect):
         return clip_full_well(signal, exposure.sensor.readout.full_well_e)
 
 
+class Nonlinearity(Effect):
+    """Bend the response of the sense node and the amplifier by a table, as a linearity test measures it.
+
+    Pairs as in EMVA 1288 (release 4.0, section 6.7): what light makes, and what it reads as. Straight lines join
+    them, the first from (0, 0), and the last goes on. The image is not corrected for it, but a full well is white.
+    """
+
+    name = "nonlinearity"
+    after = "interpixel_capacitance"
+
+    table: tuple[tuple[_Electrons, _Electrons], ...] = Field(
+        min_length=2,
+        max_length=65536,
+        description="pairs of the electrons in a well and of the electrons that they read as, both rising",
+    )
+
+    @field_validator("table")
+    @classmethod
+    def _rising(cls, table: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
+        for k, (before, after) in enumerate(pairwise(table), 1):
+            if not (after[0] > before[0] and after[1] > before[1]):
+                raise ValueError(f"pair {k}, {list(after)}, must be above the pair before, {list(before)}")
+        return table
+
+    def apply(self, signal: F32, exposure: Exposure) -> F32:
+        """Return the electrons as which the charge reads."""
+        return self.read(signal)
+
+    def read(self, electrons: F32) -> F32:
+        """Return the electrons as which a charge reads, float32 in the shape of `electrons`."""
+        given, read = np.array([(0.0, 0.0), *self.table]).T
+        slope = (read[-1] - read[-2]) / (given[-1] - given[-2])
+        beyond = np.maximum(electrons - given[-1], 0) * slope
+        return np.asarray(np.interp(electrons, given, read) + beyond, dtype=np.float32)
+
+
 class Analogue(Effect):
     """Bring charge to the level at the converter: offsets, patterns, bias, noise, gain and non-linearity."""
 
     name = "analogue"
-    after = "full_well"
+    after = "nonlinearity"
 
     def apply(self, signal: F32, exposure: Exposure) -> F32:
         """Return the level in DN, neither rounded nor clipped to the converter's range."""
@@ -64,7 +104,7 @@ class RawStep(FaultStep):
     """Let faults act on the raw DN."""
 
     name = "raw"
-    after = "stuck_pixels"
+    after = "compression"
 
 
 def _with_offsets(exposure: Exposure) -> ReadoutIndividual:

@@ -1,0 +1,559 @@
+"""Faults in images that exist already: the bits of a data set's own images, noise, files, batches, bad input."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+from astropy.io import fits
+from typer.testing import CliRunner
+
+import vbnfault
+from vbnfault.camera import Camera
+from vbnfault.cli import app
+from vbnfault.core.errors import InputError, VbnfaultError
+from vbnfault.core.files import resources
+from vbnfault.core.files.images import write_exr, write_png
+from vbnfault.core.registry import forget
+from vbnfault.detector.three_colour import ThreeColourDetector
+from vbnfault.faults import registry
+from vbnfault.inject.batch import inject_files
+from vbnfault.inject.files import read_image
+from vbnfault.inject.injector import Injector
+from vbnfault.inject.response import Response
+from vbnfault.pipeline import Session
+from vbnfault.pipeline.development import take_images
+from vbnfault.pipeline.injection import inject_faults
+from vbnfault.pipeline.labels import label
+from vbnfault.pipeline.spec import Frame
+from vbnfault.scene.config import Scene, configure_faults, load_scene
+
+SMALL = {
+    "camera.width_px": 96,
+    "camera.height_px": 64,
+    "dataset.samples": 4,
+    "dataset.sites": 1,
+    "dataset.mask_any": None,
+    "patch.facet_m": 12.0,
+    "patch.radius_m": 60.0,
+    "patch.min_boulder_m": 6.0,
+    "patch.max_triangles": 60_000,
+    "plan.on_invisible": "drop",
+}
+CAMERA = {"fov_deg": 20.0, "full_well_e": 13500.0, "read_noise_e_rms": 13.0, "exposure_s": 0.01}
+
+
+def small(name: str) -> Scene:
+    return load_scene(name, {key: value for key, value in SMALL.items() if value is not None})
+
+
+# --- the bits of a data set ---------------------------------------------------------------------------------------
+
+
+@cache
+def sun_facing(name: str) -> Frame:
+    """Return a frame of a packaged scene, with the Sun in it where a fault of the scene needs that."""
+    session = Session(small(name))
+    suns = session.plan.stratum == 1
+    return session.frame(int(np.argmax(suns)))
+
+
+MODELS = [f"{fault}/{model}" for fault, models in registry().items() for model in models]
+
+
+def fits_camera(name: str, camera: Camera) -> bool:
+    """Return whether a model of a fault can act in a camera."""
+    fault, _, model = name.partition("/")
+    cls = registry()[fault][model]
+    return not (
+        (cls.needs_mosaic and camera.detector.mosaic is None)
+        or (cls.thin_lens_only and camera.lens.real is not None)
+        or (cls.needs_ccd and not camera.is_ccd)
+    )
+
+
+def only(scene: Scene, name: str) -> Scene:
+    """Return a scene with one model of a fault, and its defaults."""
+    fault, _, model = name.partition("/")
+    texture = {"texture_file": str(resources.data_dir("textures") / "flare_01.png")}
+    table = {"model": model, **(texture if fault == "pixel_overwriting" else {})}
+    return scene.model_copy(update={"faults": {fault: table}})
+
+
+@pytest.mark.parametrize("base", ["quickstart", "navcam67p", "physical67p"])
+@pytest.mark.parametrize("name", MODELS)
+def test_own_electrons_give_the_data_sets_own_image(name: str, base: str) -> None:
+    fault, frame = name.partition("/")[0], sun_facing(base)
+    if not fits_camera(name, frame.camera):
+        pytest.skip("the model has no meaning with this camera")
+    scene = only(frame.spec.scene, name)
+    spec = replace(frame.spec, scene=scene, faults=configure_faults(scene, "scene"))
+    stages = inject_faults(spec, frame.pose, frame.rendering, frame.exposure, commanded=[fault])
+    images, labels = take_images(spec, stages), label(spec, stages)
+    context = stages.development.context
+    known = {key: value for key, value in vars(context).items() if key not in ("camera", "of_view", "_memo")}
+    result = Injector(scene)(stages.development.signal({}, []), spec.index, camera=frame.camera, context=known)
+    np.testing.assert_array_equal(result.image, images.image.array)
+    np.testing.assert_array_equal(result.clean, images.clean.array)
+    np.testing.assert_array_equal(result.masks, labels.masks)
+    assert result.injected.tolist() == [fault in stages.draws]
+
+
+def test_every_model_was_seen_in_some_image() -> None:
+    """The test above would also pass if nothing was ever drawn."""
+    seen = set()
+    for base in ("quickstart", "navcam67p", "physical67p"):
+        frame = sun_facing(base)
+        image = frame.images.clean.array[..., 0].astype(np.uint16) * 257  # charge that lags behind is little
+        for name in MODELS:
+            if name in seen or not fits_camera(name, frame.camera):
+                continue
+            result = Injector(only(frame.spec.scene, name))(np.maximum(image, 40 * 257), sun=(60.0, 20.0))
+            if result.injected.any():
+                seen.add(name)
+                assert (result.image != result.clean).any()
+    assert seen == set(MODELS)
+
+
+# --- noise --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Half(vbnfault.Fault):
+    fault = "test_half"
+    model = "half"
+    default = True
+    after = "dust_on_optics"
+    step = "electrons"
+
+    def apply(self, quantity: Any, params: Any, context: Any) -> Any:
+        return quantity.with_array(quantity.array * np.float32(0.5))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Veil(vbnfault.Fault):
+    fault = "test_veil"
+    model = "veil"
+    default = True
+    after = "dust_on_optics"
+    step = "electrons"
+
+    def apply(self, quantity: Any, params: Any, context: Any) -> Any:
+        return quantity.with_array(quantity.array + np.float32(2000))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Blur(vbnfault.Fault):
+    fault = "test_blur"
+    model = "box"
+    default = True
+    after = "dust_on_optics"
+    step = "electrons"
+
+    def apply(self, quantity: Any, params: Any, context: Any) -> Any:
+        import cv2
+
+        return quantity.with_array(cv2.blur(quantity.array, (5, 5)))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _forgotten() -> Iterator[None]:
+    """Take the models of this module out of the registry again."""
+    yield
+    forget(__name__)
+
+
+@pytest.mark.parametrize(
+    ("name", "mean", "variance"),
+    [
+        # of 10,000 electrons and a readout of 13: half of the light has 5,000 and 5,000 + 169, where scaling alone
+        # has 2,542 and scaling with the shot noise of the result 7,542
+        ("test_half", 5000.0, 5169.0),
+        ("test_veil", 12000.0, 12169.0),
+        ("test_blur", 10000.0, 10169.0),
+    ],
+)
+def test_noise_is_that_of_the_light_that_remains(name: str, mean: float, variance: float) -> None:
+    """The variance of n = 65,536 pixels is χ² with a standard deviation of √(2/n) = 0.6 %; the bound is four such.
+
+    A blur of 5 px leaves a 25th of the variance, whose measurement over 15 px errs by some per cent of that.
+    """
+    rng = np.random.default_rng(0)
+    detector = ThreeColourDetector(full_well_e=13500.0, read_noise_e_rms=13.0)
+    electrons = rng.poisson(10000, (256, 256)) + rng.normal(0, 13, (256, 256))
+    white = detector.white_e[1]  # green has the largest signal at white: the full well
+    numbers = np.rint(electrons / white * 65535).astype(np.uint16)
+    colours = np.stack([numbers] * 3, axis=-1)
+    for given in (colours, numbers):
+        result = vbnfault.inject(given, {name: {}}, camera=CAMERA, seed=3)
+        after = np.atleast_3d(result.image)[..., 1 if given.ndim == 3 else 0] / 65535 * white
+        if (
+            name == "test_veil" and given.ndim == 2
+        ):  # 2000 electrons of each colour are more of white in two of them
+            mean, variance = after.mean(), after.mean() + 169
+        assert after.mean() == pytest.approx(mean, rel=4 * np.sqrt(variance) / mean / 256)
+        assert after.var() == pytest.approx(variance, rel=4 * np.sqrt(2 / after.size))
+
+
+def test_pixels_that_no_fault_touches_keep_their_numbers() -> None:
+    rng = np.random.default_rng(1)
+    for dtype in (np.uint8, np.uint16, np.float32):
+        top = np.iinfo(dtype).max if np.dtype(dtype).kind == "u" else 1
+        image = (rng.random((96, 128, 3)) * 0.6 * top).astype(dtype)
+        result = vbnfault.inject(
+            image, {"broken_pixels": {"model": "texture"}, "dust_on_optics": {}}, camera=CAMERA, seed=2
+        )
+        assert result.image.dtype == dtype
+        assert result.injected.all()
+        changed = (result.image != image).any(axis=2)
+        assert changed.any()
+        np.testing.assert_array_equal(result.image[~result.mask_any], image[~result.mask_any])
+
+
+def test_the_same_seed_gives_the_same_image_and_another_one_another() -> None:
+    image = np.full((64, 64), 30000, np.uint16)
+    images = [vbnfault.inject(image, {"dust_on_optics": {}}, camera=CAMERA, seed=s).image for s in (4, 4, 5)]
+    np.testing.assert_array_equal(images[0], images[1])
+    assert (images[0] != images[2]).any()
+
+
+def test_a_raw_mosaic_changes_where_the_defects_are() -> None:
+    for name in resources.packaged("scenes/detectors"):
+        raw = np.full((64, 64), 900, np.uint16)
+        table = {"model": "hot_pixels"}
+        result = vbnfault.inject(
+            raw, {"broken_pixels": table}, camera={"detector": name, "exposure_s": 0.5}, seed=1, raw=True
+        )
+        assert result.image.dtype == np.uint16
+        assert set(np.unique(result.image[~result.masks[0]])) == {900}
+
+
+# --- response and Sun ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("curve", ["linear", "srgb", "gamma", "table"])
+def test_responses_invert_each_other(curve: Any) -> None:
+    table = np.array([[0.0, 0.0], [0.1, 0.4], [1.0, 1.0]])
+    response = Response(black_dn=10, white_dn=250, curve=curve, gamma=2.2, table=table)
+    light = np.linspace(0, 1, 101)
+    np.testing.assert_allclose(response.light(response.numbers(light)), light, atol=1e-12)
+    assert response.numbers(0.0) == 10
+    assert response.numbers(1.0) == pytest.approx(250)
+
+
+def test_srgb_is_that_of_colour_science() -> None:
+    import colour
+
+    light = np.linspace(0, 1, 101)
+    expected = colour.models.eotf_inverse_sRGB(light)
+    np.testing.assert_allclose(Response(black_dn=0, white_dn=1, curve="srgb").numbers(light), expected, atol=1e-7)
+
+
+def test_the_sun_is_found_as_the_saturated_disc() -> None:
+    y, x = np.mgrid[:200, :200] + 0.5
+    image = np.where(np.hypot(x - 120.3, y - 61.7) < 6, 255, 20).astype(np.uint8)
+    image[150, 20:90] = 255  # a bright line is no disc
+    result = vbnfault.inject(image, {"straylight": {}}, camera=CAMERA, sun="auto", seed=1)
+    assert result.sun_xy_px == pytest.approx([120.3, 61.7], abs=0.2)
+    assert result.injected.all()
+    assert result.unrecoverable[61, 120]
+    by_pixel = vbnfault.inject(image, {"straylight": {}}, camera=CAMERA, sun=tuple(result.sun_xy_px), seed=1)
+    assert np.abs(by_pixel.image.astype(int) - result.image).max() <= 1
+
+
+def test_faults_that_an_image_cannot_have_are_left_out_with_a_reason() -> None:
+    image = np.full((64, 64), 90, np.uint8)
+    result = vbnfault.inject(image, {"straylight": {}, "dust_on_optics": {}}, camera=CAMERA)
+    assert result.injected.tolist() == [True, False]
+    assert result.left_out == {"straylight": "needs the Sun before the camera; give it by image.sun or --sun"}
+
+
+def test_what_was_assumed_is_said() -> None:
+    result = vbnfault.inject(np.full((64, 64), 90, np.uint8), {"dust_on_optics": {}})
+    assert {text.partition(" ")[0] for text in result.assumptions} == {
+        "camera.exposure_s",
+        "camera.fov_deg",
+        "camera.detector",
+        "image.black_dn",
+        "image.white_dn",
+        "image.response",
+    }
+
+
+# --- files --------------------------------------------------------------------------------------------------------
+
+GREY = np.random.default_rng(5).integers(0, 60000, (70, 90), np.uint16)
+COLOURS = np.random.default_rng(6).integers(0, 250, (70, 90, 3), np.uint8)
+
+
+def _fits_file(path: Path, array: np.ndarray, **cards: Any) -> None:
+    part = fits.PrimaryHDU(array)
+    for key, value in cards.items():
+        part.header[key] = value
+    part.writeto(path, overwrite=True)
+
+
+def _image_files(folder: Path) -> dict[str, Path]:
+    """Write an image of every kind, and return the files by name."""
+    folder.mkdir(parents=True, exist_ok=True)
+    tag = [(65000, "s", 0, "own tag", True)]
+    tifffile.imwrite(folder / "strips.tif", GREY, description="mine", resolution=(72, 72), extratags=tag)
+    tifffile.imwrite(folder / "tiles.tif", GREY, tile=(32, 32), compression="zlib", predictor=True, extratags=tag)
+    tifffile.imwrite(folder / "big.tif", COLOURS, bigtiff=True, photometric="rgb", byteorder=">", extratags=tag)
+    planes = np.moveaxis(COLOURS, -1, 0)
+    tifffile.imwrite(folder / "planes.tif", planes, photometric="rgb", planarconfig="separate", extratags=tag)
+    write_png(folder / "alpha.png", np.dstack([COLOURS, COLOURS[..., :1]]))
+    write_png(folder / "grey.png", GREY)
+    _fits_file(folder / "unsigned.fits", GREY, OBSERVER="me")
+    _fits_file(folder / "blank.fits", (GREY // 2).astype(np.int16), BLANK=int(GREY[3, 3] // 2), OBSERVER="me")
+    _fits_file(folder / "floats.fits", GREY.astype(np.float32), OBSERVER="me")
+    np.save(folder / "array.npy", GREY)
+    write_exr(
+        folder / "rgb.exr",
+        {c: np.ascontiguousarray(COLOURS[..., k] / np.float32(255)) for k, c in enumerate("RGB")}
+        | {"Z": np.ones((70, 90), np.float32)},
+    )
+    return {path.name: path for path in sorted(folder.iterdir())}
+
+
+def test_files_keep_their_kind_and_what_is_written_is_read_back(tmp_path: Path) -> None:
+    for name, path in _image_files(tmp_path / "in").items():
+        image = read_image(path)
+        numbers = image.numbers.copy()
+        numbers[10:20, 10:20] = (numbers[10:20, 10:20] / 2).astype(numbers.dtype)
+        out = tmp_path / name
+        image.write(out, numbers, "faults")
+        np.testing.assert_array_equal(read_image(out).numbers, numbers, err_msg=name)
+
+
+def test_other_programs_read_the_files_with_their_metadata(tmp_path: Path) -> None:
+    files = _image_files(tmp_path / "in")
+    for name in ("strips.tif", "tiles.tif", "big.tif", "planes.tif"):
+        image = read_image(files[name])
+        image.write(tmp_path / name, image.numbers, "faults")
+        with tifffile.TiffFile(tmp_path / name) as before, tifffile.TiffFile(files[name]) as after:
+            np.testing.assert_array_equal(before.asarray(), after.asarray())
+            tags = [{t.code: t.value for t in f.pages[0].tags} for f in (before, after)]
+        where = {259, 273, 279, 317, 324, 325}  # compression and the places of the blocks
+        assert {k: v for k, v in tags[0].items() if k not in where} == {
+            k: v for k, v in tags[1].items() if k not in where
+        }
+    for name in ("unsigned.fits", "blank.fits", "floats.fits"):
+        image = read_image(files[name])
+        numbers = image.numbers.copy()
+        numbers[0, 0] = numbers[0, 0] + 1
+        image.write(tmp_path / name, numbers, "faults by vbnfault: dust")
+        before, after = fits.getdata(files[name]), fits.getdata(tmp_path / name)
+        assert after.dtype == before.dtype
+        assert after[0, 0] == before[0, 0] + 1
+        np.testing.assert_array_equal(after.ravel()[1:], before.ravel()[1:])
+        header = fits.getheader(tmp_path / name)
+        assert header["OBSERVER"] == "me"
+        assert "dust" in str(header["HISTORY"])
+    data = files["grey.png"].read_bytes()
+    profile = b"\x00\x00\x00\x04gAMA\x00\x00\xb1\x8f\x0b\xfca\x05"
+    at = data.index(b"IDAT") - 4
+    files["grey.png"].write_bytes(data[:at] + profile + data[at:])
+    image = read_image(files["grey.png"])
+    image.write(tmp_path / "grey.png", image.numbers, "faults")
+    assert profile in (tmp_path / "grey.png").read_bytes()
+    assert b"vbnfault\0faults" in (tmp_path / "grey.png").read_bytes()
+
+
+# --- batches ------------------------------------------------------------------------------------------------------
+
+BATCH = {
+    "plan.faulty_fraction": 1.0,
+    "camera.exposure_s": 0.01,
+    **{k: v for k, v in SMALL.items() if v is not None},
+}
+
+
+def _pictures(folder: Path, count: int) -> Path:
+    folder.mkdir()
+    rng = np.random.default_rng(9)
+    for k in range(count):
+        write_png(folder / f"{k:02d}.png", (rng.random((64, 96)) * 120 + 40).astype(np.uint8))
+    return folder
+
+
+def _contents(folder: Path) -> dict[str, bytes]:
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and "dataset.zarr" not in path.parts
+    }
+
+
+def test_a_batch_has_the_same_bytes_with_any_number_of_workers_and_after_a_kill(tmp_path: Path) -> None:
+    pictures, scene = _pictures(tmp_path / "in", 6), load_scene("quickstart", BATCH)
+    inject_files([pictures], scene, tmp_path / "one", progress=False)
+    expected = _contents(tmp_path / "one")
+    assert sum(name.endswith(".json") for name in expected) == 6
+    inject_files([pictures], scene, tmp_path / "two", workers=2, progress=False)
+    assert _contents(tmp_path / "two") == expected
+    code = (
+        "import sys; from pathlib import Path; from vbnfault.inject.batch import inject_files;"
+        "from vbnfault.scene.config import load_scene; import json;"
+        "inject_files([Path(sys.argv[1])], load_scene('quickstart', json.loads(sys.argv[3])), Path(sys.argv[2]),"
+        "progress=False)"
+    )
+    killed = tmp_path / "killed"
+    process = subprocess.Popen([sys.executable, "-c", code, str(pictures), str(killed), json.dumps(BATCH)])
+    while process.poll() is None and len(list(killed.glob("labels/*.json"))) < 2:
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    inject_files([pictures], scene, killed, progress=False)
+    assert _contents(killed) == expected
+
+
+def test_a_store_of_images_is_verified_exported_and_read_as_any_other(tmp_path: Path) -> None:
+    pictures, scene = _pictures(tmp_path / "in", 6), load_scene("quickstart", BATCH)
+    batch = inject_files([pictures], scene, tmp_path / "out", labels="zarr", sun=(60.0, 20.0), progress=False)
+    path = tmp_path / "out" / "dataset.zarr"
+    report = vbnfault.verify(path)
+    assert not report.problems
+    data = vbnfault.open_dataset(path)
+    assert data["name"].values.tolist() == list(batch.names)
+    for k, name in enumerate(batch.names):
+        np.testing.assert_array_equal(data["image"][k, :, :, 3], read_image(tmp_path / "out" / name).numbers)
+        label = json.loads((tmp_path / "out" / "labels" / f"{name}.json").read_text())
+        injected = data["fault"].values[data["injected"][k].values].tolist()
+        assert sorted(label["injected"]) == sorted(injected)
+    assert data["injected"].values.any(axis=0).all()
+    assert np.isnan(data["camera_position_T_m"].values).all()
+    vbnfault.export(path, tmp_path / "exported", "png")
+    assert list((tmp_path / "exported").rglob("*.png"))
+    inject_files([pictures], scene, tmp_path / "out", labels="zarr", sun=(60.0, 20.0), progress=False)
+    assert vbnfault.verify(path).digest == report.digest
+
+
+def test_a_batch_goes_on_past_a_damaged_image_and_names_it(tmp_path: Path) -> None:
+    pictures = _pictures(tmp_path / "in", 3)
+    (pictures / "01.png").write_bytes((pictures / "01.png").read_bytes()[:200])
+    with pytest.raises(VbnfaultError, match=r"image 1 of 3 failed, the first with: .*01\.png: is a damaged PNG"):
+        inject_files([pictures], load_scene("quickstart", BATCH), tmp_path / "out", progress=False)
+    assert [path.name for path in sorted((tmp_path / "out").glob("*.png"))] == ["00.png", "02.png"]
+
+
+def test_the_command_says_what_it_assumed_and_where_the_images_are(tmp_path: Path) -> None:
+    pictures = _pictures(tmp_path / "in", 2)
+    arguments = ["inject", str(pictures / "*.png"), "--scene", "quickstart", "--out", str(tmp_path / "out")]
+    arguments += [v for key, value in BATCH.items() for v in ("--set", f"{key}={json.dumps(value)}")]
+    result = CliRunner().invoke(app, [*arguments, "--sun", "60,20", "--seed", "3"])
+    assert result.exit_code == 0, result.output
+    assert "assumed: image.white_dn = 255" in result.output
+    assert f"2 images: {tmp_path / 'out'}" in result.output
+    assert json.loads((tmp_path / "out/labels/00.png.json").read_text())["seed"] == 3
+
+
+# --- a training loop ----------------------------------------------------------------------------------------------
+
+
+def test_batches_of_a_training_loop_have_the_draws_of_their_numbers() -> None:
+    torch = pytest.importorskip("torch", reason="PyTorch is an extra")
+    from vbnfault.torch import Inject
+
+    faults = {"dust_on_optics": {}, "broken_pixels": {"model": "texture"}, "vignetting": {}}
+    transform = Inject(faults, camera=CAMERA, probability=0.6, seed=4)
+    batch = torch.randint(20, 200, (5, 3, 48, 64), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+    images, masks = transform(batch, range(5))
+    assert images.shape == batch.shape
+    assert images.dtype == batch.dtype
+    assert masks.shape == (5, 3, 48, 64)
+    again, _ = pickle.loads(pickle.dumps(transform))(batch[3:], [3, 4])
+    assert torch.equal(again, images[3:])
+    floats, same = transform(batch.float() / 255, range(5))
+    assert floats.dtype == torch.float32
+    assert torch.equal(same, masks)
+    # the numbers of 8 bits are rounded, and rounding of floats moves a count of noise by an electron or two
+    assert (floats * 255 - images.float()).abs().max() <= 0.5 + 2 * 255 / CAMERA["full_well_e"]
+    with pytest.raises(InputError, match="must be uint8 or float32"):
+        transform(batch[0], [0])
+    with pytest.raises(InputError, match="probability = 2: must be from 0 to 1"):
+        Inject(faults, probability=2)
+
+
+# --- bad input ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("image", "sentence"),
+    [
+        (np.zeros((1, 1), np.uint8), "1 x 1 pixels: must have at least 16 x 16"),
+        (np.zeros((0, 0), np.uint8), r"image of shape \[0, 0\]"),
+        (np.zeros((64, 64, 5), np.uint8), "with 1, 3 or 4 channels"),
+        (np.zeros((64, 64), complex), "image of complex128"),
+        (np.full((64, 64), np.nan), "4096 values that are NaN or infinite"),
+    ],
+)
+def test_unusable_arrays(image: np.ndarray, sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence):
+        vbnfault.inject(image, {"dust_on_optics": {}}, camera=CAMERA)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "sentence"),
+    [
+        ("a.png", b"", "is a damaged PNG"),
+        ("a.tif", b"II*\0", "is a damaged TIFF"),
+        ("a.fits", b"SIMPLE", "is a damaged FITS|without an image"),
+        ("a.exr", b"v/1\x01", "is a damaged OpenEXR"),
+        ("a.npy", b"\x93NUMPY", "is no array of numpy"),
+        ("a.bmp", b"BM", "must end with one of"),
+    ],
+)
+def test_unusable_files(tmp_path: Path, name: str, content: bytes, sentence: str) -> None:
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(InputError, match=rf"{name}: .*({sentence})"):
+        read_image(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("keys", "sentence"),
+    [
+        ({"white_dn": 5.0, "black_dn": 10.0}, "image.white_dn = 5: must be above image.black_dn = 10"),
+        ({"response": "table", "response_file": "missing.csv"}, "missing.csv"),
+        ({"sun": "auto"}, "no round region of saturated pixels"),
+        ({"sun": (float("nan"), 1.0)}, "image.sun"),
+    ],
+)
+def test_unusable_descriptions_of_an_image(keys: dict[str, Any], sentence: str) -> None:
+    with pytest.raises((InputError, ValueError), match=sentence):
+        vbnfault.inject(np.full((64, 64), 90, np.uint8), {"dust_on_optics": {}}, camera=CAMERA, image_keys=keys)
+
+
+def test_a_response_that_falls_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "curve.csv").write_text("0,0\n0.5,0.7\n1,0.6\n")
+    keys = {"response": "table", "response_file": str(tmp_path / "curve.csv")}
+    with pytest.raises(InputError, match="both columns must rise"):
+        vbnfault.inject(np.full((64, 64), 90, np.uint8), {"dust_on_optics": {}}, camera=CAMERA, image_keys=keys)
+
+
+def test_unusable_batches(tmp_path: Path) -> None:
+    pictures, scene = _pictures(tmp_path / "in", 2), load_scene("quickstart", BATCH)
+    (tmp_path / "empty").mkdir()
+    for images, out, labels, sentence in (
+        ([tmp_path / "empty"], "out", "png", "holds no image"),
+        ([str(tmp_path / "none*.png")], "out", "png", "matches no file"),
+        ([pictures, pictures / "00.png"], "out", "png", "is named twice"),
+        ([pictures], "in", "png", "holds the images, which would be replaced"),
+    ):
+        with pytest.raises(InputError, match=sentence):
+            inject_files(images, scene, tmp_path / out, labels=labels, progress=False)
+    write_png(pictures / "large.png", np.zeros((80, 96), np.uint8))
+    with pytest.raises(InputError, match="a store holds images of one size, and these have 96 x 64, 96 x 80"):
+        inject_files([pictures], scene, tmp_path / "out", labels="zarr", progress=False)

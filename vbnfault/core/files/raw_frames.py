@@ -1,0 +1,94 @@
+"""Read a frame of raw numbers, as a camera's converter gave them, from a PNG, TIFF or FITS file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError, in_file
+from . import user_files
+from .images import decoded_image
+from .tiff import check_values
+
+_FITS = (".fits", ".fit", ".fts")
+FRAME_TYPES = (".png", ".tif", ".tiff", *_FITS)
+_MOST_VALUES = 400_000_000
+_FITS_BLOCK, _FITS_CARD = 2880, 80
+_FITS_TYPES = {8: "u1", 16: ">i2", 32: ">i4", -32: ">f4", -64: ">f8"}
+
+
+def read_frame(path: Path) -> tuple[NDArray[Any], dict[str, float]]:
+    """Return the raw numbers of a file, [y, x] in DN: uint8, uint16 or, where they are not whole, float32.
+
+    The second result holds `exposure_s` and `temperature_K` where a FITS header says them (EXPTIME, CCD-TEMP).
+    Raises InputError for a damaged file, colours, several axes, and numbers that are not finite.
+    """
+    data = user_files.read_input(path, "data", types=FRAME_TYPES)
+    with in_file(str(path)):
+        if path.suffix.lower() in _FITS:
+            image, header = _fits(data)
+        else:
+            image, header = _numbers(decoded_image(data, _MOST_VALUES)[0]), {}
+        if not np.isfinite(image).all():
+            y, x = np.argwhere(~np.isfinite(image))[0]
+            raise InputError(f"holds {image[y, x]} at x = {x}, y = {y}; must hold finite numbers")
+    return image, header
+
+
+def _numbers(values: NDArray[np.float32]) -> NDArray[Any]:
+    """Return the raw numbers of an image of one channel whose white is 1, uint8 or uint16[y, x].
+
+    Floating-point images stay as they are. Raises InputError for an image with colours.
+    """
+    if values.shape[2] > 1 and (values != values[..., :1]).any():
+        raise InputError("has colours; must hold the raw numbers of a mosaic, or grey ones")
+    grey = values[..., 0]
+    if not (grey.min() >= 0 and grey.max() <= 1):  # DN as they are: floating-point numbers, such as means of frames
+        return grey
+    for top, kind in ((255, np.uint8), (65535, np.uint16)):
+        whole = np.rint(grey * np.float32(top))
+        # sixteen bits lie off the steps of eight bits by 1/257 at least
+        if np.abs(grey * np.float32(top) - whole).max() < (1e-3 if top == 255 else 0.05):
+            return whole.astype(kind)
+    return grey
+
+
+def _fits(data: bytes) -> tuple[NDArray[Any], dict[str, float]]:
+    """Return the numbers of the first image of a FITS file (FITS standard 4.0), and exposure and temperature.
+
+    Raises InputError for what is no plain image of two axes.
+    """
+    cards: dict[str, str] = {}
+    end = 0
+    while "END" not in cards:
+        block = data[end : end + _FITS_BLOCK]
+        end += _FITS_BLOCK
+        if len(block) < _FITS_BLOCK or not data.startswith(b"SIMPLE  ="):
+            raise InputError("is no FITS file with an image in its first part")
+        for start in range(0, _FITS_BLOCK, _FITS_CARD):
+            key, _, value = block[start : start + _FITS_CARD].decode("latin-1").partition("=")
+            cards.setdefault(key[:8].strip(), value.partition("/")[0].strip())
+    try:
+        kind, axes = _FITS_TYPES.get(int(cards["BITPIX"])), int(cards["NAXIS"])
+        columns, rows = (int(cards[f"NAXIS{k}"]) for k in (1, 2))
+        scale, zero = float(cards.get("BSCALE", 1)), float(cards.get("BZERO", 0))
+        known = {
+            name: float(cards[key]) + more
+            for key, name, more in (("EXPTIME", "exposure_s", 0.0), ("CCD-TEMP", "temperature_K", 273.15))
+            if key in cards
+        }
+    except (KeyError, ValueError):
+        raise InputError("is no FITS file with an image in its first part") from None
+    if axes != 2 or kind is None:
+        raise InputError(f"has an image of {axes} axes; must have two, as raw frames have")
+    check_values(rows, columns, 1, _MOST_VALUES)
+    if len(data) < end + rows * columns * np.dtype(kind).itemsize:
+        raise InputError("is a damaged FITS file: it ends within its image")
+    image = np.frombuffer(data, kind, rows * columns, end).reshape(rows, columns) * scale + zero
+    whole = np.rint(image)
+    if (image == whole).all() and whole.min() >= 0 and whole.max() <= 65535:
+        return whole.astype(np.uint16), known
+    return image.astype(np.float32), known

@@ -1,0 +1,57 @@
+"""Simulate a frame buffer that was not renewed: rows of the image show an earlier exposure.
+
+Where a driver, a link or a memory controller misses a frame, the old one is sent again, whole or in part (a torn
+frame). Between the two exposures the camera has turned, so the stale rows show the same scene displaced. They have
+noise of their own, and the same dust, defects and straylight. What lies beyond the edges is mirrored. The pose of
+the sample is that of the new exposure, which a frame that is stale as a whole contradicts. Rows that are repeated
+one by one are those of the fault `transmission` with `fill = "previous"`.
+
+A still has no exposure before, so nothing changes but the displacement. A sequence would hand over the real one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from .context import FaultContext, Params
+from .contract import Fault
+from .fields import Interval, Severity, bounds
+from .planes import displaced, draw_shift
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrozenFrame(Fault):
+    """Show an earlier exposure, displaced, in some or all rows."""
+
+    fault = "frozen_frame"
+    model = "displaced"
+    default = True
+    after = ""
+    step = "electrons"
+    severity = Severity(key="shift_px", low=1.0, high=500.0)
+    needs_light = True
+    per_exposure = True
+    localised = False
+    effect_mask = True
+
+    rows_fraction: Interval = bounds(0.1, 1.0, limits=(0, 1), doc="part of the rows that are stale; assumed")
+    shift_px: Interval = bounds(
+        3.0, 30.0, limits=(0, 1024), unit="px", doc="displacement between the two exposures; assumed"
+    )
+
+    def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
+        """Return the first stale row, the row behind the last one, and the displacement in x and y."""
+        height = context.shape[0]
+        rows = round(self.rows_fraction.uniform(rng) * height)
+        # the new frame overwrites the old one from the top, or is overwritten by it: both ends of the image occur
+        first = (height - rows) * int(rng.integers(2))
+        return {"rows": [first, first + rows], "shift_px": draw_shift(self.shift_px, context, rng)}
+
+    def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
+        """Return the light of both exposures."""
+        stale, out = slice(*params["rows"]), quantity.array.copy()
+        out[stale] = displaced(quantity.array, *params["shift_px"])[stale]
+        return quantity.with_array(out)

@@ -1,0 +1,17 @@
+"""Put faults into images that exist already: of a user's own camera, of another renderer, of an archive.
+
+    result = vbnfault.inject(image, {"dust_on_optics": {"model": "defocused"}}, camera={"fov_deg": 5.0})
+
+The package itself can be called, as its function `inject`. Its modules: `response` converts numbers to light,
+`picture` holds an image as electrons, `change` lets the faults act, `injector` does all of it, image after image,
+`files` reads and writes files, and `batch` works through many.
+"""
+
+import sys
+
+from ..core.callable_package import CallablePackage
+from .injector import Injected, Injector, inject
+
+__all__ = ["Injected", "Injector", "inject"]
+
+sys.modules[__name__].__class__ = CallablePackage

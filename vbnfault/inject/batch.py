@@ -1,0 +1,370 @@
+"""Inject faults into the images of files, with several processes, and continue after an interruption.
+
+Each image keeps its name and its kind of file. Beside it lie its masks and a JSON file with the parameters, which
+is written last: an image with a whole JSON file of the same scene and input is finished. With labels in a store,
+the images are also the samples of a dataset, whose image has 8 bits as in any other.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import glob
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import store
+from ..core.errors import InputError
+from ..core.files import user_files
+from ..core.files.images import write_png
+from ..core.files.whole_files import own, write_json, writing
+from ..core.quantities import Sample
+from ..dataset import build
+from ..dataset.from_scene import with_card
+from ..dataset.identity import IMAGES, is_exact, planned, store_spec
+from ..dataset.progress import Progress
+from ..dataset.work import Job, Tick, attempt
+from ..pipeline import Session
+from ..pipeline.record import proposal
+from ..scene import plan
+from ..scene.config import Scene
+from ..store.schema import SCALARS
+from .files import ENDINGS, ImageFile, read_image
+from .injector import Injected, Injector
+from .picture import levels
+
+Labels = Literal["png", "zarr"]
+
+STORE = "dataset.zarr"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Batch:
+    """Describe images and what is injected into them; equal batches give equal files.
+
+    Attributes
+    ----------
+    scene
+        Scene whose `dataset.samples` is the number of images.
+    root, names
+        Folder that holds all images, and their paths below it, in order.
+    out
+        Folder of the results.
+    sun
+        In place of `image.sun` of the scene; None: as there.
+    """
+
+    scene: Scene
+    root: Path
+    names: tuple[str, ...]
+    out: Path
+    sun: str | tuple[float, ...] | None = None
+
+    @cached_property
+    def injector(self) -> Injector:
+        """Return what injects the faults."""
+        return Injector(self.scene)
+
+    @cached_property
+    def plan(self) -> plan.Plan:
+        """Return which image is commanded to carry which faults."""
+        faults = self.injector.faults
+        need_sun = [name for name, fault in faults.items() if fault.needs_sun]
+        return plan.make_plan(self.scene, list(faults), (len(self.names),), need_sun=need_sun)
+
+    def key(self, index: int) -> str:
+        """Return a digest of the input of an image: its file, its number, the scene and the Sun."""
+        digest = hashlib.sha256((self.root / self.names[index]).read_bytes())
+        scene = self.scene.model_dump(mode="json")
+        digest.update(json.dumps([index, self.sun, len(self.names), scene], sort_keys=True).encode())
+        return digest.hexdigest()
+
+    @property
+    def assumptions(self) -> list[str]:
+        """Return what was assumed of the camera, each sentence once, from the files of the images."""
+        said: dict[str, None] = {}
+        for index in range(len(self.names)):
+            if self.label_file(index).is_file():
+                said |= dict.fromkeys(json.loads(self.label_file(index).read_text(encoding="utf-8"))["assumptions"])
+        return list(said)
+
+    def label_file(self, index: int) -> Path:
+        """Return the path of the JSON file of an image."""
+        return self.out / "labels" / f"{self.names[index]}.json"
+
+    def is_finished(self, index: int) -> bool:
+        """Return whether all files of an image are there, made from the same input."""
+        try:
+            label = json.loads(self.label_file(index).read_text(encoding="utf-8"))
+            return bool(label["input"] == self.key(index)) and all((self.out / f).is_file() for f in label["files"])
+        except (OSError, ValueError, KeyError, TypeError):
+            return False
+
+    def injected(self, index: int) -> tuple[ImageFile, Injected]:
+        """Return an image and its result. Raises InputError, with the name of the file, if it cannot be used."""
+        path = self.root / self.names[index]
+        image = read_image(path)
+        try:
+            return image, self.injector(
+                image.numbers,
+                index,
+                sun=self.sun,
+                commanded=self.plan.commanded(index),
+                depth_m=image.depth_m,
+                raw=bool(self.scene.image and self.scene.image.raw),
+            )
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from None
+
+    def write(self, index: int, image: ImageFile, result: Injected) -> None:
+        """Write the files of an image; the JSON file comes last."""
+        name = self.names[index]
+        names = [fault for fault, has in zip(result.faults, result.injected, strict=True) if has]
+        files = [name]
+        with writing(self.out, within=True):
+            target = own(self.out / name)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            image.write(target, result.image, "faults by vbnfault: " + (", ".join(names) or "none"))
+            masks = {fault: result.masks[result.faults.index(fault)] for fault in names}
+            for fault, mask in {**masks, "any": result.mask_any}.items():
+                files.append(f"masks/{name}_{fault}.png")
+                path = own(self.out / files[-1])
+                path.parent.mkdir(parents=True, exist_ok=True)
+                write_png(path, mask.astype(np.uint8) * 255)
+            label = self.label_file(index)
+            label.parent.mkdir(parents=True, exist_ok=True)
+            content = {
+                "image": name,
+                "number": index,
+                "seed": self.scene.dataset.seed,
+                "input": self.key(index),
+                "injected": names,
+                "left_out": result.left_out,
+                "parameters": result.parameters,
+                "unrecoverable_fraction": float(result.unrecoverable.mean()),
+                "assumptions": list(result.assumptions),
+                "files": files,
+            }
+            write_json(own(label), content)
+
+
+# --- files alone --------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Workers:
+    """Make a worker of a batch; the object is a function that can be pickled."""
+
+    batch: Batch
+
+    def __call__(self) -> _Worker:
+        return _Worker(self.batch)
+
+
+class _Worker:
+    """Inject into images, one a task."""
+
+    def __init__(self, batch: Batch) -> None:
+        self._batch = batch
+
+    def do(self, task: int, tick: Tick) -> None:
+        """Do a task."""
+        if self._batch.is_finished(task):
+            tick(task, "kept", "")
+            return
+
+        def make(index: int) -> bool:
+            self._batch.write(index, *self._batch.injected(index))
+            return True
+
+        if attempt(task, make, tick):
+            tick(task, "built", "")
+
+
+class _Images(Job):
+    """Hand out the images of a batch; a damaged one is reported, and the others are made."""
+
+    noun, task_noun, item_noun = "batch", "image", "image"
+    most_failures = None
+
+    def items(self, number: int) -> Sequence[int]:
+        """Return the image of a task."""
+        return (number,)
+
+    def task(self, number: int, skip: frozenset[int] = frozenset(), *, careful: bool = False) -> int:
+        """Return the number of an image."""
+        return number
+
+
+# --- a store beside them ------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Factory:
+    """Make the samples of a batch in a worker; the object is a function that can be pickled."""
+
+    batch: Batch
+
+    def __call__(self) -> _Samples:
+        return _Samples(self.batch)
+
+
+class _Samples:
+    """Make samples of images, and write their files."""
+
+    def __init__(self, batch: Batch) -> None:
+        self._batch = batch
+
+    def simulate(self, index: int) -> Sample:
+        """Return the sample of an image."""
+        image, result = self._batch.injected(index)
+        self._batch.write(index, image, result)
+        return _sample(self._batch, index, image, result)
+
+
+def _sample(batch: Batch, index: int, image: ImageFile, result: Injected) -> Sample:
+    """Return an image with its labels as a sample of a store; what an image does not say is NaN."""
+    table, camera = batch.plan, result.camera
+    response = result.response
+    assert response is not None
+    layers: dict[str, NDArray[Any]] = {
+        "image": levels(result.image, response),
+        "clean": levels(result.clean, response),
+        "mask": result.masks,
+        "mask_any": result.mask_any,
+        "mask_effect": result.mask_effect,
+    }
+    sizes = {"fault": len(result.faults), "xyz": 3, "quaternion": 4, "axis_row": 3, "axis_col": 3, "xy": 2}
+    scalars: dict[str, Any] = {
+        name: np.full([sizes[d] for d in row.dims[1:]], row.fill, row.dtype)[()]
+        for name, row in SCALARS.items()
+        if row.dtype != "str" and set(row.dims[1:]) <= set(sizes)
+    }
+    sun = result.sun_xy_px
+    scalars |= {
+        "injected": result.injected,
+        "intrinsics": camera.intrinsics,
+        "distortion": camera.lens.distortion,
+        "exposure_s": camera.exposure_s,
+        "sun_distance_au": batch.scene.sun.distance_au or np.nan,
+        "sun_xy_px": np.full(2, np.nan) if sun is None else sun,
+        "tries": 1,
+        "views": 1,
+        "resolved": True,
+        "stratum": int(table.stratum[index]),
+        "site": int(table.site[index]),
+        "detector_individual": int(table.individual[index]),
+        "split": plan.SPLITS[table.split[index]],
+        "parameters": result.parameters,
+        "proposal": proposal(batch.scene, table, index, table.view(batch.scene, index, 0)),
+    }
+    return Sample(index=index, layers=layers, scalars=scalars)
+
+
+# --- the whole batch ----------------------------------------------------------------------------------------------
+
+
+def inject_files(
+    images: Sequence[str | Path],
+    scene: Scene,
+    out: Path,
+    *,
+    labels: Labels = "png",
+    sun: str | tuple[float, ...] | None = None,
+    workers: int = 1,
+    progress: bool = True,
+) -> Batch:
+    """Inject the faults of a scene into the images of files, folders and globs, and write them to a folder.
+
+    Raises
+    ------
+    InputError
+        There is no image, or scene and options do not fit.
+    VbnfaultError
+        Some images failed; all others are made, and the same call tries the failed ones again.
+    """
+    root, names = _found(images, out)
+    dataset = scene.dataset.model_copy(update={"samples": len(names)})
+    batch = Batch(scene=scene.model_copy(update={"dataset": dataset}), root=root, names=names, out=out, sun=sun)
+    options = build.BuildOptions(workers=workers, progress=progress)
+    batch.injector  # noqa: B018  an unusable scene is reported before any image
+    if labels == "zarr":
+        _build(batch, options)
+        return batch
+    job = _Images(out, Progress(len(names), shown=progress, noun="images"), dict.fromkeys(range(len(names)), 0))
+    with job.progress:
+        build.do_tasks(_Workers(batch), job, options)
+    job.raise_failures(of=f" of {len(names)}")
+    return batch
+
+
+def _build(batch: Batch, options: build.BuildOptions) -> None:
+    """Make a store of a batch beside its files."""
+    shapes = {read_image(batch.root / name).numbers.shape[:2] for name in batch.names}
+    if len(shapes) > 1:
+        sizes = ", ".join(sorted(f"{w} x {h}" for h, w in shapes))
+        raise InputError(
+            f"--labels zarr: a store holds images of one size, and these have {sizes}; use --labels png"
+        )
+    ((height, width),) = shapes
+    camera = batch.scene.camera.model_copy(update={"width_px": width, "height_px": height})
+    dataset = batch.scene.dataset.model_copy(update={"layers": ("clean", "mask_effect")})
+    scene = batch.scene.model_copy(update={"camera": camera, "dataset": dataset})
+    session = Session(scene)
+    spec = store_spec(session, (len(batch.names),))
+    digests = {name: user_files.sha256((batch.root / name).read_bytes()) for name in batch.names}
+    spec = dataclasses.replace(
+        spec,
+        sample_names=batch.names,
+        attributes={**spec.attributes, IMAGES: {"sha256": digests, "sun": batch.sun}},
+    )
+    made = build.BuildPlan(
+        spec=spec,
+        site=session.plan.site,
+        planned_faults=session.plan.injected,
+        expected=planned(spec.attributes, spec.faults),
+        exact=is_exact(spec.attributes),
+    )
+    batch = dataclasses.replace(batch, scene=scene)
+    out = store.located(batch.out / STORE)
+    batch.out.mkdir(parents=True, exist_ok=True)
+    with_card(out, build.build(_Factory(batch), made, out, options))
+
+
+def _found(images: Sequence[str | Path], out: Path) -> tuple[Path, tuple[str, ...]]:
+    """Return the folder that holds all images, and their paths below it, sorted."""
+    paths: list[Path] = []
+    for given in map(str, images):
+        path = Path(given)
+        if path.is_dir():
+            inside = sorted(p for p in path.rglob("*") if p.suffix.lower() in ENDINGS and p.is_file())
+            if not inside:
+                raise InputError(f"{path}: holds no image; they end with one of {', '.join(ENDINGS)}")
+            paths += inside
+        elif path.exists() or not glob.has_magic(given):
+            paths.append(path)
+        else:
+            matched = sorted(map(Path, glob.glob(given, recursive=True)))
+            if not matched:
+                raise InputError(f"{given}: matches no file")
+            paths += matched
+    paths = [path.absolute() for path in paths]
+    if not paths:
+        raise InputError("there is no image; name files, folders or globs")
+    root = paths[0].parent
+    while not all(path.is_relative_to(root) for path in paths):
+        root = root.parent
+    names = [path.relative_to(root).as_posix() for path in paths]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise InputError(f"{root / twice[0]}: is named twice")
+    if out.absolute() == root:
+        raise InputError(f"--out {out}: holds the images, which would be replaced; choose another folder")
+    return root, tuple(names)

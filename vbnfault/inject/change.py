@@ -1,0 +1,108 @@
+"""Compute the numbers of an image that faults struck, with the noise that their change of the light has.
+
+An image holds noise already: N electrons in a pixel where λ were expected. A fault that lets the fraction t of the
+light through leaves a mean of t λ, and the variance must be t λ plus that of the readout, σ². Scaling the image
+alone leaves t² (λ + σ²). What is missing is t (1 - t) λ + (1 - t²) σ²: the variance of the thinning of N, and of
+the readout. So the noise that is added has, in each pixel, the variance
+
+    S' + σ² - v
+
+where S' are the electrons after the fault and v is the variance that the fault leaves of the image's own noise. It
+is measured: the same draws act on the image with a small perturbation of known variance. Light that a fault adds
+gets its own shot noise in this way, and light that it leaves alone none. A pixel that no fault changes keeps its
+number.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.quantities import RGBI, Electrons
+from ..detector.mosaic import sample
+from ..detector.noise import draw_normals, poisson
+from ..faults import MOSAIC_STEPS
+from ..pipeline.development import Development, Draws, acting_at
+from .picture import Picture, levels
+
+F32 = NDArray[np.float32]
+Rng = Callable[[str, str], np.random.Generator]
+
+# Pixels over which the variance of noise that a fault mixes is averaged, and fraction of them whose perturbation
+# must have changed its sign for that
+_NEARBY_PX, _MIXED = 15, 0.01
+
+
+def struck(
+    picture: Picture, development: Development, draws: Draws, of: Callable[[Electrons], Development], rng: Rng
+) -> tuple[NDArray[Any], F32 | None]:
+    """Return the numbers of an image with the drawn faults, and its electrons, float32[y, x, channel].
+
+    The electrons are None where a fault acts inside the sensor or on the finished image. `of` returns the same
+    development of other electrons, and `rng` the generator for (stage, name).
+    """
+    before, optical = picture.electrons, acting_at(draws, "electrons")
+    after, change = before.array, np.zeros_like(picture.light)
+    if optical:
+        after = development.signal(draws, optical).merged.array
+        change = picture.in_image(after - before.array)
+        noise = _missing_noise(
+            picture, change, lambda light: of(light).signal(draws, optical).merged.array - after, rng
+        )
+        change, after = change + noise, after + (picture.seen(noise).array if noise.any() else 0)
+    inside = any(acting_at(draws, step) for step in MOSAIC_STEPS)
+    if inside:
+        change = picture.in_image(_through_sensor(picture, development, draws, after, rng))
+    numbers = picture.with_change(change)
+    on_image = bool(acting_at(draws, "rgbi"))
+    if on_image:
+        shown = RGBI(array=levels(numbers, picture.response))
+        numbers = picture.with_levels(numbers, shown, development.read_out(shown, draws))
+    return numbers, None if inside or on_image else after
+
+
+def _missing_noise(picture: Picture, change: F32, act: Callable[[Electrons], F32], rng: Rng) -> F32:
+    """Return the noise of the light that faults took away or added, over white, float32[y, x, channel].
+
+    `act` returns the change of what the faults make of the image's electrons if these are others.
+    """
+    touched = change != 0
+    if not touched.any():
+        return np.zeros_like(change)
+    white = picture.white_e
+    read2 = np.float32(picture.camera.detector.read_noise_e_rms**2)
+    signs = 2 * rng("inject", "signs").integers(0, 2, change.shape, np.int8) - np.int8(1)
+    probe = np.sqrt(picture.light * white + read2) / white * signs
+    left = picture.in_image(act(picture.seen(picture.light + probe))) * white
+    variance = left**2
+    # a fault that acts on each pixel alone keeps the signs; a blur mixes them, and its variance varies slowly
+    mixed = cv2.blur((left * signs < 0).astype(np.float32), (_NEARBY_PX, _NEARBY_PX)).reshape(left.shape) > _MIXED
+    if mixed.any():
+        smooth = cv2.blur(variance, (_NEARBY_PX, _NEARBY_PX)).reshape(variance.shape)
+        variance = np.where(mixed, smooth, variance)
+    after = np.maximum(picture.light + change, 0) * white
+    missing = np.maximum(after + read2 - variance, 0).astype(np.float32)
+    noise = poisson(missing, draw_normals(change.shape, rng("inject", "noise"))) - missing
+    return np.where(touched, noise / white, np.float32(0))
+
+
+def _through_sensor(picture: Picture, development: Development, draws: Draws, after: F32, rng: Rng) -> F32:
+    """Return the change of electrons, float32[y, x, channel], where faults act inside the sensor, too.
+
+    The noise-free sensor takes the image with and without the faults, so that what both share cancels. Charge that
+    a fault adds gets its shot noise.
+    """
+    plain, sensor = development.exposure.camera.mosaic, development.camera_with(draws).mosaic
+    exposure_s, acts = development.exposure.camera.exposure_s, development.acts(draws)
+    struck_light = picture.electrons.with_array(np.maximum(after, 0).astype(np.float32))
+    without = plain.raw(picture.electrons, exposure_s, None).astype(np.float32)
+    with_it = sensor.raw(struck_light, exposure_s, None, acts).astype(np.float32)
+    light = sample(struck_light.array, sensor.sensor.pattern)
+    added = sensor.device.expected_e(light, exposure_s, acts) - sensor.device.expected_e(light, exposure_s)
+    added = np.maximum(added, 0).astype(np.float32)
+    noise = poisson(added, draw_normals(added.shape, rng("inject", "charge"))) - added
+    return picture.spread((with_it - without) / np.float32(plain.sensor.readout.system_gain_dn_per_e) + noise)

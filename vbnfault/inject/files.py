@@ -1,0 +1,217 @@
+"""Read images of users' files, and write them back with other numbers: size, depth and metadata stay.
+
+PNG and TIFF of 8 and 16 bits (TIFF of 32 bits, too), FITS of any BITPIX with its BZERO, BSCALE and BLANK,
+OpenEXR, and numpy's NPY. Each kind says how it is read and how it is written in one class.
+"""
+
+from __future__ import annotations
+
+import io
+from abc import ABC, abstractmethod
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.errors import InputError
+from ..core.files import images, tiff
+from ..core.files.whole_files import write_whole
+
+MOST_VALUES = 4 * 10**8  # pixels times channels of one image
+_COLOURS = {1: "grey", 3: "RGB"}
+
+
+class ImageFile(ABC):
+    """Hold an image of a file: `numbers` [y, x] or [y, x, 3]; alpha is kept, and faults do not touch it."""
+
+    endings: ClassVar[tuple[str, ...]]
+    numbers: NDArray[Any]
+    depth_m: NDArray[Any] | None = None
+
+    @abstractmethod
+    def __init__(self, path: Path) -> None:
+        """Read a file. Raises InputError, whose message goes on from the file's name."""
+
+    @abstractmethod
+    def write(self, path: Path, numbers: NDArray[Any], text: str) -> None:
+        """Write a file like this one with other numbers; `text` is added to its metadata where that is possible."""
+
+
+class _Samples(ImageFile):
+    """Hold samples [y, x, channel], of which the last may be alpha."""
+
+    def _split(self, samples: NDArray[Any]) -> None:
+        count = samples.shape[2]
+        colours = count - (count in (2, 4))
+        self._alpha = samples[..., colours:]
+        self.numbers = samples[..., 0] if colours == 1 else samples[..., :colours]
+        if colours not in _COLOURS:
+            raise InputError(f"has {count} channels; must be grey or RGB, with or without alpha")
+
+    def _joined(self, numbers: NDArray[Any]) -> NDArray[Any]:
+        return np.concatenate([np.atleast_3d(numbers), self._alpha], axis=2)
+
+
+class Png(_Samples):
+    """PNG of 8 or 16 bits."""
+
+    endings = (".png",)
+
+    def __init__(self, path: Path) -> None:
+        """Read a PNG file."""
+        self._data = path.read_bytes()
+        self._split(images.png_numbers(self._data, MOST_VALUES))
+
+    def write(self, path: Path, numbers: NDArray[Any], text: str) -> None:
+        """Write a PNG file with the chunks of this one."""
+        write_whole(path, images.with_png_numbers(self._data, self._joined(numbers), text))
+
+
+class Tiff(_Samples):
+    """TIFF or BigTIFF, in strips or tiles."""
+
+    endings = (".tif", ".tiff")
+
+    def __init__(self, path: Path) -> None:
+        """Read a TIFF file."""
+        self._data = path.read_bytes()
+        self._split(tiff.tiff_numbers(self._data, MOST_VALUES))
+
+    def write(self, path: Path, numbers: NDArray[Any], text: str) -> None:
+        """Write a TIFF file with the tags of this one."""
+        write_whole(path, tiff.with_numbers(self._data, self._joined(numbers), text))
+
+
+class Npy(ImageFile):
+    """Array of numpy."""
+
+    endings = (".npy",)
+
+    def __init__(self, path: Path) -> None:
+        """Read an array."""
+        try:
+            self.numbers = np.load(path, allow_pickle=False)
+        except (ValueError, EOFError, OSError) as error:
+            raise InputError(f"is no array of numpy: {error}") from None
+
+    def write(self, path: Path, numbers: NDArray[Any], text: str) -> None:
+        """Write an array."""
+        buffer = io.BytesIO()
+        np.save(buffer, numbers, allow_pickle=False)
+        write_whole(path, buffer.getvalue())
+
+
+class Fits(ImageFile):
+    """First image of a FITS file; pixels that BLANK or NaN mark as missing stay so, and are black for faults."""
+
+    endings = (".fits", ".fit", ".fts")
+
+    def __init__(self, path: Path) -> None:
+        """Read a FITS file."""
+        fits = _astropy_fits()
+        self._data = path.read_bytes()
+        try:
+            with fits.open(io.BytesIO(self._data), do_not_scale_image_data=True, memmap=False) as file:
+                number = next((k for k, part in enumerate(file) if part.is_image and part.data is not None), None)
+                if number is None:
+                    raise InputError("is a FITS file without an image")
+                part = file[number]
+                self._number, self._stored = number, np.array(part.data)
+                self._scale = float(part.header.get("BSCALE", 1)), float(part.header.get("BZERO", 0))
+                blank = part.header.get("BLANK")
+        except InputError:
+            raise
+        except Exception:  # a damaged file fails anywhere in astropy
+            raise InputError("is a damaged FITS file") from None
+        stored, (scale, zero) = self._stored, self._scale
+        if stored.ndim == 3 and stored.shape[0] == 3:
+            raise InputError("is a FITS file of three planes; save the grey image, or each plane alone")
+        if stored.ndim != 2:
+            raise InputError(f"is a FITS file with an image of {stored.ndim} axes; must have 2")
+        whole = stored.dtype.kind in "ui"
+        self._missing = ~np.isfinite(stored) if not whole else np.zeros(stored.shape, bool)
+        if whole and blank is not None:
+            self._missing = stored == blank
+        if whole and scale == 1 and zero == int(zero) and stored.dtype.itemsize <= 4:
+            values: NDArray[Any] = stored.astype(np.int64) + int(zero)
+            unsigned = zero == 2.0 ** (8 * stored.dtype.itemsize - 1) or stored.dtype == np.uint8
+            kind = f"{'u' if unsigned else 'i'}{stored.dtype.itemsize}"
+            values = (
+                values.astype(kind) if zero in (0, 2.0 ** (8 * stored.dtype.itemsize - 1)) else values.astype(float)
+            )
+        else:
+            values = stored.astype(np.float64) * scale + zero
+        self.numbers = np.where(self._missing, 0, values).astype(values.dtype.newbyteorder("="))
+
+    def write(self, path: Path, numbers: NDArray[Any], text: str) -> None:
+        """Write a FITS file with the header of this one and a line of history."""
+        fits = _astropy_fits()
+        changed = (numbers != self.numbers) & ~self._missing
+        scale, zero = self._scale
+        out = self._stored.copy()
+        back = (numbers[changed].astype(np.float64) - zero) / scale
+        if out.dtype.kind in "ui":
+            limits = np.iinfo(out.dtype)
+            back = np.clip(np.rint(back), limits.min, limits.max)
+        out[changed] = back.astype(out.dtype)
+        buffer = io.BytesIO()
+        with fits.open(io.BytesIO(self._data), do_not_scale_image_data=True, memmap=False) as file:
+            part = file[self._number]
+            part.data = out
+            for key, value in (("BSCALE", scale), ("BZERO", zero)):
+                if value != (key == "BSCALE"):
+                    part.header[key] = value
+            part.header["HISTORY"] = text[:70]
+            file.writeto(buffer, output_verify="silentfix")
+        write_whole(path, buffer.getvalue())
+
+
+def _astropy_fits() -> Any:
+    """Return astropy's module of FITS files. Raises InputError if it is not installed."""
+    try:
+        from astropy.io import fits  # takes half a second to import
+    except ImportError as error:
+        raise InputError("needs astropy: pip install 'vbnfault[fits]'") from error
+    return fits
+
+
+class Exr(ImageFile):
+    """OpenEXR with the channels R, G, B or Y; Z, where it is given, is depth along the boresight."""
+
+    endings = (".exr",)
+
+    def __init__(self, path: Path) -> None:
+        """Read an OpenEXR file."""
+        self._header, self._channels = images.read_exr(path)
+        names: list[str] = [name for name in ("R", "G", "B") if name in self._channels] or ["Y"]
+        if len(names) not in _COLOURS or names[0] not in self._channels:
+            known = ", ".join(self._channels)
+            raise InputError(f"is an OpenEXR file with the channels {known}; must have R, G and B, or Y")
+        self._names = names
+        stack = np.stack([self._channels[name] for name in names], axis=-1)
+        self.numbers = stack[..., 0] if len(names) == 1 else stack
+        self.depth_m = self._channels.get("Z")
+
+    def write(self, path: Path, numbers: NDArray[Any], text: str) -> None:
+        """Write an OpenEXR file with the other channels and the attributes of this one."""
+        planes = np.moveaxis(np.atleast_3d(numbers), -1, 0)
+        changed = dict(zip(self._names, planes, strict=True))
+        images.write_exr_like(path, {**self._header, "vbnfault": text}, {**self._channels, **changed})
+
+
+_KINDS = {ending: kind for kind in (Png, Tiff, Npy, Fits, Exr) for ending in kind.endings}
+ENDINGS = tuple(_KINDS)
+
+
+def read_image(path: Path) -> ImageFile:
+    """Return the image of a file. Raises InputError, with its name, if it is none that can be used."""
+    kind = _KINDS.get(path.suffix.lower())
+    if kind is None:
+        raise InputError(f"{path}: must end with one of {', '.join(ENDINGS)}")
+    try:
+        return kind(path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None

@@ -1,0 +1,372 @@
+"""Inject faults into images: of files, of other renderers, of a camera that runs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..camera import Camera
+from ..core import spectra
+from ..core.errors import InputError
+from ..core.quantities import RGBI, Electrons, Radiance
+from ..faults import Fault, FaultContext
+from ..pipeline.development import Development, Draws, without
+from ..pipeline.injection import visible_draws
+from ..pipeline.labels import labels_of
+from ..pipeline.spec import Draw, Injection, SceneExposure, SceneLight
+from ..scene import keyed_random
+from ..scene.config import Scene, configure_faults, load_scene
+from ..scene.instrument import ImageTable
+from ..world import cameras, ephemeris
+from .change import struck
+from .picture import Picture
+from .response import Response
+from .sun import sun_direction
+
+F32 = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+_LEAST_PX = 16
+_ASSUMED_EXPOSURE_S = 0.01
+_ROUNDING_DN = 2.0  # a larger change of the model's image of 8 bits shows in any image
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Injected:
+    """Hold an image with its faults, and what is known of them.
+
+    Attributes
+    ----------
+    image
+        The image with faults, in the shape and the data type of the given one; uint8[y, x, 4] for electrons and
+        radiance.
+    clean
+        The image without faults: the given one.
+    faults
+        The classes of the scene, in the order of the dataset.
+    masks
+        bool[fault, y, x]: the mask of each class.
+    mask_any
+        bool[y, x]: pixels of any localised class.
+    mask_effect
+        bool[fault, y, x]: pixels of the noise-free image that change by 1 DN of 8 bits or more.
+    injected
+        bool[fault].
+    parameters
+        The drawn parameters by class, plain data.
+    left_out
+        Why a commanded class is not in the image, by class.
+    unrecoverable
+        bool[y, x]: pixels at white or at the lowest number, of which the light is not known.
+    electrons
+        float32[y, x, channel]: electrons of the image with faults before the readout; None where a fault acts in
+        the readout or on the finished image.
+    camera
+        The camera, with its exposure.
+    response
+        How the numbers follow from light; None for electrons and radiance.
+    sun_xy_px
+        Pixel position of the Sun, float64[2]; None without a Sun before the camera.
+    assumptions
+        What was assumed of the camera, a sentence each.
+    """
+
+    image: NDArray[Any]
+    clean: NDArray[Any]
+    faults: tuple[str, ...]
+    masks: Mask
+    mask_any: Mask
+    mask_effect: Mask
+    injected: Mask
+    parameters: dict[str, dict[str, Any]]
+    left_out: dict[str, str]
+    unrecoverable: Mask
+    electrons: F32 | None
+    camera: Camera
+    response: Response | None = None
+    sun_xy_px: NDArray[np.float64] | None = None
+    assumptions: tuple[str, ...] = ()
+
+
+class _ImageDevelopment(Development):
+    """Develop images whose clean electrons are given; where they hold the noise of an image, no other is drawn."""
+
+    def __init__(self, electrons: Electrons, *, holds_noise: bool, **shared: Any) -> None:
+        super().__init__(**shared)
+        self._given, self._holds_noise = electrons, holds_noise
+
+    @cached_property
+    def noise(self) -> Any:
+        return None if self._holds_noise else super().noise
+
+    def image(self, draws: Draws, *, noisy: bool = True, keep_signals: bool = True) -> RGBI:
+        return super().image(draws, noisy=noisy and not self._holds_noise, keep_signals=keep_signals)
+
+    def _undisturbed(self, draws: Draws) -> Electrons:
+        if self._instrument(draws):
+            names = ", ".join(sorted(draws))
+            raise InputError(f"{names}: changes the lens or the filters, which needs radiance and not an image")
+        return self._given
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Drawing:
+    """Hold the faults of an image and its keyed random numbers."""
+
+    faults: Mapping[str, Fault]
+    seed: int
+    index: int
+
+    def rng(self, stage: str, name: str) -> np.random.Generator:
+        """Return the generator for (stage, name)."""
+        return keyed_random.rng(self.seed, self.index, stage, name)
+
+
+class Injector:
+    """Inject the faults of a scene into images of its camera; everything that images share is made once.
+
+    Parameters
+    ----------
+    scene
+        A scene, its file or name. Its `[camera]`, `[sun]`, `[image]` and `[faults]` count.
+    source
+        Name of the scene in messages.
+
+    Raises
+    ------
+    InputError
+        The scene cannot be used.
+    """
+
+    def __init__(self, scene: Scene | str | Path, *, source: str = "scene") -> None:
+        if not isinstance(scene, Scene):
+            source, scene = str(scene), load_scene(scene)
+        self.scene, self.source = scene, source
+        self.faults = configure_faults(scene, source)
+        self._cameras: dict[tuple[int, int], Camera] = {}
+
+    def __call__(
+        self,
+        image: NDArray[Any] | Electrons | Radiance,
+        index: int = 0,
+        *,
+        sun: str | Sequence[float] | None = None,
+        commanded: Sequence[str] | None = None,
+        depth_m: NDArray[Any] | None = None,
+        camera: Camera | None = None,
+        context: Mapping[str, Any] | None = None,
+        raw: bool = False,
+    ) -> Injected:
+        """Return an image with faults.
+
+        Parameters
+        ----------
+        image
+            [y, x], [y, x, 1], [y, x, 3] (R, G, B) or [y, x, 4] (R, G, B, I), of whole numbers or floats; or the
+            expected electrons of the camera, or radiance, from which the camera takes the image with its own noise.
+        index
+            Number of the image: with the seed of the scene it keys all random numbers.
+        sun
+            "auto" finds the Sun as the saturated disc; two numbers are its pixel position, three its direction in
+            the camera frame; None is what `[image]` says.
+        commanded
+            Classes to inject; default: all of the scene.
+        depth_m
+            float[y, x]: depth along the boresight, where it is known.
+        camera
+            Camera with its exposure, in place of the scene's.
+        context
+            Further fields of `faults.FaultContext` that are known.
+        raw
+            Whether the numbers of [y, x] are those of the sensor's mosaic.
+
+        Raises
+        ------
+        InputError
+            The image cannot be used with this camera.
+        """
+        given = image if isinstance(image, Electrons | Radiance) else _checked_array(image)
+        camera, assumed = self._camera(_shape(given), camera)
+        picture = None
+        if isinstance(given, Electrons | Radiance):
+            light = given if isinstance(given, Electrons) else camera.expose(given, camera.exposure_s)
+        else:
+            picture = Picture.of(given, self.scene.image or ImageTable(), camera, raw=raw)
+            assumed += picture.assumptions
+            light = picture.electrons
+        known = replace(self._context(camera, sun, depth_m, picture), **(context or {}))
+        drawing = _Drawing(faults=self.faults, seed=self.scene.dataset.seed, index=index)
+        of = partial(_development, context=known, drawing=drawing, holds_noise=picture is not None)
+        development = of(light)
+        draws, left_out = self._drawn(development, drawing, commanded)
+        result, electrons = None, None
+        if picture is not None:
+            drawn, (result, electrons) = draws, struck(picture, development, draws, of, drawing.rng)
+            for name in [name for name in drawn if not development.effect(drawn, name, _ROUNDING_DN).any()]:
+                # a change below the rounding of the model's image may be one below that of this image, too
+                others = without(draws, name)
+                lacking = struck(picture, development, others, of, drawing.rng)
+                if np.array_equal(lacking[0], result):
+                    draws, (result, electrons) = others, lacking
+                    left_out[name] = "changes no number of the image"
+        injection = Injection(draws=draws, development=development)
+        members = [name for name, fault in self.faults.items() if fault.localised]
+        labels = labels_of(self.faults, injection, members, ("mask_effect",))
+        shape, nothing = development.context.shape, np.zeros(development.context.shape, dtype=bool)
+        effects = [labels.effects.get(name, nothing) for name in self.faults]
+        return Injected(
+            image=development.image(draws).array if result is None else result,
+            clean=development.image({}).array if picture is None else picture.numbers,
+            faults=tuple(self.faults),
+            masks=labels.masks,
+            mask_any=labels.mask_any,
+            mask_effect=np.array(effects, dtype=bool).reshape(-1, *shape),
+            injected=np.array([name in draws for name in self.faults], dtype=bool),
+            parameters={name: {"model": draw.fault.model, **draw.params} for name, draw in sorted(draws.items())},
+            left_out=left_out,
+            unrecoverable=nothing if picture is None else picture.unrecoverable,
+            electrons=electrons,
+            camera=camera,
+            response=None if picture is None else picture.response,
+            sun_xy_px=known.sun_xy_px,
+            assumptions=tuple(assumed),
+        )
+
+    def _drawn(
+        self, development: Development, drawing: _Drawing, commanded: Sequence[str] | None
+    ) -> tuple[dict[str, Draw], dict[str, str]]:
+        """Return draws of the commanded classes, and why the others are not in the image."""
+        names = [name for name in self.faults if commanded is None or name in commanded]
+        left_out = self._impossible(names, development.context)
+        possible = [name for name in names if name not in left_out]
+        draws = visible_draws(drawing, development, possible, stored=True)
+        unseen = {name: "no draw of it changes the image" for name in possible if name not in draws}
+        return draws, {**left_out, **unseen}
+
+    # --- camera and Sun ------------------------------------------------------------------------------------------
+
+    def _camera(self, shape: tuple[int, int], given: Camera | None) -> tuple[Camera, list[str]]:
+        """Return the camera of images of a shape, and what was assumed of it."""
+        height, width = shape
+        if given is not None:
+            if (given.height_px, given.width_px) != shape:
+                raise InputError(
+                    f"image of {width} x {height} pixels: the camera has {given.width_px} x {given.height_px}"
+                )
+            return given, []
+        if min(shape) < _LEAST_PX:
+            raise InputError(f"image of {width} x {height} pixels: must have at least {_LEAST_PX} x {_LEAST_PX}")
+        table, assumed = self.scene.camera, []
+        exposure_s = table.exposure_s
+        if exposure_s == "auto":
+            exposure_s = _ASSUMED_EXPOSURE_S
+            assumed.append(f"camera.exposure_s = {exposure_s:g}: assumed, since the scene leaves it to be metered")
+        for key, default in (("fov_deg", 65.0), ("detector", "")):
+            if key not in table.model_fields_set and "focal_length_mm" not in table.model_fields_set:
+                assumed.append(f"camera.{key} = {default!r}: assumed, since the scene does not give it")
+        if shape not in self._cameras:
+            own = table.model_copy(update={"width_px": width, "height_px": height})
+            self._cameras[shape] = cameras.base_camera(self.scene.model_copy(update={"camera": own}))
+        return replace(self._cameras[shape], exposure_s=float(exposure_s)), assumed
+
+    def _context(
+        self, camera: Camera, sun: str | Sequence[float] | None, depth_m: Any, picture: Picture | None
+    ) -> FaultContext:
+        """Return the context of the faults."""
+        nodes = ephemeris.wavelengths_nm(self.scene)
+        distance_au = ephemeris.sun_distance_au(self.scene)
+        direction = sun_direction(
+            (self.scene.image or ImageTable()).sun if sun is None else sun, camera, distance_au, picture
+        )
+        return FaultContext(
+            camera=camera,
+            sun_xy_px=None if direction is None else camera.project(direction),
+            sun_direction_C=direction,
+            sun_irradiance_W_m2_nm=spectra.solar_band_irradiance_W_m2_nm(nodes, distance_au),
+            wavelength_nm=nodes,
+            sun_angular_radius_rad=spectra.sun_angular_radius_rad(distance_au),
+            sun_visible_fraction=None if direction is None else 1.0,
+            depth_m=None if depth_m is None else np.asarray(depth_m),
+        )
+
+    def _impossible(self, names: Sequence[str], context: FaultContext) -> dict[str, str]:
+        """Return why some of the classes cannot act on an image."""
+        dark = [name for name in names if self.faults[name].needs_sun and context.sun_xy_px is None]
+        return dict.fromkeys(dark, "needs the Sun before the camera; give it by image.sun or --sun")
+
+
+def _development(
+    light: Electrons, context: FaultContext, drawing: _Drawing, *, holds_noise: bool
+) -> _ImageDevelopment:
+    """Return what develops images of given electrons."""
+    nodes, camera = context.sunlight[0], context.camera
+    dark = Radiance(array=np.zeros((len(nodes), 1, 1), np.float32), wavelength_nm=nodes)
+    exposure = SceneExposure(camera=camera, light=SceneLight(lens=camera.lens, rendered=dark), rate=light)
+    return _ImageDevelopment(light, holds_noise=holds_noise, exposure=exposure, context=context, rng=drawing.rng)
+
+
+def _shape(image: NDArray[Any] | Electrons | Radiance) -> tuple[int, int]:
+    """Return (height, width) in pixels."""
+    array = image.array if isinstance(image, Electrons | Radiance) else image
+    height, width = array.shape[-2:] if isinstance(image, Radiance) else array.shape[:2]
+    return int(height), int(width)
+
+
+def inject(
+    image: NDArray[Any] | Electrons | Radiance,
+    faults: Mapping[str, Any],
+    *,
+    camera: Camera | Mapping[str, Any] | None = None,
+    seed: int = 0,
+    sun: str | Sequence[float] | None = None,
+    **known: Any,
+) -> Injected:
+    """Return an image with faults, their masks and their parameters.
+
+    Parameters
+    ----------
+    image
+        As for `Injector`.
+    faults
+        Tables of the faults by class, as under `[faults]` of a scene: {"dust_on_optics": {"model": "defocused"}}.
+    camera
+        Keys of `[camera]`, or a camera with its exposure; default: a scene's default camera.
+    seed
+        Seed of all random numbers.
+    sun, known
+        As for `Injector`; `image_keys` are keys of `[image]`.
+
+    Raises
+    ------
+    InputError
+        Image, camera or faults cannot be used.
+    """
+    tables: dict[str, Any] = {"title": "inject", "dataset": {"seed": seed}, "faults": dict(faults)}
+    if "image_keys" in known:
+        tables["image"] = known.pop("image_keys")
+    if isinstance(camera, Mapping):
+        tables["camera"] = dict(camera)
+    injector = Injector(Scene.model_validate(tables))
+    return injector(image, sun=sun, camera=camera if isinstance(camera, Camera) else None, **known)
+
+
+def _checked_array(image: Any) -> NDArray[Any]:
+    """Return an image as an array. Raises InputError if it has another shape or data type than an image."""
+    array = np.asarray(image)
+    if array.ndim == 3 and array.shape[2] == 1:
+        array = array[..., 0]
+    if array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] not in (3, 4)) or not array.size:
+        raise InputError(
+            f"image of shape {list(array.shape)}: must be [y, x], or [y, x, channel] with 1, 3 or 4 channels"
+        )
+    if array.dtype.kind not in "uif" or (array.dtype.kind in "ui" and array.dtype.itemsize > 4):
+        raise InputError(f"image of {array.dtype}: must hold whole numbers of up to 32 bits, or floats")
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
+        raise InputError(f"image: holds {int((~np.isfinite(array)).sum())} values that are NaN or infinite")
+    return array

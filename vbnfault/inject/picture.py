@@ -1,0 +1,212 @@
+"""Hold a user's image as electrons of a camera, and change its numbers where the electrons change."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..camera import Camera
+from ..core.errors import InputError
+from ..core.quantities import LUMINANCE, RGBI, Electrons
+from ..detector.demosaic import interpolate
+from ..detector.interface import with_luminance
+from ..detector.mosaic import channel_of, sample
+from ..scene.instrument import ImageTable
+from .response import Response, read_table
+
+F32 = NDArray[np.float32]
+
+_COLOURS = ("R", "G", "B")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Picture:
+    """Hold an image of a camera.
+
+    Attributes
+    ----------
+    numbers
+        The image as given, [y, x] or [y, x, channel].
+    light
+        Light that the numbers stand for over that of white, float32[y, x, channel of the image], not below 0.
+    white_e
+        Electrons at white, float32[channel of the image]. Grey images and raw mosaics have one channel, whose white
+        is the full well over the gain.
+    response
+        How the numbers follow from light.
+    camera
+        Camera of the image.
+    raw
+        Whether the numbers are those of the sensor's mosaic.
+    unrecoverable
+        bool[y, x]: pixels at or above white, or at the lowest number.
+    assumptions
+        What was assumed of the response, a sentence each.
+    """
+
+    numbers: NDArray[Any]
+    light: F32
+    white_e: F32
+    response: Response
+    camera: Camera
+    raw: bool
+    unrecoverable: NDArray[np.bool_]
+    assumptions: tuple[str, ...]
+
+    @classmethod
+    def of(cls, numbers: NDArray[Any], table: ImageTable, camera: Camera, *, raw: bool) -> Picture:
+        """Return an image of a camera. Raises InputError if its channels do not fit the camera's."""
+        detector = camera.detector
+        if raw and (detector.mosaic is None or numbers.ndim != 2):
+            what = "camera.detector names no sensor" if detector.mosaic is None else "it has several channels"
+            raise InputError(f"image: cannot be a raw mosaic: {what}")
+        response, assumptions = _response(numbers.dtype, table, camera, raw=raw)
+        highest = np.iinfo(numbers.dtype).max if numbers.dtype.kind in "ui" else np.inf
+        lost = (numbers >= min(response.white_dn, highest)) | (numbers <= np.minimum(0, response.black_dn))
+        light = np.atleast_3d(np.maximum(response.light(numbers), 0).astype(np.float32))
+        return cls(
+            numbers=numbers,
+            light=light,
+            white_e=_white_e(light.shape[2], camera),
+            response=response,
+            camera=camera,
+            raw=raw,
+            unrecoverable=lost.any(axis=2) if lost.ndim == 3 else lost,
+            assumptions=assumptions,
+        )
+
+    @cached_property
+    def electrons(self) -> Electrons:
+        """Return the electrons of each pixel and channel of the camera that the numbers stand for."""
+        return self.seen(self.light)
+
+    def seen(self, light: F32) -> Electrons:
+        """Return light of the image, [y, x, channel of the image], as electrons of the camera's channels."""
+        white = self.camera.detector.white_e
+        if self.raw:
+            return Electrons(array=self.spread(light[..., 0] * white.max()), white_e=white)
+        return Electrons(array=_to_camera(light, self.camera) * white, white_e=white)
+
+    def in_image(self, change_e: F32) -> F32:
+        """Return a change of the camera's electrons as one of the image's light, float32[y, x, channel]."""
+        if self.raw:
+            return sample(change_e, self.camera.mosaic.sensor.pattern)[..., None] / self.white_e
+        return _to_image(change_e / self.camera.detector.white_e, self.camera, self.light.shape[2])
+
+    def with_change(self, change: F32) -> NDArray[Any]:
+        """Return the numbers with a change of light, float32[y, x, channel]; others stay as they are."""
+        change = change.reshape(self.numbers.shape)
+        changed = change != 0
+        out = self.numbers.copy()
+        light = self.response.light(self.numbers[changed])
+        out[changed] = self._rounded(self.response.numbers(light + change[changed]))
+        return out
+
+    def spread(self, mosaic_e: F32) -> F32:
+        """Return electrons of the mosaic, float32[y, x], in all channels, [y, x, channel]; their own stay exact."""
+        pattern = self.camera.mosaic.sensor.pattern
+        planes = np.stack([interpolate(mosaic_e, pattern, name) for name in pattern.channels], axis=-1)
+        own = channel_of(pattern, mosaic_e.shape)[..., None].astype(np.intp)
+        np.put_along_axis(planes, own, mosaic_e[..., None], axis=2)
+        return planes
+
+    def with_levels(self, numbers: NDArray[Any], before: RGBI, after: RGBI) -> NDArray[Any]:
+        """Return numbers with the change of an image of 8 bits.
+
+        A level of 0 or 255 becomes black or white; elsewhere the difference of the levels is added, so that numbers
+        of more bits keep their last digits.
+        """
+        channels = 1 if numbers.ndim == 2 else numbers.shape[2]
+        pick = [3] if channels == 1 else list(range(channels))
+        old, new = (x.array[..., pick].reshape(numbers.shape).astype(np.float64) for x in (before, after))
+        step = (self.response.white_dn - self.response.black_dn) / 255
+        moved = numbers.astype(np.float64) + (new - old) * step
+        moved = np.where(new == 0, self.response.black_dn, np.where(new == 255, self.response.white_dn, moved))
+        out = numbers.copy()
+        changed = new != old
+        out[changed] = self._rounded(moved[changed])
+        return out
+
+    def _rounded(self, values: NDArray[np.float64]) -> NDArray[Any]:
+        """Return values in the data type of the image: whole numbers rounded, clipped to white or the top code."""
+        dtype = self.numbers.dtype
+        if dtype.kind == "f":
+            return values.astype(dtype)
+        limits = np.iinfo(dtype)
+        top = self.camera.mosaic.sensor.readout.top_dn if self.raw else self.response.white_dn
+        return np.clip(np.rint(values), limits.min, min(top, limits.max)).astype(dtype)
+
+
+def levels(numbers: NDArray[Any], response: Response) -> NDArray[np.uint8]:
+    """Return numbers as an image of 8 bits, uint8[y, x, 4] with R, G, B and I."""
+    code = 255 * (numbers.astype(np.float64) - response.black_dn) / (response.white_dn - response.black_dn)
+    eight = np.atleast_3d(np.clip(np.rint(code), 0, 255).astype(np.uint8))
+    if eight.shape[2] == 1:
+        eight = np.repeat(eight, 4, axis=2)
+    elif eight.shape[2] == 3:
+        eight = with_luminance(eight)
+    return np.ascontiguousarray(eight)
+
+
+def _response(
+    dtype: np.dtype[Any], table: ImageTable, camera: Camera, *, raw: bool
+) -> tuple[Response, tuple[str, ...]]:
+    """Return the response of an image, and what was assumed of it."""
+    assumed = []
+    black, white = table.black_dn, table.white_dn
+    if raw:
+        readout = camera.mosaic.sensor.readout
+        default_black = float(readout.bias_dn)
+        default_white = default_black + readout.system_gain_dn_per_e * readout.white_e
+    else:
+        default_black, default_white = 0.0, float(np.iinfo(dtype).max) if dtype.kind in "ui" else 1.0
+    if black is None:
+        black = default_black
+        assumed.append(f"image.black_dn = {black:g}: " + ("the sensor's bias" if raw else "assumed"))
+    if white is None:
+        white = default_white
+        assumed.append(f"image.white_dn = {white:g}: " + ("the sensor's white" if raw else "assumed"))
+    if "response" not in table.model_fields_set:
+        assumed.append("image.response = 'linear': assumed")
+    if white <= black:
+        raise InputError(f"image.white_dn = {white:g}: must be above image.black_dn = {black:g}")
+    curve = None if table.response != "table" else read_table(table.response_file)
+    return (
+        Response(black_dn=black, white_dn=white, curve=table.response, gamma=table.gamma, table=curve),
+        tuple(assumed),
+    )
+
+
+def _white_e(channels: int, camera: Camera) -> F32:
+    """Return the electrons at white of an image's channels, float32[channel]."""
+    white = dict(zip(camera.detector.channels, camera.detector.white_e, strict=True))
+    full = camera.detector.white_e.max()
+    colours = [white.get(colour, full) for colour in _COLOURS]
+    return np.array({1: [full], 3: colours, 4: [*colours, white.get("W", full)]}[channels], dtype=np.float32)
+
+
+def _to_camera(light: F32, camera: Camera) -> F32:
+    """Return an image's light in the camera's channels, [y, x, channel]. Raises InputError for lost colours."""
+    channels, given = camera.detector.channels, light.shape[2]
+    if given == 1:
+        return np.repeat(light, len(channels), axis=2)
+    if channels == ("W",):
+        raise InputError(f"image: has {given} channels, but camera.detector {camera.detector.name} sees no colours")
+    white = light[..., 3] if given == 4 else light[..., :3] @ LUMINANCE
+    return np.stack([light[..., _COLOURS.index(c)] if c in _COLOURS else white for c in channels], axis=-1)
+
+
+def _to_image(light: F32, camera: Camera, count: int) -> F32:
+    """Return light in the camera's channels as that of an image with 1, 3 or 4 channels, [y, x, channel]."""
+    channels = camera.detector.channels
+    planes = {name: light[..., k] for k, name in enumerate(channels)}
+    if "W" in planes:
+        intensity = planes["W"]
+    else:
+        intensity = sum(w * planes[c] for c, w in zip(_COLOURS, LUMINANCE, strict=True))  # type: ignore[assignment]
+    colours = [planes.get(c, intensity) for c in _COLOURS]
+    return np.stack({1: [intensity], 3: colours, 4: [*colours, intensity]}[count], axis=-1)

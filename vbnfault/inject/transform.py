@@ -1,0 +1,104 @@
+"""Inject faults into batches of a training loop. This module needs PyTorch; `vbnfault.torch` names its class."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+
+from ..core.errors import InputError
+from ..scene import keyed_random
+from ..scene.config import Scene
+from .injector import Injector
+
+
+class Inject:
+    """Put faults into images of a batch; each image has its own draw, keyed by the seed and its number.
+
+    An object can be sent to worker processes; each sets up lens and sensor once for each size of image.
+
+    Parameters
+    ----------
+    faults
+        Tables of the faults by class, as under `[faults]` of a scene.
+    camera, image
+        Keys of `[camera]` and of `[image]`.
+    probability
+        Chance of each class in an image, 0 to 1.
+    seed
+        Seed of all random numbers.
+    sun
+        Position of the Sun, as for `Injector`; it must not be None for straylight.
+
+    Raises
+    ------
+    InputError
+        Camera or faults cannot be used.
+    """
+
+    def __init__(
+        self,
+        faults: Mapping[str, Any],
+        *,
+        camera: Mapping[str, Any] | None = None,
+        image: Mapping[str, Any] | None = None,
+        probability: float = 0.5,
+        seed: int = 0,
+        sun: str | Sequence[float] | None = None,
+    ) -> None:
+        if not 0 <= probability <= 1:
+            raise InputError(f"probability = {probability:g}: must be from 0 to 1")
+        tables: dict[str, Any] = {"title": "inject", "dataset": {"seed": seed}, "faults": dict(faults)}
+        tables |= {key: dict(table) for key, table in (("camera", camera), ("image", image)) if table}
+        self._scene = Scene.model_validate(tables)
+        self._probability, self._sun, self.seed = probability, sun, seed
+        self.classes = tuple(self.injector.faults)
+
+    @cached_property
+    def injector(self) -> Injector:
+        """Return what injects the faults; each process makes its own."""
+        return Injector(self._scene)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what another process needs."""
+        return {key: value for key, value in vars(self).items() if key != "injector"}
+
+    def __call__(
+        self, images: torch.Tensor, numbers: Sequence[int] | torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return images with faults, in the data type of the given ones, and masks.
+
+        Parameters
+        ----------
+        images
+            uint8 or float32 (white is 1) [image, channel, y, x] on the CPU, with 1 channel or R, G, B.
+        numbers
+            Number of each image, such as its index in the data set plus the epoch times its length.
+
+        Returns
+        -------
+        tuple
+            The images, and bool[image, class, y, x] with the classes in the order of `classes`.
+
+        Raises
+        ------
+        InputError
+            The tensor has another shape or data type.
+        """
+        if images.ndim != 4 or images.shape[1] not in (1, 3) or images.dtype not in (torch.uint8, torch.float32):
+            raise InputError(
+                f"images: {images.dtype} of shape {list(images.shape)}: must be uint8 or float32 of "
+                "[image, channel, y, x] with 1 or 3 channels"
+            )
+        out, masks = [], []
+        for image, number in zip(images.permute(0, 2, 3, 1).contiguous().numpy(), numbers, strict=True):
+            chance = keyed_random.rng(self.seed, int(number), "inject", "classes").random(len(self.classes))
+            chosen = [name for name, p in zip(self.classes, chance, strict=True) if p < self._probability]
+            result = self.injector(image, int(number), sun=self._sun, commanded=chosen)
+            out.append(result.image.reshape(image.shape))
+            masks.append(result.masks)
+        changed = torch.from_numpy(np.stack(out)).permute(0, 3, 1, 2).contiguous()
+        return changed, torch.from_numpy(np.stack(masks))
