@@ -21,7 +21,7 @@ from test_calibration import KALIBR, ROS, YAML_1_0
 from test_cli import run
 from test_render import NODES, ball, box, join, scene, sun
 
-from vbnfault import dataset, render, store
+from vbnfault import dataset, inject, render, store
 from vbnfault.camera import Camera
 from vbnfault.cli.options import SceneOptions
 from vbnfault.core.calibration import Calibration
@@ -402,6 +402,21 @@ def test_a_calibration_is_scaled_only_when_asked() -> None:
     found = scaled.camera.frame_calibration
     assert found is not None
     np.testing.assert_allclose(found.intrinsics, np.array([160.0, 161.0, 99.0, 76.0]) / 2)
+
+
+def test_faults_strike_an_own_image_of_a_calibrated_camera(tmp_path: Path) -> None:
+    """The frame has the size of the file's image, and the Sun's pixel its direction by the calibration."""
+    path = tmp_path / "cameras.txt"
+    path.write_text("1 OPENCV 96 80 80 80.5 49.5 38 -0.28 0.1 0.001 -0.0007\n")
+    grey = np.full((80, 96), 60, np.uint8)
+    known = {"camera": {"calibration": {"file": str(path)}, "exposure_s": 0.01}, "sun": (20.0, 30.0)}
+    result = inject(grey, {"straylight": {"model": "texture"}}, **known)
+    assert result.camera.lens.calibration == Calibration.read(path)
+    assert result.sun_xy_px == pytest.approx((20.0, 30.0), abs=1e-9)
+    assert result.injected.all()
+    assert not any("fov_deg" in text for text in result.assumptions)
+    with pytest.raises(InputError, match="is of an image of 96 x 80 px, and the camera has 96 x 96 px"):
+        inject(np.full((96, 96), 60, np.uint8), {"straylight": {}}, **known)
 
 
 def test_a_preview_with_fewer_pixels_sees_the_same_field(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 
 from ..core import spectra
 from ..core.calibration import Calibration
-from ..core.errors import InputError
+from ..core.errors import InputError, under_key
 from ..core.quantities import ARCHITECTURES, READOUT_DIRECTIONS, Architecture, ReadoutDirection
 from ..core.tables import Table, pair_within
 from .calibration import CalibrationTable, of_frame
@@ -92,8 +92,12 @@ class CameraTable(Table):
     focal_length_mm: float | None = Field(
         None, ge=0.1, le=1e5, description="in place of fov_deg; default: that of fov_deg, or the lens's own"
     )
-    width_px: int = Field(1024, ge=16, le=16384, description="width of the image")
-    height_px: int = Field(1024, ge=16, le=16384, description="height of the image")
+    width_px: int = Field(
+        1024, ge=16, le=16384, description="width of the image; default: the calibration's, if given"
+    )
+    height_px: int = Field(
+        1024, ge=16, le=16384, description="height of the image; default: the calibration's, if given"
+    )
     lens: str = Field(
         "",
         description="a packaged lens or a prescription's TOML, as it is, or scaled to fov_deg or focal_length_mm; "
@@ -279,6 +283,9 @@ class CameraTable(Table):
             )
         try:
             table = table.in_numbers(self.width_px, self.height_px)
+            if not {"width_px", "height_px"} & self.model_fields_set and not table.scale_to_frame:
+                object.__setattr__(self, "width_px", table.width_px)
+                object.__setattr__(self, "height_px", table.height_px)
             fov_deg = min(of_frame(table, self.width_px, self.height_px).fov_deg, _WIDEST_DEG)
         except InputError as error:
             raise ValueError(f"calibration: {error}") from None
@@ -293,7 +300,10 @@ class CameraTable(Table):
     @property
     def frame_calibration(self) -> Calibration | None:
         """Return the calibration of the frame; None for a camera without one."""
-        return None if self.calibration is None else of_frame(self.calibration, self.width_px, self.height_px)
+        if self.calibration is None:
+            return None
+        with under_key("camera.calibration"):
+            return of_frame(self.calibration, self.width_px, self.height_px)
 
     @model_validator(mode="after")
     def _known(self) -> CameraTable:
