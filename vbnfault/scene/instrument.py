@@ -31,6 +31,7 @@ OF_THE_DETECTOR = (
 
 # The widest field of a rectilinear image. That of a calibration counts as at most this wide where poses are drawn.
 _WIDEST_DEG = 140.0
+_MOST_PX = 16384  # columns or rows of an image
 # Keys that only a camera with a named detector has.
 OF_A_DETECTOR = ("individuals", "detector_temperature_K", "stretch", "black")
 # Keys of a sensor file that users expect under [camera].
@@ -92,12 +93,8 @@ class CameraTable(Table):
     focal_length_mm: float | None = Field(
         None, ge=0.1, le=1e5, description="in place of fov_deg; default: that of fov_deg, or the lens's own"
     )
-    width_px: int = Field(
-        1024, ge=16, le=16384, description="width of the image; default: the calibration's, if given"
-    )
-    height_px: int = Field(
-        1024, ge=16, le=16384, description="height of the image; default: the calibration's, if given"
-    )
+    width_px: int = Field(1024, ge=16, le=_MOST_PX, description="width of the image; default: a calibration's")
+    height_px: int = Field(1024, ge=16, le=_MOST_PX, description="height of the image; default: a calibration's")
     lens: str = Field(
         "",
         description="a packaged lens or a prescription's TOML, as it is, or scaled to fov_deg or focal_length_mm; "
@@ -284,8 +281,10 @@ class CameraTable(Table):
         try:
             table = table.in_numbers(self.width_px, self.height_px)
             if not {"width_px", "height_px"} & self.model_fields_set and not table.scale_to_frame:
-                object.__setattr__(self, "width_px", table.width_px)
-                object.__setattr__(self, "height_px", table.height_px)
+                for key in ("width_px", "height_px"):
+                    if not 16 <= getattr(table, key) <= _MOST_PX:
+                        raise InputError(f"{key} = {getattr(table, key)}: must be from 16 to {_MOST_PX}")
+                    object.__setattr__(self, key, getattr(table, key))
             fov_deg = min(of_frame(table, self.width_px, self.height_px).fov_deg, _WIDEST_DEG)
         except InputError as error:
             raise ValueError(f"calibration: {error}") from None
