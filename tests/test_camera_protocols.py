@@ -49,7 +49,7 @@ def test_a_camera_of_foreign_classes_takes_the_same_image(real: bool) -> None:
     light = np.random.default_rng(1).uniform(0, 1, (2, SIZE + 2 * gy, SIZE + 2 * gx)).astype(np.float32)
     radiance = Radiance(array=light, wavelength_nm=np.array([500.0, 600.0]))
     np.testing.assert_array_equal(foreign.expose(radiance, 1e-3).array, own.expose(radiance, 1e-3).array)
-    np.testing.assert_array_equal(foreign.seen_slopes, own.seen_slopes)
+    np.testing.assert_array_equal(foreign.seen_directions, own.seen_directions)
     direction = np.array([0.1, -0.2, 1.0])
     np.testing.assert_array_equal(foreign.project(direction), own.project(direction))
     frames = [

@@ -129,7 +129,13 @@ def test_a_view_without_ground_is_foreseen_at_the_references_exposure(detector: 
     scene = parsed(camera={"detector": detector} if detector else {})
     camera = cameras.base_camera(scene)
     sky = SimpleNamespace(semantic=np.full((32, 32), SKY, dtype=np.uint8))
-    view = SimpleNamespace(intrinsics=(40.0, 40.0, 16.0, 16.0), width_px=32, height_px=32)
+    view = View(
+        position_L_m=np.zeros(3),
+        L_from_C=np.eye(3),
+        intrinsics=np.array([40.0, 40.0, 16.0, 16.0]),
+        width_px=32,
+        height_px=32,
+    )
     foreseen = exposure.foreseen_exposure_s(scene, camera, sky, view, facet(scene))
     assert foreseen == exposure.reference_exposure_s(scene, camera)
 

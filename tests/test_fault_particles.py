@@ -70,7 +70,7 @@ def one_grain(
     c: FaultContext, *, slope: tuple[float, float] = (0.0, 0.0), depth_m: float = 20.0, **more: Any
 ) -> Any:
     """Parameters of one grain of 2 mm at rest, with its blur circle."""
-    x, y = c.camera.projection.pixel_of(np.array([slope]))[0]
+    x, y = c.camera.projection.pixel_of(np.array([[*slope, 1.0]]))[0]
     blur = 2 * c.camera.lens.aperture_radius_m * abs(1 / depth_m - 1 / c.camera.lens.focus_distance_m)
     grain = {
         "x_px": x,

@@ -203,7 +203,7 @@ def test_points_of_truth_lie_at_their_depth_along_their_rays() -> None:
     L_from_C = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     frame: Any = SimpleNamespace(
         rendering=SimpleNamespace(truth=SimpleNamespace(depth_m=depth)),
-        camera=SimpleNamespace(seen_slopes=np.stack([u, v], axis=-1)),
+        camera=SimpleNamespace(seen_directions=np.stack([u, v, np.ones_like(u)], axis=-1)),
         spec=SimpleNamespace(
             terrain=SimpleNamespace(
                 site=SimpleNamespace(

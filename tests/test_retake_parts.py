@@ -69,12 +69,11 @@ def _radiance(monkeypatch: pytest.MonkeyPatch, stored: StoredView, *, sees_sun: 
         out[:, 1, 2] += 5
         return "the disc is seen"
 
-    view = SimpleNamespace(height_px=ROWS, width_px=COLUMNS, intrinsics=np.array([9.0, 9, 3, 2]))
+    view = SimpleNamespace(height_px=ROWS, width_px=COLUMNS, pixel_map=None)
     scene = SimpleNamespace(view=view, sun=None, wavelength_nm=(450.0, 550.0))
     monkeypatch.setattr(retaken, "may_see_sun", lambda *_: sees_sun)
     monkeypatch.setattr(render, "sun_in_view", lambda *_: "disc")
     monkeypatch.setattr(retaken, "add_mean", add)
-    monkeypatch.setattr(retaken, "Pinhole", lambda *_: None)
     return retaken._radiance(spec_of(), scene, stored)  # type: ignore[arg-type]
 
 

@@ -138,7 +138,7 @@ def centres_and_directions(camera: Camera) -> tuple[F64, F64]:
     rows = np.unique(np.append(np.arange(0, camera.height_px, 13), camera.height_px - 1))
     columns = np.unique(np.append(np.arange(0, camera.width_px, 13), camera.width_px - 1))
     centres = np.stack(np.meshgrid(columns + 0.5, rows + 0.5), -1).reshape(-1, 2)
-    return centres, camera.seen_slopes[np.ix_(rows, columns)].reshape(-1, 2)
+    return centres, camera.seen_directions[np.ix_(rows, columns)][..., :2].reshape(-1, 2)
 
 
 def assert_opencv_agrees(camera: Camera) -> None:

@@ -18,6 +18,7 @@ __version__ = "0.2.0"
 
 if TYPE_CHECKING:
     from . import navigation, torch
+    from .core.calibration import Calibration
     from .core.errors import InputError, VbnfaultError
     from .dataset import BuildOptions, verify
     from .dataset import build_scene as build
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
 # is loaded when the name is first used. `tests/test_api.py` compares this table with the imports above.
 _HOMES = {
     "BuildOptions": "dataset",
+    "Calibration": "core.calibration",
     "DiscReflectance": "reflectance",
     "Effect": "detector.effects",
     "Exposure": "detector.effects",

@@ -12,7 +12,7 @@ What a fenced block is follows from its language and its first line:
 - `python`: code; the blocks of a page share their names.
 - Any block whose first line is a comment with a file's name (`# my_camera.toml`): this file, which is written.
 - `toml` without a file's name: a part of a scene, which must be accepted beside a title.
-- `text`, `json`: output to read, which does not run.
+- `text`, `json`, `yaml`: output to read, which does not run.
 
 A comment before a block says that it does not run, and why: `<!-- not run: it downloads 40 MB -->`. Its syntax is
 checked all the same. `<!-- needs torch -->` runs the block only where that package is installed.
@@ -39,10 +39,10 @@ _FENCE = re.compile(
     r"(?:^<!-- (?P<mark>not run: [^>]+|needs \w+) -->\n\n?)?^```(?P<language>\w+)\n(?P<text>.*?)^```$",
     flags=re.DOTALL | re.MULTILINE,
 )
-_FILE = re.compile(r"# ([\w./-]+\.(?:toml|py|csv|txt))\n")
+_FILE = re.compile(r"# ([\w./-]+\.(?:toml|py|csv|txt|yaml))\n")
 WIDEST_PX = 720
 MOST_BYTES = 250_000
-LANGUAGES = ("sh", "python", "toml", "text", "json")
+LANGUAGES = ("sh", "python", "toml", "yaml", "text", "json")
 
 # pip and the tests are what continuous integration itself runs
 DEVELOPERS = ("pip", "pytest", "python -m pytest", "sphinx-build")

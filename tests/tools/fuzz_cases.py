@@ -79,6 +79,23 @@ def case_sensor(seeds: Seeds, rng: random.Random, here: Path) -> Case:
     return dry(whole_scene(seeds, here, camera=camera, faults={"cosmic_rays": {}})), {}
 
 
+def case_calibration(seeds: Seeds, rng: random.Random, here: Path) -> Case:
+    """Damage a camera's calibration: the file of a scene, or the numbers in it."""
+    from test_calibrated_camera import TABLES
+    from test_calibration import COLMAP, KALIBR, ROS, ROS_MESSAGE, YAML_1_0
+
+    camera = {key: value for key, value in seeds.scene["camera"].items() if key != "fov_deg"}
+    if rng.random() < 0.4:
+        table = changed(rng.choice(list(TABLES.values())), rng)
+    else:
+        texts = [text.encode() for text in (ROS, ROS_MESSAGE, KALIBR, COLMAP, YAML_1_0)]
+        path = here / "camera.yaml"
+        path.write_bytes(flipped(rng.choice(texts), rng, rng.choice(texts)))
+        table = {"file": str(path), "scale_to_frame": True, "camera": rng.choice(("", "cam0", "1"))}
+        camera |= {"width_px": 64, "height_px": 48}
+    return dry(whole_scene(seeds, here, camera={**camera, "calibration": table}, faults={})), {}
+
+
 def case_study(seeds: Seeds, rng: random.Random, here: Path) -> Case:
     """Damage a study file, its scene, or values given by `--set`.
 
@@ -402,6 +419,7 @@ CASES: dict[str, tuple[Callable[[Seeds, random.Random, Path], Case], int]] = {  
     "fault": (case_fault, 11),
     "lens": (case_lens, 12),
     "sensor": (case_sensor, 9),
+    "calibration": (case_calibration, 6),
     "study": (case_study, 8),
     "mesh": (case_mesh, 12),
     "spacecraft": (case_spacecraft, 8),

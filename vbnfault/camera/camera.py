@@ -95,18 +95,29 @@ class Camera:
 
     @property
     def intrinsics(self) -> NDArray[np.float64]:
-        """Return fx, fy, cx, cy in pixels, float64[4]. Pixel centres lie at +0.5, the axis in the middle."""
+        """Return fx, fy, cx, cy in pixels, float64[4]. Pixel centres lie at +0.5.
+
+        The axis is in the middle, except in a calibrated camera.
+        """
+        if self.lens.calibration is not None:
+            return self.lens.calibration.intrinsics
         f = self.focal_length_px
         return np.array([f, f, self.width_px / 2, self.height_px / 2])
 
     @property
     def fov_deg(self) -> float:
-        """Return the full field of view across the width in degrees, without distortion."""
+        """Return the full field of view across the width in degrees, without the distortion of a prescription."""
+        if self.lens.calibration is not None:
+            return self.lens.calibration.fov_deg
         return float(np.degrees(2 * np.arctan(self.width_px / 2 / self.focal_length_px)))
 
     def project(self, direction_C: NDArray[np.float64]) -> NDArray[np.float64] | None:
         """Return pixel x and y of a direction in C, float64[2]; None where it points sideways or backwards."""
         x, y, z = direction_C
+        calibration = self.lens.calibration
+        if calibration is not None:
+            ahead = z > calibration.least_z * np.linalg.norm(direction_C)
+            return calibration.pixel_of(direction_C) if ahead else None
         if z <= 1e-9:
             return None
         fx, fy, cx, cy = self.intrinsics
@@ -116,13 +127,16 @@ class Camera:
 
     @property
     def projection(self) -> Projection:
-        """Return the map of directions to pixels: by chief rays at the d line, or of a rectilinear camera."""
+        """Return the map of directions to pixels: by chief rays at the d line, of a calibration, or rectilinear."""
         return self.lens.projection(self.intrinsics)
 
     @property
-    def seen_slopes(self) -> NDArray[np.float64]:
-        """Return the tangents x/z and y/z in C of the directions that the pixel centres see, float64[y, x, 2]."""
-        return _seen_slopes(self.lens, tuple(self.intrinsics.tolist()), self.width_px, self.height_px)
+    def seen_directions(self) -> NDArray[np.float64]:
+        """Return vectors in C along the directions that the pixel centres see, float64[y, x, 3].
+
+        They are unit vectors of a calibrated camera, and have z = 1 otherwise.
+        """
+        return _seen_directions(self.lens, tuple(self.intrinsics.tolist()), self.width_px, self.height_px)
 
     @property
     def mosaic(self) -> MosaicDetector:
@@ -139,10 +153,12 @@ class Camera:
 
 
 @lru_cache(maxsize=2)
-def _seen_slopes(lens: Lens, intrinsics: tuple[float, ...], width_px: int, height_px: int) -> NDArray[np.float64]:
-    """Return `Camera.seen_slopes`, read-only. All samples of a camera share them."""
+def _seen_directions(
+    lens: Lens, intrinsics: tuple[float, ...], width_px: int, height_px: int
+) -> NDArray[np.float64]:
+    """Return `Camera.seen_directions`, read-only. All samples of a camera share them."""
     projection = lens.projection(np.array(intrinsics))
-    out = projection.slopes_at(np.arange(width_px) + 0.5, np.arange(height_px) + 0.5)
+    out = projection.directions_at(np.arange(width_px) + 0.5, np.arange(height_px) + 0.5)
     out.flags.writeable = False
     return out
 

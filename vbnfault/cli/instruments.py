@@ -59,11 +59,29 @@ class LensOptions:
     ] = None
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FitOptions:
+    """Hold the options of the frame to whose distortion OpenCV's model is fitted."""
+
+    fit_opencv: Annotated[
+        bool,
+        typer.Option(
+            "--fit-opencv",
+            help="Print the lens's distortion as OpenCV's coefficients, with the residual.",
+        ),
+    ] = False
+    width_px: Annotated[int, whole(16, 16384, "Width in pixels of the image for --fit-opencv.")] = 1024
+    height_px: Annotated[
+        int | None, whole(16, 16384, "Height in pixels of the image for --fit-opencv.", unset="as wide as it is")
+    ] = None
+
+
 @app.command(rich_help_panel=_PANEL)
 @grouped
 def lens(
     lens: LensArgument,
     options: LensOptions,
+    fit: FitOptions,
     out: Annotated[
         Path | None,
         local_path("PNG file for the drawing.", unset="the lens's name, in the working folder"),
@@ -90,6 +108,10 @@ def lens(
     typer.echo(f"{prescription.name}: {len(prescription.surfaces)} surfaces{source}")
     for name, value in lens_sheet.figures(prescription).items():
         typer.echo(f"  {name:<28}{value:10.4f}")
+    field_deg = request.field_deg(prescription, 40.0)
+    if fit.fit_opencv:
+        height_px = fit.width_px if fit.height_px is None else fit.height_px
+        typer.echo(lens_sheet.opencv_fit(prescription, field_deg, fit.width_px, height_px))
     if json_ is not None:
         with writing(json_):
             lens_sheet.write_table(prescription, json_)
@@ -99,7 +121,7 @@ def lens(
             write_lens(prescription, toml)
         typer.echo(str(toml))
     with writing(path):
-        lens_sheet.draw(prescription, path, half_field_deg=request.field_deg(prescription, 40.0) / 2)
+        lens_sheet.draw(prescription, path, half_field_deg=field_deg / 2)
     typer.echo(str(path))
 
 

@@ -215,7 +215,10 @@ class SceneOptions(SceneValues):
             return loaded
         camera = loaded.camera
         size = {f"camera.{k}": max(16, round(self.scale * getattr(camera, k))) for k in ("width_px", "height_px")}
-        field = {"camera.fov_deg": camera.fov_deg, "camera.focal_length_mm": None}
+        field: dict[str, Any] = {"camera.fov_deg": camera.fov_deg, "camera.focal_length_mm": None}
+        if camera.calibration is not None:
+            numbers = camera.calibration.model_dump(exclude_none=True)
+            field = {"camera.calibration": numbers | {"scale_to_frame": True}}
         return config.load_scene(scene, self._values() | size | field)
 
 

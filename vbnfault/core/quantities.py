@@ -115,25 +115,41 @@ class FineLight:
     mean: F32
 
     @classmethod
-    def of(cls, *, slopes: F64, area_px: F64, radiance: F32, intrinsics: F64, shape: tuple[int, int]) -> FineLight:
-        """Return the light of points in a pinhole's frame of (height, width) pixels.
+    def of(
+        cls,
+        *,
+        slopes: F64,
+        area_px: F64,
+        radiance: F32,
+        intrinsics: F64,
+        shape: tuple[int, int],
+        projection: Any = None,
+    ) -> FineLight:
+        """Return the light of points in a frame of (height, width) pixels.
 
         Parameters
         ----------
         slopes
             float64[point, 2]: tangents in C. Points beyond the frame are kept for the lens.
         area_px
-            float64[point]: area of each point in pixels.
+            float64[point]: area of each point in pixels of a pinhole with these intrinsics.
         radiance
             float32[band, point].
         intrinsics
             fx, fy, cx and cy in pixels.
+        projection
+            The `sundisc.Projection` of the frame; default: that pinhole.
         """
         light = radiance * area_px.astype(np.float32)
         # cos⁴θ / (fx fy) is the projected solid angle of a pixel
         solid_sr = 1 / (intrinsics[0] * intrinsics[1] * (1 + (slopes**2).sum(axis=1)) ** 2)
         power = light * solid_sr.astype(np.float32)
         pixels = slopes * intrinsics[:2] + intrinsics[2:]
+        if projection is not None:
+            towards = _forward(slopes)
+            pixels = projection.pixel_of(towards)
+            facing = 1 if projection.foreshortens else 1 / np.sqrt(1 + (slopes**2).sum(axis=1))
+            light = (light * (solid_sr / (facing * projection.solid_angle_sr(towards)))).astype(np.float32)
         column, row = np.floor(pixels).astype(np.int64).T
         inside = (column >= 0) & (column < shape[1]) & (row >= 0) & (row < shape[0])
         column, row, values = column[inside], row[inside], light[:, inside]
@@ -148,6 +164,11 @@ class FineLight:
             columns=slice(*columns),
             mean=mean.reshape(-1, height, width).astype(np.float32),
         )
+
+    @property
+    def directions(self) -> F64:
+        """Return the directions of the points in C, float64[point, 3], with z = 1."""
+        return _forward(self.slopes)
 
     def joined(self, other: FineLight | None) -> FineLight:
         """Return the light of both."""
@@ -185,6 +206,10 @@ class FineLight:
         window = out[:, self.rows, self.columns]
         np.maximum(window - self.mean, 0, out=window)
         return out
+
+
+def _forward(slopes: F64) -> F64:
+    return np.column_stack([slopes, np.ones(len(slopes))])
 
 
 def splat(pixels: F64, weights: F64, shape: tuple[int, int]) -> F32:

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,21 +32,50 @@ Frame = tuple[int, int]
 _ACROSS = 128
 _RIM = 64  # points of the rim that bound its image; between two points it extends 1 - cos(π / 64) = 0.12 % further
 _MOST_CELLS = 1 << 20  # processed at once, to bound the memory
+_STEEPEST = 10.0  # the largest tangent that `slopes_of` returns, of 84°
 _SHARP_PX = 0.05  # a smaller blur circle of defocus is ignored
-_LEAST_Z = 1e-3  # below this z of a rim point in C, a plane cannot hold its image
+LEAST_Z = 1e-3  # below this z of a unit direction in C, a plane cannot hold its image
 
 
 class Projection(Protocol):
-    """Map between directions and the plane of the pixels, at one wavelength."""
+    """Map between directions and the plane of the pixels, at one wavelength.
 
-    def pixel_of(self, slopes: F64) -> F64:
-        """Return pixel positions x and y, float64[..., 2], of tangents x/z and y/z in C."""
+    Directions are vectors in C of any length, float64[..., 3]. Those of a plane have z = 1.
+    """
 
-    def slopes_at(self, x_px: Floats, y_px: Floats) -> F64:
-        """Return the tangents x/z and y/z in C that the positions of a grid see, float64[y, x, 2]."""
+    @property
+    def least_z(self) -> float:
+        """Return the least z of unit directions of which the map can hold an image."""
 
-    def solid_angle_sr(self, slopes: F64) -> F64:
-        """Return the projected solid angle per pixel at given tangents, cos θ dω / (dx dy), in sr, float64[...]."""
+    @property
+    def foreshortens(self) -> bool:
+        """Return whether the pupil is a flat hole, through which light at the angle θ passes as cos θ."""
+
+    def pixel_of(self, directions: F64) -> F64:
+        """Return pixel positions x and y of directions, float64[..., 2]."""
+
+    def directions_at(self, x_px: Floats, y_px: Floats) -> F64:
+        """Return the directions that the positions of a grid see, float64[y, x, 3]."""
+
+    def solid_angle_sr(self, directions: F64) -> F64:
+        """Return the solid angle per pixel at directions in sr, float64[...].
+
+        Where the pupil foreshortens, it is the projected one, cos θ dω / (dx dy).
+        """
+
+
+def forward(slopes: F64) -> F64:
+    """Return the directions of tangents x/z and y/z in C, float64[..., 3], with z = 1."""
+    return np.concatenate([slopes, np.ones_like(slopes[..., :1])], axis=-1)
+
+
+def slopes_of(directions: F64) -> F64:
+    """Return the tangents x/z and y/z of directions, float64[..., 2], limited to those of 84°.
+
+    So a fisheye is a wide camera to what asks for tangents.
+    """
+    across = np.hypot(directions[..., 0], directions[..., 1])
+    return np.asarray(directions[..., :2] / np.maximum(directions[..., 2], across / _STEEPEST)[..., None])
 
 
 @dataclass(frozen=True)
@@ -55,18 +84,27 @@ class Pinhole:
 
     intrinsics: F64
 
-    def pixel_of(self, slopes: F64) -> F64:
+    least_z: ClassVar[float] = LEAST_Z
+    foreshortens: ClassVar[bool] = True
+
+    def pixel_of(self, directions: F64) -> F64:
         """Return pixel positions as `Projection` defines."""
+        slopes = directions[..., :2] / directions[..., 2:]
         return np.asarray(slopes * self.intrinsics[:2] + self.intrinsics[2:])
 
-    def slopes_at(self, x_px: Floats, y_px: Floats) -> F64:
-        """Return tangents as `Projection` defines."""
+    def directions_at(self, x_px: Floats, y_px: Floats) -> F64:
+        """Return directions as `Projection` defines."""
         fx, fy, cx, cy = self.intrinsics
-        return np.stack(np.meshgrid((x_px - cx) / fx, (y_px - cy) / fy), axis=-1)
+        return forward(np.stack(np.meshgrid((x_px - cx) / fx, (y_px - cy) / fy), axis=-1))
 
-    def solid_angle_sr(self, slopes: F64) -> F64:
+    def directions_of(self, xy_px: F64) -> F64:
+        """Return the directions that positions float64[..., 2] see, float64[..., 3]."""
+        return forward((xy_px - self.intrinsics[2:]) / self.intrinsics[:2])
+
+    def solid_angle_sr(self, directions: F64) -> F64:
         """Return cos⁴θ / (fx fy), as `Projection` defines."""
         fx, fy = self.intrinsics[:2]
+        slopes = directions[..., :2] / directions[..., 2:]
         return np.asarray(1 / (fx * fy * (1 + (slopes**2).sum(axis=-1)) ** 2))
 
 
@@ -105,9 +143,9 @@ def bounds_px(disc: SunInView, projection: Projection) -> F64 | None:
     turn = np.arange(_RIM) * 2 * np.pi / _RIM
     s, c = np.sin(disc.angular_radius_rad), np.cos(disc.angular_radius_rad)
     rim = np.column_stack([s * np.cos(turn), s * np.sin(turn), np.full(_RIM, c)]) @ axes(disc.direction_C)
-    if (rim[:, 2] < _LEAST_Z).any():
+    if (rim[:, 2] < projection.least_z).any():
         return None
-    rim_px = projection.pixel_of(rim[:, :2] / rim[:, 2:])
+    rim_px = projection.pixel_of(rim)
     low, high = rim_px.min(axis=0), rim_px.max(axis=0)
     more = 0.01 * (high - low)
     return np.stack([low - more, high + more])
@@ -134,7 +172,7 @@ def pixel_sums(
         Coefficients c_k, float64[profile, k], of Σ c_k μᵏ, the radiance over the disc's mean. Default: one uniform
         profile.
     gain
-        Function that returns a factor on the light for tangents float64[y, x, 2].
+        Function that returns a factor on the light for directions float64[y, x, 3].
 
     Returns
     -------
@@ -178,7 +216,7 @@ def add_mean(
     if sums is None:
         return None
     y, x = (np.arange(s.start, s.stop) + 0.5 for s in (sums.rows, sums.columns))
-    solid = projection.solid_angle_sr(projection.slopes_at(x, y))
+    solid = projection.solid_angle_sr(projection.directions_at(x, y))
     light = sums.values * (disc.radiance_W_m2_sr_nm[list(bands)][:, None, None] / solid)
     radiance[:, sums.rows, sums.columns] += light.astype(np.float32)
     return sums.rows, sums.columns
@@ -233,13 +271,13 @@ def _sums(
     strips = max(1, _MOST_CELLS // len(x))
     for first in range(0, len(y), strips):
         strip = slice(first, first + strips)
-        slopes = projection.slopes_at(x, y[strip])
-        position = on_disc(slopes)
+        seen = projection.directions_at(x, y[strip])
+        position = on_disc(seen)
         covered, mu = _cells_on_disc(position, per_px, dx, dy[strip, None])
-        weight = covered * projection.solid_angle_sr(slopes) * dx * dy[strip, None]
+        weight = covered * projection.solid_angle_sr(seen) * dx * dy[strip, None]
         shown = weight * _visible(disc.visible, position)
         if gain is not None:
-            shown = shown * gain(slopes)
+            shown = shown * gain(seen)
         inside = row[strip] >= 0
         for k, coefficients in enumerate(profiles):
             profile = np.polynomial.polynomial.polyval(mu, coefficients)
@@ -249,12 +287,13 @@ def _sums(
             np.add.at(for_rows, row[strip][inside], of_columns)
             out[k][:, column[starts][of_frame]] += for_rows
     mean = profiles @ (2 / (np.arange(profiles.shape[1]) + 2))  # of each profile over the disc
-    return np.asarray(out * (np.pi * on_disc.sine**2 * on_disc.axes[2, 2] * mean / total)[:, None, None])
+    facing = on_disc.axes[2, 2] if projection.foreshortens else 1.0
+    return np.asarray(out * (np.pi * on_disc.sine**2 * facing * mean / total)[:, None, None])
 
 
 @dataclass(frozen=True, eq=False)
 class _DiscPosition:
-    """Map tangents x/z and y/z to positions on the unit disc, which is the disc seen along its own direction.
+    """Map directions to positions on the unit disc, which is the disc seen along its own direction.
 
     `axes` are those of the disc, float64[3, 3]; `sine` is that of its angular radius.
     """
@@ -262,19 +301,18 @@ class _DiscPosition:
     axes: F64
     sine: float
 
-    def __call__(self, slopes: F64) -> F64:
+    def __call__(self, directions: F64) -> F64:
         """Return the positions, float64[y, x, 2]."""
-        length = np.sqrt(1 + (slopes**2).sum(axis=-1))
-        coordinates = [
-            (slopes[..., 0] * a[0] + slopes[..., 1] * a[1] + a[2]) / (self.sine * length) for a in self.axes[:2]
-        ]
+        x, y, z = np.moveaxis(directions, -1, 0)
+        length = np.sqrt(z * z + (x * x + y * y))
+        coordinates = [(x * a[0] + y * a[1] + z * a[2]) / (self.sine * length) for a in self.axes[:2]]
         return np.stack(coordinates, axis=-1)
 
     def change_per_px(self, projection: Projection, bounds: F64) -> tuple[F64, F64]:
         """Return the change of the position per pixel along x and along y, both float64[2]."""
         middle, quarter = bounds.mean(axis=0), (bounds[1] - bounds[0]) / 4
         near = self(
-            projection.slopes_at(*(m + q * np.array([-1.0, 1.0]) for m, q in zip(middle, quarter, strict=True)))
+            projection.directions_at(*(m + q * np.array([-1.0, 1.0]) for m, q in zip(middle, quarter, strict=True)))
         )
         return (
             (near[:, 1] - near[:, 0]).mean(axis=0) / (2 * quarter[0]),

@@ -342,9 +342,10 @@ def _camera(session: Session) -> list[str]:
         )
     else:
         exposure = f"{settings.exposure_s:g} s"
+    field_deg = settings.fov_deg if settings.calibration is None else camera.fov_deg
     architectures = (camera.architecture,) if settings.detector else settings.architectures
     return [
-        f"camera: {camera.width_px} x {camera.height_px} px, {settings.fov_deg:g} deg across; "
+        f"camera: {camera.width_px} x {camera.height_px} px, {field_deg:.6g} deg across; "
         f"lens: {camera.lens.figures['summary']}",
         f"detector: {camera.detector.name}{_effects(camera.detector)}, {', '.join(architectures)}; "
         f"exposure: {exposure}",

@@ -57,6 +57,7 @@ _LEFT_OUT_AT_DEFAULT = (
     "body.volume_km3",
     "coma",
     "camera.black",
+    "camera.calibration",
     "camera.point_spread",
     "camera.stretch",
     "camera.exposure_max_towards_sun_s",
@@ -265,6 +266,7 @@ def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
         lens_names=(camera.lens.name,),
         distortion_residual_px=camera.lens.distortion_residual_px,
         distortion_valid_to_deg=camera.lens.distortion_valid_to_deg,
+        **_calibrated(camera),
         attitude_references=references,
         centre_of_mass_T_m=tuple(session.body.centre_of_mass_T_m.tolist()) if "centre" in references else None,
         detector_names=tuple(f"{camera.detector.name} {k}" for k in range(individuals))
@@ -276,6 +278,18 @@ def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
         sample_names=() if session.trajectory is None else session.trajectory.name,
         attributes=_root_attributes(session, blocks),
     )
+
+
+def _calibrated(camera: Camera) -> dict[str, Any]:
+    """Return the fields of a store that describe the calibration of its camera; {} without one."""
+    calibration = camera.lens.calibration
+    if calibration is None:
+        return {}
+    return {
+        "distortion_model": calibration.model,
+        "coefficients": tuple(calibration.stored_coefficients),
+        "skew_px": calibration.skew,
+    }
 
 
 def _rendered_shape(camera: Camera) -> tuple[int, int]:

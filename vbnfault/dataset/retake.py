@@ -64,7 +64,7 @@ _FREE: dict[str, frozenset[str] | None] = {
     ),
 }
 # Of the camera, these keys may not differ; all others may.
-_FIXED_OF_CAMERA = frozenset({"fov_deg", "width_px", "height_px", "focus_distance_m"})
+_FIXED_OF_CAMERA = frozenset({"calibration", "fov_deg", "width_px", "height_px", "focus_distance_m"})
 # Keys of the camera on which the renderer's aperture depends.
 _OPTICS = ("lens", "focus", "f_number", "pixel_pitch_um", "detector")
 _SAME_FOCAL_LENGTH = 1e-6  # as a fraction: 1e-3 px at the border of 2048 px
@@ -299,7 +299,7 @@ def _check_grid(opened: Store, session: pipeline.Session, source: str) -> None:
     """Raise InputError if the camera needs a render of another scale, or a wider one, than the store has."""
     camera = session.base_camera
     number = opened.begun()[0]
-    stored = float(opened.column("intrinsics", number)[:, 0].max())
+    stored = float(np.sqrt(opened.column("intrinsics", number)[:, :2].prod(axis=1)).max())
     lens = f"camera.lens = {session.scene.camera.lens!r}"
     if abs(camera.focal_length_px / stored - 1) > _SAME_FOCAL_LENGTH:
         raise InputError(

@@ -14,6 +14,7 @@ from ..camera import Camera
 from ..core import spectra
 from ..core.quantities import FarSource, Radiance
 from ..core.shared_results import SharedResults
+from ..core.sundisc import Pinhole
 from ..lens.image_frame import ImageFrame
 from .fields import REFERENCE_WIDTH_PX
 
@@ -87,14 +88,13 @@ class FaultContext:
     def sun_before_camera(self) -> NDArray[np.float64] | None:
         """Return a vector towards the Sun in the camera frame C with z > 0, float64[3]; not normalised.
 
-        If no direction is known, the vector is computed from the Sun's pixel position by a pinhole model. Return
-        None if the Sun is behind the camera or unknown.
+        If no direction is known, the vector is computed from the Sun's pixel position, by the camera's calibration
+        or by a pinhole model. Return None if the Sun is behind the camera or unknown.
         """
         direction = self.sun_direction_C
         if direction is None and self.sun_xy_px is not None:
-            fx, fy, cx, cy = self.camera.intrinsics
-            x, y = self.sun_xy_px
-            direction = np.array([(x - cx) / fx, (y - cy) / fy, 1.0])
+            projection = self.camera.lens.calibration or Pinhole(self.camera.intrinsics)
+            direction = projection.directions_of(np.asarray(self.sun_xy_px, dtype=np.float64))
         return direction if direction is not None and direction[2] > 0 else None
 
     @property

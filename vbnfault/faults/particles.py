@@ -57,6 +57,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.sundisc import forward, slopes_of
 from ..detector.noise import poisson_above_0
 from ..lens.streaks import Streaks, drawn, inside, pupil_support
 from .context import FaultContext, Params
@@ -402,11 +403,11 @@ class _Population:
         height, width = context.shape
         edge = np.concatenate(
             [
-                projection.slopes_at(np.linspace(0, width, 65), np.array([0.0, height])).reshape(-1, 2),
-                projection.slopes_at(np.array([0.0, width]), np.linspace(0, height, 65)).reshape(-1, 2),
+                projection.directions_at(np.linspace(0, width, 65), np.array([0.0, height])).reshape(-1, 3),
+                projection.directions_at(np.array([0.0, width]), np.linspace(0, height, 65)).reshape(-1, 3),
             ]
         )
-        self.half = np.abs(edge).max(axis=0)
+        self.half = np.abs(slopes_of(edge)).max(axis=0)
         low, high = fault.radius_mm
         self.radius_mm = np.geomspace(low, max(high, low * (1 + 1e-9)), _RADII)
         number = (self.radius_mm / self.radius_mm[0]) ** (1 - fault.size_exponent)  # per step of log a
@@ -531,7 +532,7 @@ class _Population:
         heading = _in_cone(self.up, fault.cone_deg, uniform[6], uniform[7])
         velocity = heading * speed[:, None] - self.camera_velocity
         moved = (velocity[:, :2] - slope * velocity[:, 2:]) / depth[:, None] * camera.exposure_s
-        first, last = (camera.projection.pixel_of(slope + s * moved) for s in (-0.5, 0.5))
+        first, last = (camera.projection.pixel_of(forward(slope + s * moved)) for s in (-0.5, 0.5))
         distance = depth * np.sqrt(1 + (slope**2).sum(axis=1))
         albedo = fault.albedo.uniform(rng, count)
         phase_deg = self.sun.phase_deg(towards)

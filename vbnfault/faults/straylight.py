@@ -156,16 +156,15 @@ class TextureStraylight(Fault):
         return flares, self.glare_textures or tuple(f"glare_{k}" for k in GLARES), close
 
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
-        """Return `flares`, `glare`, the centre of the image in px and the mask level.
+        """Return `flares`, `glare`, the principal point (the centre of most images), and `mask_level_dn`.
 
         `flares` is a list of tables with index, position, radius and brightness. `glare` is such a table without a
         position, or None.
         """
-        height, width = context.shape
         params: Params = {
             "flares": [],
             "glare": self._draw_glare(context, rng),
-            "centre_xy_px": [width / 2, height / 2],
+            "centre_xy_px": context.camera.intrinsics[2:].tolist(),
             "mask_level_dn": float(self.mask_level_dn),
         }
         if self.flares:

@@ -206,7 +206,7 @@ class _LensStraylight(LensFault):
         scene, added = times(quantity.array, 1 - light.scene_lost), light.added
         if not light.scene_added:
             veil = sums(quantity.array) * light.scene_lost
-            plane = veil_per_px(context.shape, context.camera.focal_length_px)
+            plane = _in_frame(veil_per_px(_sensor_grid(context).shape, context.camera.focal_length_px), context)
             added = added + plane[..., None] * veil.astype(np.float32)
         if quantity.past_rims is None:
             return quantity.with_array(scene + added)
@@ -248,7 +248,7 @@ class _LensStraylight(LensFault):
             return AddedLight(added=scene, direct_left=1 - lost, scene_lost=lost, scene_added=True)
         source = replace(source, spikes=spikes)
         of_sun = source.straylight(channel_bands(context)[1] * context.sun_visible, once)
-        planes = of_sun.total(context.camera.exposure_s)
+        planes = _in_frame(of_sun.total(context.camera.exposure_s), context)
         added = cv2.merge(list(planes)).reshape(*context.shape, len(planes))
         return AddedLight(
             added=added if scene is None else added + scene,
@@ -292,8 +292,7 @@ class _LensStraylight(LensFault):
         theta, azimuth = sun
         camera, sensor, bands = context.camera, _sensor_grid(context), channel_bands(context)[0]
         assert context.sun_xy_px is not None
-        middle = np.array([camera.width_px / 2, camera.height_px / 2])
-        x, y = (np.asarray(context.sun_xy_px) - middle) * sensor.pitch_mm
+        x, y = (np.asarray(context.sun_xy_px) - _axis_px(context)) * sensor.pitch_mm
         area_mm2, axial_mm2 = camera.lens.pupil_area_mm2([np.tan(np.radians(theta)), 0.0])
         return SunInLens(
             lens=context.frame.prescription(params["lens"], params["coating"]),
@@ -344,18 +343,18 @@ class _LensStraylight(LensFault):
 
     def _ghosts(self, params: Params, context: FaultContext) -> list[dict[str, Any]]:
         """Return the brightest ghosts in the frame as plain data."""
-        source, camera = self.sun_in_lens(params, context), context.camera
+        source = self.sun_in_lens(params, context)
         if source is None:
             return []
-        pitch_mm = source.sensor.pitch_mm
+        pitch_mm, (axis_x, axis_y) = source.sensor.pitch_mm, _axis_px(context).tolist()
         once = anew if context.coating_loss else _of_view(context)  # each sample has its own loss of coatings
         return [
             {
                 "pair": list(g.pair),
                 "flux_fraction": g.flux_fraction,
                 "peak_irradiance_fraction": g.peak_irradiance_fraction,
-                "x_px": g.centroid_mm[0] / pitch_mm + camera.width_px / 2,
-                "y_px": g.centroid_mm[1] / pitch_mm + camera.height_px / 2,
+                "x_px": g.centroid_mm[0] / pitch_mm + axis_x,
+                "y_px": g.centroid_mm[1] / pitch_mm + axis_y,
                 "rms_radius_px": g.rms_radius_mm / pitch_mm,
             }
             for g in once(_brightest, source.of_ghosts)
@@ -437,8 +436,36 @@ def _far_points(context: FaultContext, reach: float) -> list[tuple[PointSources,
 
 
 def _sensor_grid(context: FaultContext) -> SensorGrid:
-    """Return the pixels of the camera."""
-    return SensorGrid(shape=context.shape, pitch_mm=context.camera.detector.pixel_pitch_um * 1e-3)
+    """Return the pixels of the camera, with those that a frame around its axis has more than a calibrated one."""
+    height, width = (size + abs(more) for size, more in zip(context.shape, _past_frame(context), strict=True))
+    return SensorGrid(shape=(height, width), pitch_mm=context.camera.detector.pixel_pitch_um * 1e-3)
+
+
+def _past_frame(context: FaultContext) -> tuple[int, int]:
+    """Return how many rows and columns a frame around the axis has more: below and to the right, or if negative
+    above and to the left.
+
+    The axis of a calibrated camera is its principal point, to half a pixel; that of others is in the middle.
+    """
+    cx, cy = context.camera.intrinsics[2:]
+    rows, columns = (
+        int(np.clip(round(2 * float(c) - size), -size, size))
+        for c, size in zip((cy, cx), context.shape, strict=True)
+    )
+    return rows, columns
+
+
+def _axis_px(context: FaultContext) -> F64:
+    """Return the position of the lens's axis in the frame, float64[2] in px."""
+    (height, width), (rows, columns) = context.shape, _past_frame(context)
+    return np.array([(width + columns) / 2, (height + rows) / 2])
+
+
+def _in_frame(planes: F32, context: FaultContext) -> F32:
+    """Return the part of planes on `_sensor_grid`, float32[..., y, x], that lies in the frame."""
+    (height, width), (rows, columns) = context.shape, _past_frame(context)
+    top, left = max(-rows, 0), max(-columns, 0)
+    return planes[..., top : top + height, left : left + width]
 
 
 def channel_bands(context: FaultContext) -> tuple[Bands, F64]:

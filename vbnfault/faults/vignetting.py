@@ -19,7 +19,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..lens.thin import cos4_map
+from ..core.calibration import Calibration
+from ..lens.thin import natural_falloff
 from .context import FaultContext, Params
 from .contract import Fault
 from .fields import Interval, Severity, bounds, number
@@ -56,7 +57,7 @@ class Cos4Vignetting(Fault):
         """Return E0, and the least loss of the pixels in the mask."""
         e0 = self.on_axis_illuminance_dn.uniform(rng)
         if self.frame_illuminance_dn is not None:
-            mean = float(cos4_map(context.shape, context.camera.focal_length_px).mean(dtype=np.float64))
+            mean = float(_falloff(context).mean(dtype=np.float64))
             e0 = min(self.frame_illuminance_dn / mean, 255.0)
         return {
             "on_axis_illuminance_dn": e0,
@@ -65,7 +66,8 @@ class Cos4Vignetting(Fault):
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
         """Return the expected electrons times the factor of each pixel."""
-        cos4 = _cos4_planes(context.shape, context.camera.focal_length_px, quantity.array.shape[2])
+        camera, channels = context.camera, quantity.array.shape[2]
+        cos4 = _planes(camera.lens.calibration, context.shape, camera.focal_length_px, channels)
         e0 = params["on_axis_illuminance_dn"] / 255
         return quantity.with_array(cv2.multiply(quantity.array, cos4, scale=e0).reshape(cos4.shape))
 
@@ -80,13 +82,21 @@ class Cos4Vignetting(Fault):
     def soft(self, params: Params, context: FaultContext) -> NDArray[np.float32]:
         """Return the factor on the light, float32[y, x]."""
         e0 = np.float32(params["on_axis_illuminance_dn"] / 255)
-        return e0 * cos4_map(context.shape, context.camera.focal_length_px)
+        return e0 * _falloff(context)
+
+
+def _falloff(context: FaultContext) -> NDArray[np.float32]:
+    """Return the falloff of the sample's thin lens, cos⁴θ without a calibration, float32[y, x]."""
+    camera = context.camera
+    return natural_falloff(camera.lens.calibration, context.shape, camera.focal_length_px)
 
 
 @lru_cache(maxsize=2)
-def _cos4_planes(shape: tuple[int, int], focal_length_px: float, channels: int) -> NDArray[np.float32]:
-    """Return cos⁴θ as float32[y, x, channel] with equal planes, read-only."""
+def _planes(
+    calibration: Calibration | None, shape: tuple[int, int], focal_length_px: float, channels: int
+) -> NDArray[np.float32]:
+    """Return the falloff as float32[y, x, channel] with equal planes, read-only."""
     # kept for all samples of a camera: one fast product replaces a broadcast
-    out = np.repeat(cos4_map(shape, focal_length_px)[..., None], channels, axis=2)
+    out = np.repeat(natural_falloff(calibration, shape, focal_length_px)[..., None], channels, axis=2)
     out.flags.writeable = False
     return out

@@ -280,6 +280,8 @@ class Injector:
             exposure_s = _ASSUMED_EXPOSURE_S
             assumed.append(f"camera.exposure_s = {exposure_s:g}: assumed, since the scene leaves it to be metered")
         for key, default in (("fov_deg", 65.0), ("detector", "")):
+            if key == "fov_deg" and table.calibration is not None:
+                continue
             if key not in table.model_fields_set and "focal_length_mm" not in table.model_fields_set:
                 assumed.append(f"camera.{key} = {default!r}: assumed, since the scene does not give it")
         if shape not in self._cameras:

@@ -39,8 +39,7 @@ def sun_direction(
             f"image.sun = {list(map(float, vector.ravel()))}: must be x and y in pixels, or a direction"
         )
     if len(vector) == 2:
-        slopes = camera.projection.slopes_at(vector[:1], vector[1:])
-        vector = np.array([*np.ravel(slopes), 1.0])
+        vector = camera.projection.directions_at(vector[:1], vector[1:]).ravel()
     return np.asarray(vector / np.linalg.norm(vector))
 
 

@@ -99,9 +99,9 @@ class ImageFrame:
 
     def beams(self, name: str) -> Beams:
         """Return the beams of `real_lens(name)`, from the axis to slightly beyond the frame's corners."""
-        slope = np.hypot(*self.slopes(np.array([self.width_px]), np.array([self.height_px])))
+        slope = np.hypot(*self.slopes(np.array([0, self.width_px]), np.array([0, self.height_px])))
         lens = self.real_lens(name)
-        return beams(lens.prescription, _MARGIN * float(slope[0, 0]), lens.sensor_mm)
+        return beams(lens.prescription, _MARGIN * float(slope.max()), lens.sensor_mm)
 
 
 @file_contents.cached_with_contents(maxsize=8)

@@ -37,7 +37,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..core import spectra
 from ..core.errors import InputError
 from ..core.quantities import Irradiance, Radiance, splat
-from ..core.sundisc import Floats, add_mean, pixel_sums
+from ..core.sundisc import LEAST_Z, Floats, add_mean, forward, pixel_sums
 from .glass import D_NM, RANGE_NM
 from .mapping import ChiefHeights, FieldMap, RadialModel, camera_model, chief_heights, field_map
 from .paraxial import paraxial_properties
@@ -112,6 +112,7 @@ class RealLens:
     blurs: ClassVar[bool] = True
     falls_off: ClassVar[bool] = True
     border_px: ClassVar[int] = REACH_PX
+    calibration: ClassVar[None] = None
 
     @property
     def real(self) -> RealLens:
@@ -466,8 +467,8 @@ class RealLens:
             light = self._resampling.resampled(source[band], tables.stretch[band], tables.solid_angle_sr[band])
             if fine is not None:
                 rays = self.chief_rays(bands[band], REACH_PX)
-                power = fine.power[band] * rays.beam_mm2(fine.slopes) * (passes[band] / pixel_mm2)
-                light += splat(rays.pixel_of(fine.slopes), power, (light.shape[0], light.shape[1]))
+                power = fine.power[band] * rays.beam_mm2(fine.directions) * (passes[band] / pixel_mm2)
+                light += splat(rays.pixel_of(fine.directions), power, (light.shape[0], light.shape[1]))
             array[band] = spreads.applied(light, band)[_INSIDE]
 
         with ThreadPoolExecutor(2) as pool:
@@ -521,8 +522,8 @@ class RealLens:
             if disc is not None:
                 add_mean(out[None], disc, rays, [band])
             if fine is not None:
-                mean = fine.power[band] / rays.solid_angle_sr(fine.slopes)
-                out = out + splat(rays.pixel_of(fine.slopes), mean, (self.height_px, self.width_px))
+                mean = fine.power[band] / rays.solid_angle_sr(fine.directions)
+                out = out + splat(rays.pixel_of(fine.directions), mean, (self.height_px, self.width_px))
             return out
 
         with ThreadPoolExecutor(2) as pool:
@@ -565,36 +566,40 @@ class ChiefRays:
     wavelength_nm: float
     margin_px: int
 
+    least_z: ClassVar[float] = LEAST_Z
+    foreshortens: ClassVar[bool] = True
+
     @property
     def _centre_px(self) -> F64:
         """Return the pixel position of the axis, float64[2]."""
         return np.array([self.lens.width_px, self.lens.height_px]) / 2 + self.margin_px
 
-    def pixel_of(self, slopes: F64) -> F64:
-        """Return the pixel positions x, y, float64[..., 2], of tangents x/z and y/z in C."""
+    def pixel_of(self, directions: F64) -> F64:
+        """Return the pixel positions x, y, float64[..., 2], of directions in C, float64[..., 3]."""
+        slopes = directions[..., :2] / directions[..., 2:]
         slope = np.maximum(np.hypot(slopes[..., 0], slopes[..., 1]), 1e-12)
         stretch = self.lens.distorted(slope, self.wavelength_nm) / slope
         return np.asarray(slopes * stretch[..., None] * self.lens.focal_length_px + self._centre_px)
 
-    def slopes_at(self, x_px: Floats, y_px: Floats) -> F64:
-        """Return the tangents x/z and y/z in C, float64[y, x, 2], at the positions of a grid."""
+    def directions_at(self, x_px: Floats, y_px: Floats) -> F64:
+        """Return the directions in C, float64[y, x, 3], at the positions of a grid."""
         x, y = ((v - c) / self.lens.focal_length_px for v, c in zip((x_px, y_px), self._centre_px, strict=True))
         distance = np.maximum(np.hypot(x[None, :], y[:, None]), 1e-12)
         stretch = self.lens.undistorted(distance, self.wavelength_nm) / distance
-        return np.stack([x * stretch, y[:, None] * stretch], axis=-1)
+        return forward(np.stack([x * stretch, y[:, None] * stretch], axis=-1))
 
-    def solid_angle_sr(self, slopes: F64) -> F64:
+    def solid_angle_sr(self, directions: F64) -> F64:
         """Return the projected solid angle of a pixel, cos⁴θ · t / (h dh/dt) times its area, float64[...]."""
         mapped = self.lens._map(self.wavelength_nm)
-        slope = np.maximum(np.hypot(slopes[..., 0], slopes[..., 1]), 1e-12)
+        slope = np.maximum(np.hypot(directions[..., 0], directions[..., 1]) / directions[..., 2], 1e-12)
         rise = np.interp(slope, mapped.slope, mapped.rise_mm)
         pixel_mm2 = (self.lens.pixel_pitch_um * 1e-3) ** 2
         return np.asarray(pixel_mm2 * slope / (mapped.height(slope) * rise * (1 + slope**2) ** 2))
 
-    def beam_mm2(self, slopes: F64) -> F64:
+    def beam_mm2(self, directions: F64) -> F64:
         """Return the area of the beam that passes all rims, float64[...]; 0 beyond the traced field."""
         mapped = self.lens._map(self.wavelength_nm)
-        slope = np.hypot(slopes[..., 0], slopes[..., 1])
+        slope = np.hypot(directions[..., 0], directions[..., 1]) / directions[..., 2]
         return np.asarray(np.interp(slope, mapped.slope, self.lens._beam_mm2(mapped.slope), right=0.0))
 
 

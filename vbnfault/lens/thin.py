@@ -33,8 +33,9 @@ import scipy.fft
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtr
 
+from ..core.calibration import Calibration
 from ..core.quantities import Irradiance, Radiance
-from ..core.sundisc import Pinhole
+from ..core.sundisc import Pinhole, Projection, slopes_of
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -44,8 +45,8 @@ F64 = NDArray[np.float64]
 class ThinLens:
     """Describe a thin lens; `focus_distance_m` is the object distance in focus (inf: focused at infinity).
 
-    `halo` is its point spread, None for an ideal image; pixels then subtend `pixel_rad`. It answers the
-    same questions as a `RealLens`.
+    `halo` is its point spread, None for an ideal image; pixels then subtend `pixel_rad`. The `calibration` of the
+    frame distorts the image; None: it is rectilinear. The class answers the same questions as a `RealLens`.
     """
 
     focal_length_mm: float
@@ -54,13 +55,13 @@ class ThinLens:
     focus_distance_m: float = float("inf")
     halo: Halo | None = None
     pixel_rad: float = 0.0
+    calibration: Calibration | None = None
 
     name: ClassVar[str] = "thin lens"
     resamples: ClassVar[bool] = False
     falls_off: ClassVar[bool] = False
     guard_px: ClassVar[tuple[int, int]] = (0, 0)
     border_px: ClassVar[int] = 0
-    distortion_valid_to_deg: ClassVar[float] = 90.0
     distortion_residual_px: ClassVar[tuple[float, float]] = (0.0, 0.0)
 
     @property
@@ -80,7 +81,7 @@ class ThinLens:
             "efl_mm": self.focal_length_mm,
             "f_number": self.f_number,
             "transmission": self.transmission,
-            "summary": f"{self.name} of {self.focal_length_mm:.4g} mm, f/{self.f_number:.3g}",
+            "summary": f"{self.name} of {self.focal_length_mm:.4g} mm, f/{self.f_number:.3g}{self._calibrated}",
         }
 
     @property
@@ -93,25 +94,51 @@ class ThinLens:
         return np.full(len(wavelength_nm), float(self.transmission))
 
     def pupil_area_mm2(self, slope: ArrayLike) -> F64:
-        """Return the area of the beam that passes the pupil, π (f / 2N)², for any tangent of the field angle."""
-        return np.full(np.shape(slope), np.pi * (self.focal_length_mm / (2 * self.f_number)) ** 2)
+        """Return the area of the beam that passes the pupil, π (f / 2N)², for any tangent of the field angle.
+
+        It lies across the axis. The pupil of a fisheye turns towards the light, which widens it by 1 / cos θ.
+        """
+        area = np.full(np.shape(slope), np.pi * (self.focal_length_mm / (2 * self.f_number)) ** 2)
+        if self.calibration is None or self.calibration.foreshortens:
+            return area
+        return np.asarray(area * np.sqrt(1 + np.square(slope)))
+
+    @property
+    def _calibrated(self) -> str:
+        """Return the clause of a summary that names the model of the calibration."""
+        return "" if self.calibration is None else f", calibrated by the model {self.calibration.model}"
 
     @property
     def distortion(self) -> F64:
-        """Return OpenCV's eight coefficients, all 0."""
-        return np.zeros(8)
+        """Return OpenCV's coefficients: eight that are 0, or those of the calibration."""
+        if self.calibration is None:
+            return np.zeros(8)
+        return np.array(list(self.calibration.stored_coefficients.values()))
+
+    @property
+    def distortion_valid_to_deg(self) -> float:
+        """Return the angle from the boresight up to which `distortion` holds."""
+        return 90.0 if self.calibration is None else self.calibration.valid_to_deg
 
     def distorted(self, slope: F64) -> F64:
         """Return the tangents of the field angles: they are the image heights in focal lengths."""
         return slope
 
     def field_slopes(self, x: NDArray, y: NDArray) -> tuple[NDArray, NDArray]:
-        """Return image heights in focal lengths: they are the tangents of the field angles."""
-        return x, y
+        """Return the tangents of the field angles of image heights in focal lengths from the middle of the frame.
 
-    def projection(self, intrinsics: F64) -> Pinhole:
-        """Return the rectilinear map between directions and pixels; `intrinsics` are fx, fy, cx, cy."""
-        return Pinhole(intrinsics)
+        Without a calibration they are the heights.
+        """
+        if self.calibration is None:
+            return x, y
+        f, size = self.calibration.focal_length_px, (self.calibration.width_px, self.calibration.height_px)
+        d = self.calibration.directions_of(np.stack([x * f + size[0] / 2, y * f + size[1] / 2], axis=-1))
+        slopes = slopes_of(d)
+        return slopes[..., 0].astype(np.float32), slopes[..., 1].astype(np.float32)
+
+    def projection(self, intrinsics: F64) -> Projection:
+        """Return the map between directions and pixels; `intrinsics` are fx, fy, cx, cy of a rectilinear one."""
+        return self.calibration or Pinhole(intrinsics)
 
     def on_axis(self, radiance: Radiance) -> Irradiance:
         """Return the irradiance of radiance of any shape, which does not depend on the position in the image."""
@@ -132,6 +159,8 @@ class ThinLens:
         (physics.md, section 6, warns of counting it twice).
         """
         sharp = self.on_axis(radiance)
+        if self.calibration is not None and self.calibration.circle_deg is not None:
+            sharp = replace(sharp, array=sharp.array * image_circle(self.calibration))
         if self.halo is None:
             return sharp
         return replace(sharp, array=np.asarray(self.halo.applied(sharp.array, self.pixel_rad)))
@@ -144,12 +173,13 @@ class ThinLens:
     def image_of_sun(self, radiance: Radiance, pixel_pitch_um: float) -> Irradiance:
         """Return the irradiance of the Sun's direct image, π T L cos⁴θ / (4 N²), per band.
 
-        Its power is E☉ T A cos θ at every field angle, the flux that the pupil admits.
+        Its power is E☉ T A cos θ at every field angle, the flux that the pupil admits; that of a fisheye turns
+        towards the light and admits E☉ T A.
         """
         as_scene = self.on_axis(radiance).array
         shape = as_scene.shape[1:]
-        cos4 = cos4_map((int(shape[0]), int(shape[1])), self.focal_length_mm * 1e3 / pixel_pitch_um)
-        array = as_scene * cos4
+        size, focal_length_px = (int(shape[0]), int(shape[1])), self.focal_length_mm * 1e3 / pixel_pitch_um
+        array = as_scene * natural_falloff(self.calibration, size, focal_length_px)
         if self.halo is not None:
             # in float64: the rounding errors of the Sun's disc may be as bright as the scene
             array = np.asarray(self.halo.applied(array.astype(np.float64), self.pixel_rad), dtype=np.float32)
@@ -167,6 +197,31 @@ def cos4_map(shape: tuple[int, int], focal_length_px: float) -> F32:
     y2 = ((np.arange(height) + 0.5 - height / 2) / focal_length_px) ** 2
     cos2 = 1 / (1 + x2[None, :] + y2[:, None])
     out = (cos2 * cos2).astype(np.float32)
+    out.flags.writeable = False
+    return out
+
+
+@lru_cache(maxsize=2)
+def natural_falloff(calibration: Calibration | None, shape: tuple[int, int], focal_length_px: float) -> F32:
+    """Return the light of a uniform scene through a pupil of one size, float32[y, x], read-only; 1 on the axis.
+
+    It is cos⁴θ in a rectilinear frame. In a calibrated one it is the solid angle of every pixel, over that of a
+    pinhole's pixel on the axis.
+    """
+    if calibration is None:
+        return cos4_map(shape, focal_length_px)
+    seen = calibration.directions_at(*(np.arange(size) + 0.5 for size in shape[::-1]))
+    out = (calibration.solid_angle_sr(seen) * calibration.fx * calibration.fy).astype(np.float32)
+    out *= image_circle(calibration)
+    out.flags.writeable = False
+    return out
+
+
+@lru_cache(maxsize=2)
+def image_circle(calibration: Calibration) -> NDArray[np.bool_]:
+    """Return the pixels of a calibration's frame whose centres lie in its image circle, bool[y, x], read-only."""
+    size = calibration.width_px, calibration.height_px
+    out = calibration.is_lit(calibration.directions_at(*(np.arange(n) + 0.5 for n in size)))
     out.flags.writeable = False
     return out
 

@@ -1,7 +1,7 @@
 """Relate pixels of two views by depth, pose and the camera model that a dataset stores.
 
 Pixel coordinates are (x, y) from the image's top left corner; pixel centres lie at +0.5. The camera model is
-OpenCV's: intrinsics fx, fy, cx, cy and the coefficients k1, k2, p1, p2, k3, k4, k5, k6 of the rational distortion.
+OpenCV's: intrinsics fx, fy, cx, cy and the coefficients of a `core.calibration`.
 """
 
 from __future__ import annotations
@@ -13,13 +13,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.errors import InputError
+from ..core.calibration import Calibration
+from ..core.errors import InputError, under_key
 
 F64 = NDArray[np.float64]
-
-_NEWTON_STEPS = 12
-_FOLD_STEP_DEG = 0.02
-_DIFFERENCE = 1e-6  # step of the numeric derivative, in focal lengths
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -38,7 +35,11 @@ class CameraView:
     camera_position_T_m
         float64[3]: position of the camera in T, in m. Any frame that is fixed in the ground serves as T.
     distortion
-        OpenCV's k1, k2, p1, p2, k3, k4, k5, k6, float64[8], or the first 4 or 5 of them.
+        OpenCV's k1, k2, p1, p2, k3, k4, k5, k6, float64[8], the first 4 or 5 of them, or 12 or 14 with thin prism
+        and tilt; k1 to k4 of a fisheye.
+    model
+        "opencv", "fisheye" or "undistorting" (`Calibration`): the attribute `model` of the array `distortion` of a
+        calibrated camera.
     valid_to_deg
         Angle from the boresight up to which `distortion` holds, the attribute `valid_to_deg` of the array
         `distortion`. None: up to where the model first folds, which is computed. Farther directions have no pixel.
@@ -56,6 +57,7 @@ class CameraView:
     camera_from_T: F64
     camera_position_T_m: F64
     distortion: F64 = field(default_factory=lambda: np.zeros(8))
+    model: str = "opencv"
     valid_to_deg: float | None = None
     depth_m: NDArray[Any] | None = None
 
@@ -73,8 +75,10 @@ class CameraView:
         if np.abs(matrix @ matrix.T - np.eye(3)).max() > 1e-6:
             raise InputError("view.camera_from_T: is no rotation; give a rotation matrix or a unit quaternion")
         object.__setattr__(self, "camera_from_T", matrix)
-        if self.valid_to_deg is not None and not 0 < self.valid_to_deg <= 90:
-            raise InputError(f"view.valid_to_deg = {self.valid_to_deg}: must be above 0 and at most 90")
+        if self.valid_to_deg is not None and not 0 < self.valid_to_deg <= 180:
+            raise InputError(f"view.valid_to_deg = {self.valid_to_deg}: must be above 0 and at most 180")
+        with under_key("view"):
+            _ = self.calibration
 
     @property
     def matrix(self) -> F64:
@@ -87,28 +91,24 @@ class CameraView:
 
         NaN for pixels so far outside the frame that no direction up to `valid_to_deg` reaches them.
         """
-        fx, fy, cx, cy = self.intrinsics
-        target = (np.asarray(xy, dtype=np.float64) - (cx, cy)) / (fx, fy)
-        k = self.distortion
-        if not k.any():
-            return target
-        slopes = target.copy()
-        step_x, step_y = _DIFFERENCE * np.eye(2)
-        for _ in range(_NEWTON_STEPS):
-            value = _distorted(slopes, k)
-            along_x = (_distorted(slopes + step_x, k) - value) / _DIFFERENCE
-            along_y = (_distorted(slopes + step_y, k) - value) / _DIFFERENCE
-            off = value - target
-            determinant = along_x[:, 0] * along_y[:, 1] - along_y[:, 0] * along_x[:, 1]
-            slopes[:, 0] -= (off[:, 0] * along_y[:, 1] - off[:, 1] * along_y[:, 0]) / determinant
-            slopes[:, 1] -= (off[:, 1] * along_x[:, 0] - off[:, 0] * along_x[:, 1]) / determinant
-        found = (np.abs(_distorted(slopes, k) - target) < _DIFFERENCE).all(axis=1, keepdims=True)
-        return np.where(found & self._is_valid(slopes), slopes, np.nan)
+        directions = self.calibration.directions_of(xy)
+        slopes = directions[:, :2] / directions[:, 2:]
+        return np.where(self._is_valid(directions), slopes, np.nan)
 
-    def _is_valid(self, slopes: F64) -> NDArray[np.bool_]:
-        """Return whether the distortion holds for tangents float64[n, 2], bool[n, 1]."""
-        limit_deg = _fold_deg(self.distortion) if self.valid_to_deg is None else self.valid_to_deg
-        return np.asarray(np.degrees(np.arctan(np.hypot(slopes[:, :1], slopes[:, 1:]))) <= limit_deg)
+    @property
+    def calibration(self) -> Calibration:
+        """Return the camera model as a calibration; the size of its image is unknown."""
+        fx, fy, cx, cy = self.intrinsics.tolist()
+        coefficients = tuple(self.distortion.tolist())
+        return Calibration(
+            model=self.model, width_px=1, height_px=1, fx=fx, fy=fy, cx=cx, cy=cy, coefficients=coefficients
+        )
+
+    def _is_valid(self, directions: F64) -> NDArray[np.bool_]:
+        """Return whether the distortion holds for directions float64[n, 3], bool[n, 1]."""
+        limit_deg = self.calibration.valid_to_deg if self.valid_to_deg is None else self.valid_to_deg
+        across = np.hypot(directions[:, :1], directions[:, 1:2])
+        return np.asarray(np.degrees(np.arctan2(across, directions[:, 2:])) <= limit_deg)
 
     def points_T_m(self, xy: F64) -> F64:
         """Return the points of the ground that pixels see, float64[n, 3] in T; NaN where they see the sky.
@@ -147,22 +147,18 @@ class CameraView:
     def project(self, points_T_m: F64) -> F64:
         """Return the pixels of points float64[n, 3] in T, float64[n, 2].
 
-        NaN where they lie behind the camera, or farther off its boresight than `valid_to_deg`: there the distortion
-        may fold back into the frame.
+        NaN where they lie behind the camera (a fisheye sees there, too), or farther off its boresight than
+        `valid_to_deg`: there the distortion may fold back into the frame.
         """
         in_C = (np.asarray(points_T_m, dtype=np.float64) - self.camera_position_T_m) @ self.camera_from_T.T
-        z = np.where(in_C[:, 2] > 0, in_C[:, 2], np.nan)
-        fx, fy, cx, cy = self.intrinsics
-        slopes = in_C[:, :2] / z[:, None]
-        pixels = _distorted(slopes, self.distortion) * (fx, fy) + (cx, cy)
-        return np.where(self._is_valid(slopes), pixels, np.nan)
+        return np.where(self._is_valid(in_C), self.calibration.pixel_of(in_C), np.nan)
 
 
 _SHAPES: dict[str, tuple[tuple[int, ...], ...]] = {
     "intrinsics": ((4,),),
     "camera_from_T": ((4,), (3, 3)),
     "camera_position_T_m": ((3,),),
-    "distortion": ((8,), (5,), (4,)),
+    "distortion": ((8,), (4,), (5,), (12,), (14,)),
 }
 
 
@@ -211,32 +207,5 @@ def _matrix(quaternion: F64) -> F64:
             [w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)],
             [2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)],
             [2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z],
-        ]
-    )
-
-
-def _fold_deg(coefficients: F64) -> float:
-    """Return the angle up to which the radial distortion rises without a pole; 90 where it always does."""
-    slope = np.tan(np.radians(np.arange(0, 90, _FOLD_STEP_DEG)))
-    k = np.zeros(8)
-    k[: len(coefficients)] = coefficients
-    k[2:4] = 0
-    with np.errstate(all="ignore"):
-        distance = _distorted(np.column_stack([slope, 0 * slope]), k)[:, 0]
-        wrong = ~(np.diff(distance) > 0)
-    return float(_FOLD_STEP_DEG * np.argmax(wrong)) if wrong.any() else 90.0
-
-
-def _distorted(slopes: F64, coefficients: F64) -> F64:
-    """Return image positions in focal lengths, float64[n, 2], by the model of `cv2.projectPoints`."""
-    k = np.zeros(8)
-    k[: len(coefficients)] = coefficients
-    x, y = slopes[:, 0], slopes[:, 1]
-    r2 = x * x + y * y
-    radial = (1 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))) / (1 + r2 * (k[5] + r2 * (k[6] + r2 * k[7])))
-    return np.column_stack(
-        [
-            x * radial + 2 * k[2] * x * y + k[3] * (r2 + 2 * x * x),
-            y * radial + k[2] * (r2 + 2 * y * y) + 2 * k[3] * x * y,
         ]
     )

@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import isotonic_regression
 
+from ..core.calibration import COEFFICIENTS
 from ..core.files.path_checks import real
 from ..core.files.whole_files import replacing, write_json
-from ..lens import Prescription, open_f_number, paraxial_properties
+from ..lens import Prescription, RealLens, open_f_number, paraxial_properties
 from ..lens.rays import real_pupil_diameter_mm, trace
 
 if TYPE_CHECKING:
@@ -37,6 +38,36 @@ def figures(lens: Prescription) -> dict[str, float]:
 def write_table(lens: Prescription, path: Path) -> None:
     """Write name, source and `figures` as JSON; null for a value that is infinite, such as a pupil's position."""
     write_json(path, {"name": lens.name, "source": lens.source, **figures(lens)})
+
+
+def opencv_fit(lens: Prescription, fov_deg: float, width_px: int, height_px: int) -> str:
+    """Return the lens's distortion as a table `[camera.calibration]` of OpenCV's rational model, with the residual.
+
+    The image of `width_px` x `height_px` pixels has the field of view `fov_deg` across its width, without
+    distortion. Raises InputError if no model reaches its corners.
+    """
+    f_px = width_px / 2 / float(np.tan(np.radians(fov_deg) / 2))
+    pitch_um = paraxial_properties(lens).efl_mm * 1e3 / f_px
+    real_lens = RealLens(prescription=lens, width_px=width_px, height_px=height_px, pixel_pitch_um=pitch_um)
+    rms, most = real_lens.distortion_residual_px
+    values = {
+        "model": '"opencv"',
+        "width_px": width_px,
+        "height_px": height_px,
+        "fx": f"{f_px:.10g}",
+        "cx": f"{width_px / 2 - 0.5:.10g}",
+        "cy": f"{height_px / 2 - 0.5:.10g}",
+    }
+    coefficients = zip(COEFFICIENTS["opencv"][:8], real_lens.distortion.tolist(), strict=True)
+    values |= {name: f"{value:.12g}" for name, value in coefficients if name[0] == "k"}
+    return "\n".join(
+        [
+            "[camera.calibration]",
+            *(f"{key} = {value}" for key, value in values.items()),
+            f"# residual over the lit frame: {rms:.4f} px rms, {most:.4f} px at most; "
+            f"holds to {real_lens.distortion_valid_to_deg:.2f} deg from the axis",
+        ]
+    )
 
 
 def draw(lens: Prescription, path: Path, *, half_field_deg: float = 20.0) -> None:

@@ -101,8 +101,7 @@ def _edges(surface: TerrainMesh, scene: RenderInput, truth: Truth) -> Edges:
     if not len(row):
         nothing = np.zeros((0, _EDGE_LINES**2))
         return Edges(row=row, column=column, depth_m=nothing.astype(np.float32), semantic=nothing.astype(np.uint8))
-    fx, fy, cx, cy = scene.view.intrinsics
     x, y = edge_positions_px(row, column, _EDGE_LINES)
-    slopes = np.stack([(x - cx) / fx, (y - cy) / fy], axis=-1)
-    seen = render.truth(surface, scene.view, scene.sun, slopes=slopes)
+    directions = scene.view.pixel_map.directions_of(np.stack([x, y], axis=-1))
+    seen = render.truth(surface, scene.view, scene.sun, directions=directions)
     return Edges(row=row, column=column, depth_m=seen.depth_m, semantic=seen.semantic)

@@ -55,8 +55,7 @@ def _metered_light(spec: SampleSpec, rendering: Rendering) -> tuple[float, Elect
 def limited(scene: Scene, rendered: RenderInput) -> Scene:
     """Return a scene with the longest exposure of a view: shorter where the Sun is in the frame or near it."""
     towards_sun_s, view = scene.camera.exposure_max_towards_sun_s, rendered.view
-    fx, fy, _, _ = view.intrinsics
-    corner_deg = math.degrees(math.atan(math.hypot(view.width_px / fx, view.height_px / fy) / 2))
+    corner_deg = math.degrees(view.corner_rad)
     away_deg = math.degrees(math.acos(np.clip(view.L_from_C[:, 2] @ rendered.sun.direction_L, -1, 1)))
     if towards_sun_s is None or away_deg > corner_deg + _NEAR_FRAME_DEG:
         return scene
@@ -111,10 +110,9 @@ def foreseen_exposure_s(scene: Scene, camera: Camera, truth: Truth, view: View, 
     fixed = scene.camera.exposure_s
     if fixed != "auto":
         return float(fixed)
-    fx, fy, cx, cy = view.intrinsics
-    slopes = camera.seen_slopes[::2, ::2]
-    column = np.clip((slopes[..., 0] * fx + cx).astype(np.intp), 0, view.width_px - 1)
-    row = np.clip((slopes[..., 1] * fy + cy).astype(np.intp), 0, view.height_px - 1)
+    position = view.pixel_map.pixel_of(camera.seen_directions[::2, ::2])
+    column = np.clip(position[..., 0].astype(np.intp), 0, view.width_px - 1)
+    row = np.clip(position[..., 1].astype(np.intp), 0, view.height_px - 1)
     body = truth.semantic[::2, ::2] == BODY
     seen = radiance.array.reshape(len(radiance.array), -1)[:, (row * view.width_px + column)[body]]
     rate = rate_on_axis(camera, Radiance(array=seen[:, None], wavelength_nm=radiance.wavelength_nm))

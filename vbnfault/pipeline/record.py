@@ -147,8 +147,8 @@ def points_T_m(frame: Frame) -> F64:
     depth = np.where(
         np.isfinite(frame.rendering.truth.depth_m), frame.rendering.truth.depth_m.astype(np.float64), np.nan
     )
-    slopes = frame.camera.seen_slopes
-    seen_C = np.stack([slopes[..., 0] * depth, slopes[..., 1] * depth, depth], axis=-1)
+    directions = frame.camera.seen_directions
+    seen_C = directions * (depth / directions[..., 2])[..., None]
     site, pose = frame.spec.terrain.site, frame.pose
     T_from_C = site.T_from_L @ pose.L_from_C
     camera_T_m = site.position_T_m + site.T_from_L @ pose.position_L_m

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core import spectra
+from ..core.calibration import Calibration
 from ..core.quantities import BODY, SKY, FarSource, FineLight, Radiance, Truth
-from ..core.sundisc import Projection
+from ..core.sundisc import Projection, forward
 from ..lens.straylight.scene import RenderGrid, surrounding_grids
 from ..render.description import RenderInput, View
 from ..world import assemble, ephemeris
@@ -40,6 +41,7 @@ def describe(spec: SampleSpec, pose: Pose) -> RenderInput:
         height_px=camera.height_px + 2 * guard_y,
         aperture_radius_m=camera.lens.aperture_radius_m,
         focus_distance_m=camera.lens.focus_distance_m,
+        projection=camera.lens.calibration,
     )
     return RenderInput(
         view=view,
@@ -56,8 +58,9 @@ def describe(spec: SampleSpec, pose: Pose) -> RenderInput:
 def render_view(spec: SampleSpec, pose: Pose) -> Rendering:
     """Render the radiance of every band, and the truth layers.
 
-    The renderer has pinhole cameras only. With a lens prescription it therefore renders a guard band around the
-    image. Truth follows the chief rays of the pixel centres. A body of few pixels is rendered in a close-up.
+    With a lens prescription it renders a pinhole's image with a guard band around it, which the lens distorts. A
+    calibrated camera is rendered with its own rays. Truth follows the rays of the pixel centres. A body of few
+    pixels is rendered in a close-up.
     """
     from .. import render
 
@@ -100,10 +103,27 @@ def seen_truth(spec: SampleSpec, scene: RenderInput) -> Truth:
     from .. import render
 
     camera, angles = spec.camera, bool(ANGLE_LAYERS & set(spec.scene.dataset.layers))
+    is_distorted = camera.lens.resamples or camera.lens.calibration is not None
     lens: dict[str, Any] = (
-        {"slopes": camera.seen_slopes, "projection": camera.projection} if camera.lens.resamples else {}
+        {"directions": camera.seen_directions, "projection": camera.projection} if is_distorted else {}
     )
-    return render.truth(spec.terrain.surface, scene.view, scene.sun, angles=angles, **lens)
+    truth = render.truth(spec.terrain.surface, scene.view, scene.sun, angles=angles, **lens)
+    calibration = camera.lens.calibration
+    return truth if calibration is None else _in_circle(truth, calibration, camera.seen_directions)
+
+
+def _in_circle(truth: Truth, calibration: Calibration, directions: NDArray[np.float64]) -> Truth:
+    """Return truth that has the sky where no light reaches the frame, beyond the image circle."""
+    dark = ~calibration.is_lit(directions)
+    if not dark.any():
+        return truth
+    sky = {"depth_m": np.inf, "normal": 0, "semantic": SKY, "material": -1}
+    arrays = {}
+    for name, values in vars(truth).items():
+        if values is not None:
+            arrays[name] = values.copy()
+            arrays[name][dark] = sky.get(name, np.nan)
+    return replace(truth, **arrays)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -132,6 +152,8 @@ def body_of_few_pixels(spec: SampleSpec, pose: Pose, scene: RenderInput) -> FewP
     """Return the body in a close-up, with its air and the dust in front of it; None if the body is wider."""
     from .. import render
 
+    if scene.view.projection is not None and spec.scene.coma is not None:
+        return None  # the dust around a close-up is known on the grid of a pinhole only
     air = spec.scene.body.atmosphere
     near = render.close_up(
         spec.terrain.surface, scene.view, 0.0 if air is None else render.TOP_SCALE_HEIGHTS * air.scale_height_m
@@ -169,7 +191,7 @@ def with_body(truth: Truth, body: FewPixels, projection: Projection) -> Truth:
     if near.size_px >= 1 or not len(row):
         return truth
     k = np.argmin((row - row.mean()) ** 2 + (column - column.mean()) ** 2)
-    x, y = np.floor(projection.pixel_of(near.slopes[row[k], column[k]])).astype(int)
+    x, y = np.floor(projection.pixel_of(forward(near.slopes[row[k], column[k]]))).astype(int)
     height, width = truth.semantic.shape
     if not (0 <= x < width and 0 <= y < height):
         return truth

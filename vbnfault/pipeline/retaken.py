@@ -20,7 +20,7 @@ from ..body import Site
 from ..core import frames
 from ..core.errors import VbnfaultError
 from ..core.quantities import SKY, Radiance, Sample, Truth
-from ..core.sundisc import Pinhole, add_mean
+from ..core.sundisc import add_mean
 from ..render.description import RenderInput, may_see_sun
 from ..scene.config import Scene
 from ..scene.plan import EarlierViews, Plan
@@ -309,7 +309,7 @@ def _radiance(spec: SampleSpec, scene: RenderInput, stored: StoredView) -> Radia
         disc = render.sun_in_view(spec.terrain.surface, view, scene.sun)
     if disc is not None:
         sun = np.zeros(array.shape, np.float32)
-        if add_mean(sun, disc, Pinhole(view.intrinsics), range(len(array))) is None:
+        if add_mean(sun, disc, view.pixel_map, range(len(array))) is None:
             sun = disc = None
     if sun is not None and not exact:
         # the stored sum does not say how bright the scene is in these pixels: it is as if it were dark

@@ -129,9 +129,7 @@ def air_light(
         radiance that is left; 1 where no ground is seen.
     """
     height, width = depth_m.shape
-    fx, fy, cx, cy = view.intrinsics
-    x, y = np.meshgrid((np.arange(width) + 0.5 - cx) / fx, (np.arange(height) + 0.5 - cy) / fy)
-    rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
+    rays = view.pixel_map.directions_at(np.arange(width) + 0.5, np.arange(height) + 0.5).reshape(-1, 3)
     length = np.linalg.norm(rays, axis=1)
     towards_L = rays / length[:, None] @ view.L_from_C.T
     radius_m = float(np.cbrt(np.prod(air.semi_axes_m)))
@@ -148,7 +146,10 @@ def air_light(
     miss2 = np.maximum(start @ start - along**2, 0)
     half = np.sqrt(np.maximum((unit + TOP_SCALE_HEIGHTS) ** 2 - miss2, 0))
     begin = np.maximum(along - half, 0)
-    reach = np.where(is_ground.ravel(), depth_m.ravel().astype(np.float64) * length, np.inf) / air.scale_height_m
+    reach = (
+        np.where(is_ground.ravel(), depth_m.ravel().astype(np.float64) / rays[:, 2] * length, np.inf)
+        / air.scale_height_m
+    )
     end = np.minimum(along + half, reach * stretch)
     # A line that dips into the sphere ends there; one without known ground that passes between facets does not.
     # Facets may lie below the sphere, and a ray between two of them may even see the far side.

@@ -84,6 +84,7 @@ def _halved(view: View) -> View:
     return replace(
         view,
         intrinsics=view.intrinsics / 2,
+        projection=None if view.projection is None else view.projection.scaled_by(0.5, 0.5),
         width_px=-(-view.width_px // 2),
         height_px=-(-view.height_px // 2),
     )
@@ -290,9 +291,9 @@ class _Guide:
         """Return the normal, the position in camera axes and the depth (0 on the sky) at pixels."""
         record = dr.gather(mi.Vector4f, self._record, mi.UInt32(y * self.width + x))
         depth = record.w
-        across = (mi.Float(x) + 0.5 - self.optics.centre.x) * self.optics.scale.x
-        down = (mi.Float(y) + 0.5 - self.optics.centre.y) * self.optics.scale.y
-        return record.xyz, mi.Vector3f(across * depth, down * depth, depth), depth
+        across, down, along = self.optics.towards(mi.Float(x) + 0.5, mi.Float(y) + 0.5)
+        length = depth if along is None else depth / along
+        return record.xyz, mi.Vector3f(across * length, down * length, depth), depth
 
     def filtered(self, values: Any, stride: int) -> Any:
         """Return the values averaged over 5 × 5 pixels that are `stride` apart and lie on the same surface."""

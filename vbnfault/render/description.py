@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.calibration import Calibration
+from ..core.sundisc import Pinhole
 from ..reflectance import BandReflectance
 
 F64 = NDArray[np.float64]
 
+_BORDER = 65  # positions along a side of the frame of a camera with distortion
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class View:
-    """Describe a pinhole or thin-lens view of a patch, in the site's L axes (origin at the site, metres).
+    """Describe the view of a pinhole or a thin lens of a patch, in the site's L axes (origin at the site, metres).
 
     Attributes
     ----------
@@ -28,6 +33,8 @@ class View:
         An aperture of 0 is a pinhole; the focus distance may be inf.
     start_m
         Distance from the camera at which its rays start. Before a far body, they keep the precision of float32.
+    projection
+        Calibration of a camera with distortion. None: the pinhole of the intrinsics.
     """
 
     position_L_m: F64
@@ -38,6 +45,32 @@ class View:
     aperture_radius_m: float = 0.0
     focus_distance_m: float = float("inf")
     start_m: float = 0.0
+    projection: Calibration | None = None
+
+    @property
+    def pixel_map(self) -> Pinhole | Calibration:
+        """Return the map between directions and pixels."""
+        return Pinhole(self.intrinsics) if self.projection is None else self.projection
+
+    @property
+    def corner_rad(self) -> float:
+        """Return the angle of a corner from the boresight, with distortion the largest angle along the border."""
+        if self.projection is None:
+            fx, fy = self.intrinsics[:2]
+            return math.atan(math.hypot(self.width_px / fx, self.height_px / fy) / 2)
+        x, y = (np.linspace(0, size, _BORDER) for size in (self.width_px, self.height_px))
+        grids = (self.projection.directions_at(x, y[[0, -1]]), self.projection.directions_at(x[[0, -1]], y))
+        return float(np.arccos(np.clip(min(grid[..., 2].min() for grid in grids), -1, 1)))
+
+    def rays_C(self, x_px: F64, y_px: F64) -> tuple[F64, F64, F64 | float]:
+        """Return x, y and z in C of the directions at pixel positions, which fit together; z = 1 of a pinhole."""
+        if self.projection is None:
+            fx, fy, cx, cy = self.intrinsics
+            return (x_px - cx) / fx, (y_px - cy) / fy, 1.0
+        x, y, z = np.moveaxis(
+            self.projection.directions_of(np.stack(np.broadcast_arrays(x_px, y_px), axis=-1)), -1, 0
+        )
+        return x, y, z
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -107,6 +140,8 @@ def may_see_sun(view: View, sun: Sunlight) -> bool:
     The margin is far larger than the lens's finite aperture.
     """
     x, y, z = view.L_from_C.T @ sun.direction_L
+    if view.projection is not None:
+        return bool(np.arccos(np.clip(z, -1, 1)) < view.corner_rad + 2 * sun.angular_radius_rad + 0.02)
     fx, fy, cx, cy = view.intrinsics
     if z <= 0:
         return False

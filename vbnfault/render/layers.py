@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.quantities import BODY, SKY, SPACECRAFT, SUN, SunInView, Truth
-from ..core.sundisc import Pinhole, Projection, bounds_px, pixel_sums
+from ..core.sundisc import Projection, bounds_px, pixel_sums
 from .albedo import GroundPoints
 from .description import Sunlight, View
 from .light import sun_in_view
@@ -23,7 +23,7 @@ def truth(
     sun: Sunlight,
     *,
     angles: bool = False,
-    slopes: NDArray[np.float64] | None = None,
+    directions: NDArray[np.float64] | None = None,
     projection: Projection | None = None,
 ) -> Truth:
     """Return depth, normal and semantic class at every pixel centre, from one ray each.
@@ -36,14 +36,15 @@ def truth(
     ----------
     angles
         Return also the angles of incidence, emission and phase, the dust and the spacecraft's materials.
-    slopes
-        float64[y, x, 2]: tangents x/z and y/z of the rays in C. None: those of the view's pinhole.
+    directions
+        float64[y, x, 3]: vectors along the rays in C. None: those of the view.
     projection
-        The same map for all positions in these pixels. None: the view's pinhole; with slopes, no pixel has the Sun.
+        The same map for all positions in these pixels. None: that of the view; with directions, no pixel has the
+        Sun.
     """
     optics = Optics(view)
-    shape = (view.height_px, view.width_px) if slopes is None else slopes.shape[:2]
-    rays = optics.centre_rays() if slopes is None else optics.rays_of(slopes)
+    shape = (view.height_px, view.width_px) if directions is None else directions.shape[:2]
+    rays = optics.centre_rays() if directions is None else optics.rays_of(directions)
     hit = surface.seen_from(view).intersect(rays)
     hit.start_m = optics.start_m
     boresight = optics.axes[2]
@@ -73,9 +74,9 @@ def truth(
             layers["material"] = dr.select(hit.on_vehicle, mi.Int32(hit.material), mi.Int32(-1))
     dr.eval(*in_camera, semantic, *layers.values())
     classes = semantic.numpy().astype(np.uint8).reshape(shape)
-    disc = sun_in_view(surface, view, sun) if slopes is None or projection is not None else None
+    disc = sun_in_view(surface, view, sun) if directions is None or projection is not None else None
     if disc is not None:
-        _mark_sun(classes, disc, Pinhole(view.intrinsics) if projection is None else projection)
+        _mark_sun(classes, disc, view.pixel_map if projection is None else projection)
     return Truth(
         normal=np.stack([c.numpy() for c in in_camera], axis=-1).astype(np.float16).reshape(*shape, 3),
         semantic=classes,
@@ -91,8 +92,7 @@ def _mark_sun(classes: NDArray[np.uint8], disc: SunInView, projection: Projectio
     holds = sums.values[0] > 0
     part = classes[sums.rows, sums.columns]
     part[holds & (part == SKY)] = SUN
-    x, y, z = disc.direction_C
-    column, row = np.floor(projection.pixel_of(np.array([x / z, y / z]))).astype(int)
+    column, row = np.floor(projection.pixel_of(disc.direction_C)).astype(int)
     middle = disc.visible.shape[0] // 2
     small = bool((bounds[1] - bounds[0] < 1).all())
     inside = 0 <= row < classes.shape[0] and 0 <= column < classes.shape[1]

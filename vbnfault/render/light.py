@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.quantities import Radiance, SunInView
-from ..core.sundisc import Pinhole, add_mean, axes, bounds_px
+from ..core.sundisc import add_mean, axes, bounds_px
 from .bsdf import Reflection, has_bands
 from .description import RenderInput, Sunlight, View, may_see_sun
 from .detail import Detail
@@ -94,7 +94,7 @@ def _with_sun(surface: TerrainMesh, scene: RenderInput, array: NDArray[np.float3
     sun: NDArray[np.float32] | None = None
     if (disc := sun_in_view(surface, view, scene.sun)) is not None:
         sun = np.zeros(array.shape, np.float32)  # pages that stay empty take no memory
-        window = add_mean(sun, disc, Pinhole(view.intrinsics), range(bands))
+        window = add_mean(sun, disc, view.pixel_map, range(bands))
         if window is None:
             sun = None
         else:
@@ -127,7 +127,7 @@ def _traced_disc(surface: TerrainMesh, view: View, sun: Sunlight) -> SunInView |
         limb_darkening=sun.limb_darkening,
         blur_slope=view.aperture_radius_m / view.focus_distance_m,
     )
-    bounds = bounds_px(disc, Pinhole(view.intrinsics))
+    bounds = bounds_px(disc, view.pixel_map)
     if bounds is None:
         return None
     # two cells per pixel if the frame resolves the disc

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.calibration import Calibration
 from ..core.sundisc import axes
 from .description import Sunlight, View
 from .runtime import dr, mi, packets
@@ -195,6 +196,7 @@ class Optics:
         fx, fy, cx, cy = (float(v) for v in view.intrinsics)
         self.scale = opaque_vector(mi.Vector2f, np.array([1 / fx, 1 / fy]))
         self.centre = opaque_vector(mi.Vector2f, np.array([cx, cy]))
+        self._table = None if view.projection is None else _directions(view.projection)
         self.start_m = dr.opaque(mi.Float, view.start_m) if view.start_m else 0.0
         self.aperture = view.aperture_radius_m
         self._radius = dr.opaque(mi.Float, view.aperture_radius_m)
@@ -205,16 +207,34 @@ class Optics:
 
         `on_aperture` is a point of the unit disc on the aperture; without it, the ray meets the lens's centre.
         """
-        cx = (x - self.centre.x) * self.scale.x
-        cy = (y - self.centre.y) * self.scale.y
+        cx, cy, cz = self.towards(x, y)
         ax, ay, az = self.axes
         origin = self.origin
         if on_aperture is not None:
             lx, ly = on_aperture.x * self._radius, on_aperture.y * self._radius
             origin = origin + lx * ax + ly * ay
-            cx, cy = cx - lx * self._inverse_focus, cy - ly * self._inverse_focus
-        direction = dr.normalize(cx * ax + cy * ay + az)
+            nearness = self._inverse_focus if cz is None else self._inverse_focus * dr.maximum(cz, 0)
+            cx, cy = cx - lx * nearness, cy - ly * nearness
+        direction = dr.normalize(cx * ax + cy * ay + (az if cz is None else cz * az))
         return (origin if isinstance(self.start_m, float) else origin + self.start_m * direction), direction
+
+    def towards(self, x: Any, y: Any) -> tuple[Any, Any, Any]:
+        """Return x, y and z in C of the direction at image point (x, y) in pixels; None stands for z = 1."""
+        if self._table is None:
+            return (x - self.centre.x) * self.scale.x, (y - self.centre.y) * self.scale.y, None
+        nodes, columns, rows, per_px = self._table
+        u, v = x * per_px, y * per_px
+        column = dr.clip(mi.Int32(dr.floor(u)), 0, columns - 2)
+        row = dr.clip(mi.Int32(dr.floor(v)), 0, rows - 2)
+        u, v = u - mi.Float(column), v - mi.Float(row)
+        corner = [
+            dr.gather(mi.Vector4f, nodes, mi.UInt32((row + down) * columns + column + right))
+            for down in (0, 1)
+            for right in (0, 1)
+        ]
+        above, below = (dr.lerp(corner[k], corner[k + 1], u) for k in (0, 2))
+        d = dr.lerp(above, below, v)
+        return d.x, d.y, d.z
 
     def camera_rays(self, strata: Strata) -> Any:
         """Return one ray per stratum, through the thin lens."""
@@ -232,12 +252,29 @@ class Optics:
         y = mi.Float(pixel // self.width) + 0.5
         return mi.Ray3f(*self.direction(x, y))
 
-    def rays_of(self, slopes: NDArray[np.float64]) -> Any:
-        """Return one ray from the lens's centre for each pair of tangents x/z and y/z in C, float64[y, x, 2]."""
-        across, down = (packets(mi.Float, np.asarray(slopes[..., k], np.float32)) for k in (0, 1))
+    def rays_of(self, directions: NDArray[np.float64]) -> Any:
+        """Return one ray from the lens's centre for each vector in C, float64[y, x, 3]."""
+        across, down, along = (packets(mi.Float, np.asarray(directions[..., k], np.float32)) for k in range(3))
         ax, ay, az = self.axes
-        direction = dr.normalize(across * ax + down * ay + az)
+        direction = dr.normalize(across * ax + down * ay + along * az)
         return mi.Ray3f(self.origin + self.start_m * direction, direction)
+
+
+# Least and greatest number of nodes along the longer side of a table of directions. Between nodes h px apart,
+# linear interpolation errs by h²/8 times the second derivative: at 1024 px at most 1e-3 px for the distortion of a
+# lens of 120°.
+_NODES = (256, 1024)
+
+
+@lru_cache(maxsize=4)
+def _directions(calibration: Calibration) -> tuple[Any, int, int, float]:
+    """Return directions in C at the nodes of a grid over a frame, its columns and rows, and its nodes per px."""
+    size = calibration.width_px, calibration.height_px
+    per_px = float(2.0 ** np.round(np.log2(np.clip(2 * max(size), *_NODES) / max(size))))
+    columns, rows = (int(np.ceil(n * per_px)) + 1 for n in size)
+    seen = calibration.directions_at(np.arange(columns) / per_px, np.arange(rows) / per_px)
+    seen = np.concatenate([seen, np.zeros_like(seen[..., :1])], axis=-1)
+    return packets(mi.Float, seen.astype(np.float32)), columns, rows, per_px
 
 
 def opaque_vector(kind: Any, values: np.ndarray) -> Any:

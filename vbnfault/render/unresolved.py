@@ -126,6 +126,7 @@ class CloseUp:
             radiance=values[:, lit],
             intrinsics=frame.intrinsics,
             shape=(frame.height_px, frame.width_px),
+            projection=frame.projection,
         )
 
 
@@ -227,4 +228,5 @@ def thin_parts(surface: TerrainMesh, scene: RenderInput) -> FineLight | None:
         radiance=radiance[:, lit],
         intrinsics=view.intrinsics,
         shape=(view.height_px, view.width_px),
+        projection=view.projection,
     )

@@ -16,6 +16,7 @@ from .runtime import columns, dr, mi, packets
 
 # Facets narrower than this are sampled by themselves, if they are wholly farther than so many metres.
 _THIN_PX, _NEAREST_M = 1.0, 0.05
+_ANY_SLOPE = 1e30  # of a camera with distortion, which may see all parts
 
 
 class Vehicle:
@@ -67,6 +68,7 @@ class Vehicle:
         twice_area = np.abs(sides[0][:, 0] * sides[1][:, 1] - sides[0][:, 1] * sides[1][:, 0])
         longest = np.hypot(*sides).max(axis=1)
         half = np.array([view.width_px, view.height_px]) / 2 + np.abs(view.intrinsics[2:])
+        half = half if view.projection is None else half + np.inf
         inside = (np.abs(x).min(axis=1) < half[0]) & (np.abs(y).min(axis=1) < half[1])
         before = (corners[..., 2] > _NEAREST_M).all(axis=1)
         return np.asarray((twice_area < _THIN_PX * longest) & before & inside)
@@ -76,6 +78,8 @@ class Vehicle:
 
         The lower bounds lie above the upper ones if the camera sees no part.
         """
+        if view.projection is not None:
+            return np.array([[-_ANY_SLOPE] * 2, [_ANY_SLOPE] * 2])
         fx, fy, cx, cy = view.intrinsics
         low = np.array([-cx / fx, -cy / fy])
         high = np.array([(view.width_px - cx) / fx, (view.height_px - cy) / fy])

@@ -293,6 +293,8 @@ def _anchor_paths(table: dict[str, Any], folder: Path, overrides: Collection[str
     anchor(table.get("severity"), "severity.file")
     anchor_file(table.get("camera"), "camera.lens")
     anchor_file(table.get("camera"), "camera.detector")
+    camera = table.get("camera")
+    anchor(camera.get("calibration") if isinstance(camera, dict) else None, "camera.calibration.file")
     anchor(table.get("trajectory"), "trajectory.file")
     anchor(table.get("spice"), "spice.kernels")
     plugins, faults = table.get("plugins"), table.get("faults")
@@ -349,6 +351,11 @@ def _check_faults(scene: Scene, faults: Mapping[str, Fault]) -> None:
         where = f"faults.{name}.model = {fault.model!r}"
         if fault.thin_lens_only and camera.lens:
             raise InputError(f"{where}: with camera.lens = {camera.lens!r} {fault.thin_lens_only}")
+        if fault.lit_by_surroundings and camera.calibration is not None:
+            raise InputError(
+                f"{where}: takes light from around the frame, which is rendered for rectilinear cameras only; "
+                "leave camera.calibration out, or choose another model or other sources"
+            )
         if fault.needs_mosaic and not camera.detector:
             raise InputError(f"{where}: acts inside a detector with a mosaic; name a camera.detector")
         if fault.needs_ccd:

@@ -8,9 +8,11 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from ..core import spectra
-from ..core.errors import InputError
+from ..core.calibration import Calibration
+from ..core.errors import InputError, under_key
 from ..core.quantities import ARCHITECTURES, READOUT_DIRECTIONS, Architecture, ReadoutDirection
 from ..core.tables import Table, pair_within
+from .calibration import CalibrationTable, of_frame
 
 # Values of a camera without a prescription, where the scene gives none.
 THIN_LENS = {"f_number": 4.0, "transmission": 0.9}
@@ -27,6 +29,9 @@ OF_THE_DETECTOR = (
     "architectures",
 )
 
+# The widest field of a rectilinear image. That of a calibration counts as at most this wide where poses are drawn.
+_WIDEST_DEG = 140.0
+_MOST_PX = 16384  # columns or rows of an image
 # Keys that only a camera with a named detector has.
 OF_A_DETECTOR = ("individuals", "detector_temperature_K", "stretch", "black")
 # Keys of a sensor file that users expect under [camera].
@@ -81,14 +86,15 @@ class CameraTable(Table):
     fov_deg: float = Field(
         65.0,
         ge=0.01,
-        le=140,
-        description="full field of view across the width; default: that of focal_length_mm or of lens, if given",
+        le=_WIDEST_DEG,
+        description="full field of view across the width; default: that of focal_length_mm, lens or calibration, "
+        "if given",
     )
     focal_length_mm: float | None = Field(
         None, ge=0.1, le=1e5, description="in place of fov_deg; default: that of fov_deg, or the lens's own"
     )
-    width_px: int = Field(1024, ge=16, le=16384, description="width of the image")
-    height_px: int = Field(1024, ge=16, le=16384, description="height of the image")
+    width_px: int = Field(1024, ge=16, le=_MOST_PX, description="width of the image; default: a calibration's")
+    height_px: int = Field(1024, ge=16, le=_MOST_PX, description="height of the image; default: a calibration's")
     lens: str = Field(
         "",
         description="a packaged lens or a prescription's TOML, as it is, or scaled to fov_deg or focal_length_mm; "
@@ -115,6 +121,9 @@ class CameraTable(Table):
     focus_distance_m: float | None = Field(None, gt=0, le=1e12, description="default: infinity")
     point_spread: PointSpreadTable | None = Field(
         None, description="of a thin lens; a prescription has its own; default: points stay points"
+    )
+    calibration: CalibrationTable | None = Field(
+        None, description="of a thin lens: distortion and focal length as measured; default: rectilinear"
     )
     detector: str = Field(
         "",
@@ -221,6 +230,8 @@ class CameraTable(Table):
     @model_validator(mode="after")
     def _field(self) -> CameraTable:
         """Set the field of view: as given, or that of the focal length, or of the lens as it is."""
+        if self.calibration is not None:
+            return self._calibrated(self.calibration)
         given = self.model_fields_set
         focal_length_mm = self.focal_length_mm
         if focal_length_mm is None and (not self.lens or "fov_deg" in given):
@@ -242,7 +253,7 @@ class CameraTable(Table):
         width_mm = self.width_px * self.binning * pitch_um * 1e-3
         fov_deg = math.degrees(2 * math.atan(width_mm / 2 / focal_length_mm))
         key = "lens" if self.focal_length_mm is None else "focal_length_mm"
-        if not 0.01 <= fov_deg <= 140:
+        if not 0.01 <= fov_deg <= _WIDEST_DEG:
             raise ValueError(
                 f"{key} = {getattr(self, key)!r}: {focal_length_mm:g} mm give {width_mm:g} mm of the detector a "
                 f"field of {fov_deg:.3g} deg; must be from 0.01 to 140 deg"
@@ -255,6 +266,43 @@ class CameraTable(Table):
         object.__setattr__(self, "fov_deg", fov_deg)
         object.__setattr__(self, "focal_length_mm", focal_length_mm)
         return self
+
+    def _calibrated(self, table: CalibrationTable) -> CameraTable:
+        """Set the field of view to that of the calibration, and the numbers of its file in place of the file."""
+        if self.lens:
+            raise ValueError(
+                f"calibration: camera.lens = {self.lens!r} has its own distortion, that of its rays; leave one out "
+                "(vbnfault lens LENS --fit-opencv prints that distortion as OpenCV's coefficients)"
+            )
+        if self.focal_length_mm is not None:
+            raise ValueError(
+                f"focal_length_mm = {self.focal_length_mm:g}: the calibration has its own; leave one out"
+            )
+        try:
+            table = table.in_numbers(self.width_px, self.height_px)
+            if not {"width_px", "height_px"} & self.model_fields_set and not table.scale_to_frame:
+                for key in ("width_px", "height_px"):
+                    if not 16 <= getattr(table, key) <= _MOST_PX:
+                        raise InputError(f"{key} = {getattr(table, key)}: must be from 16 to {_MOST_PX}")
+                    object.__setattr__(self, key, getattr(table, key))
+            fov_deg = min(of_frame(table, self.width_px, self.height_px).fov_deg, _WIDEST_DEG)
+        except InputError as error:
+            raise ValueError(f"calibration: {error}") from None
+        if "fov_deg" in self.model_fields_set and not math.isclose(fov_deg, self.fov_deg, rel_tol=1e-9):
+            raise ValueError(
+                f"fov_deg = {self.fov_deg:g}: the calibration has a field of {fov_deg:.4g} deg; leave fov_deg out"
+            )
+        object.__setattr__(self, "calibration", table)
+        object.__setattr__(self, "fov_deg", fov_deg)
+        return self
+
+    @property
+    def frame_calibration(self) -> Calibration | None:
+        """Return the calibration of the frame; None for a camera without one."""
+        if self.calibration is None:
+            return None
+        with under_key("camera.calibration"):
+            return of_frame(self.calibration, self.width_px, self.height_px)
 
     @model_validator(mode="after")
     def _known(self) -> CameraTable:

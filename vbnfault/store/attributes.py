@@ -45,6 +45,7 @@ _RULES: dict[str, tuple[Callable[[Any], bool], str]] = {
     "width": (lambda n: 1 <= n <= _MOST_PIXELS, f"be from 1 to {_MOST_PIXELS}"),
     "shard_samples": (lambda n: 0 <= n <= _MOST_WISHED, f"be from 0 to {_MOST_WISHED}"),
     "distortion_residual_px": (lambda pair: len(pair) == 2, "have 2 elements"),
+    "coefficients": (lambda names: 1 <= len(names) <= 32, "have from 1 to 32 elements"),
     "centre_of_mass_T_m": (lambda vector: vector is None or len(vector) == 3, "have 3 elements"),
     "attitude_references": (
         lambda names: len(names) == 2 and {*names} <= {"sun", "nadir", "centre"},
@@ -60,7 +61,7 @@ _MOST_FLAGS = 2**28
 # Fields of `StoreSpec` that become names of arrays, of folders and of files of an export.
 _NAMES = ("faults", "soft_layers")
 # Fields and root attributes that are shown as texts, and of those the ones that may have several lines.
-_TEXTS = ("mask_kinds", "mask_rules", "site_names", "lens_names", "detector_names", "sample_names")
+_TEXTS = ("coefficients", "mask_kinds", "mask_rules", "site_names", "lens_names", "detector_names", "sample_names")
 _TEXTS_OF_ROOT = ("title", "licence", "description", "citation", "intensity_channel", "scene_hash", "command")
 _OF_LINES = ("description", "citation", "mask_rules", "command")
 _NAME = re.compile("[a-z][a-z0-9_]{0,127}")

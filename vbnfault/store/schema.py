@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.calibration import COEFFICIENTS
 from ..core.errors import InputError
 from ..core.quantities import CHANNELS
 from ..scene.names import SPLITS, STRATA
@@ -52,8 +53,17 @@ MAX_SAMPLE_BYTES = 2**34  # all layers of a sample, uncompressed
 _SCALARS = "scalars"  # the entry of the `layer` axis that stands for all scalars of a sample
 
 
+RATIONAL = COEFFICIENTS["opencv"][:8]  # of the distortion of cameras without a calibration
 # Fields that older stores lack, with their defaults, which are not written: such stores stay as they were.
-_LATER = {"sample_names": (), "rendered_shape": (), "mask_any_joint": False, "distortion_valid_to_deg": None}
+_LATER = {
+    "sample_names": (),
+    "rendered_shape": (),
+    "mask_any_joint": False,
+    "distortion_valid_to_deg": None,
+    "distortion_model": "",
+    "coefficients": RATIONAL,
+    "skew_px": 0.0,
+}
 # Fields that alter no decoded value: neither digests nor comparisons know them.
 _NO_DATA = ("shard_samples", "codecs", "distortion_valid_to_deg")
 _LABELS = {  # coordinates of the short axes
@@ -64,7 +74,11 @@ _LABELS = {  # coordinates of the short axes
     "xy": ("x", "y"),
     "quaternion": ("w", "x", "y", "z"),
     "intrinsic": ("fx", "fy", "cx", "cy"),
-    "coefficient": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+}
+_CALIBRATED = {  # attributes of the distortion of a calibrated camera
+    "long_name": "of the calibration, for the intrinsics",
+    "description": "Coefficients of the camera's calibration: of cv2.projectPoints for the model opencv, of "
+    "cv2.fisheye.projectPoints for fisheye; undistorting takes image positions to tangents.",
 }
 _DESCRIPTIONS = {  # of the coordinates
     "y": "Minus the coordinate row: it falls from the top of an image to its bottom, so that plots stand upright.",
@@ -130,6 +144,13 @@ class StoreSpec:
         over the lit frame.
     distortion_valid_to_deg
         Angle from the boresight up to which the stored distortion coefficients hold; None in older stores.
+    distortion_model
+        Model of a calibrated camera's distortion, a key of `core.calibration.COEFFICIENTS`; "" for the rational
+        model of other cameras.
+    coefficients
+        Names of the coefficients of the distortion, in order.
+    skew_px
+        Skew of a calibrated camera in px.
     attitude_references
         For each of `STRATA`, the direction from which roll, pitch and yaw are measured: "sun", "nadir" or "centre".
     centre_of_mass_T_m
@@ -168,6 +189,9 @@ class StoreSpec:
     lens_names: tuple[str, ...] = ()
     distortion_residual_px: tuple[float, float] = (0.0, 0.0)
     distortion_valid_to_deg: float | None = None
+    distortion_model: str = ""
+    coefficients: tuple[str, ...] = RATIONAL
+    skew_px: float = 0.0
     attitude_references: tuple[str, ...] = ("sun", "sun")
     centre_of_mass_T_m: tuple[float, float, float] | None = None
     detector_names: tuple[str, ...] = ()
@@ -225,6 +249,11 @@ class StoreSpec:
         return {**self.pixel_layers, **SCALARS, "crc32c": CRC32C, "done": DONE}
 
     @property
+    def _labels(self) -> dict[str, tuple[str, ...]]:
+        """Return the labels of the short axes."""
+        return {**_LABELS, "coefficient": self.coefficients}
+
+    @property
     def checked(self) -> tuple[str, ...]:
         """Return the labels of the `layer` axis of `crc32c`: every layer, then all scalars together."""
         return (*self.pixel_layers, _SCALARS)
@@ -240,7 +269,7 @@ class StoreSpec:
             "fault": len(self.faults),
             "band": len(self.wavelength_nm),
             "layer": len(self.checked),
-            **{name: len(labels) for name, labels in _LABELS.items()},
+            **{name: len(labels) for name, labels in self._labels.items()},
         }
         return tuple(sizes[d] for d in row.dims if d != "sample")
 
@@ -271,7 +300,9 @@ class StoreSpec:
                 "residual_px_rms": self.distortion_residual_px[0],
                 "residual_px_max": self.distortion_residual_px[1],
                 **({} if valid_to_deg is None else {"valid_to_deg": valid_to_deg}),
+                **({"model": self.distortion_model, **_CALIBRATED} if self.distortion_model else {}),
             },
+            "intrinsics": {"skew_px": self.skew_px} if self.distortion_model else {},
             **dict.fromkeys(("roll_deg", "pitch_deg", "yaw_deg"), attitude),
             "detector_individual": {"names": list(self.detector_names)},
             "split": {"names": list(SPLITS)},
@@ -315,7 +346,7 @@ class StoreSpec:
             "x": _coordinate("x", "x", columns, "column, pixel centres at +0.5", axis="X"),
             "fault": _coordinate("fault", "fault", self.faults, "fault class"),
             "layer": _coordinate("layer", "layer", self.checked, "what a checksum covers"),
-            **{name: _coordinate(name, name, tuple(labels), name) for name, labels in _LABELS.items()},
+            **{name: _coordinate(name, name, tuple(labels), name) for name, labels in self._labels.items()},
             **self._rendered_coordinates(),
         }
         if self.wavelength_nm:
@@ -325,6 +356,8 @@ class StoreSpec:
         if self.sample_names:
             names = self.sample_names[:samples]
             coordinates["name"] = _coordinate("name", "sample", names, "name of the sample")
+        if self.distortion_model:
+            coordinates["coefficient"].attributes["description"] = "Coefficient of the camera's calibration."
         return {**coordinates, "sample": _coordinate("sample", "sample", numbers, "sample")}
 
     def _rendered_coordinates(self) -> dict[str, Member]:

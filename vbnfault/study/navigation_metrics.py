@@ -179,6 +179,7 @@ def _view(camera: Camera, pose: Pose, truth: Truth) -> navigation.CameraView:
     return navigation.CameraView(
         intrinsics=camera.intrinsics,
         distortion=camera.lens.distortion,
+        model="opencv" if camera.lens.calibration is None else camera.lens.calibration.model,
         valid_to_deg=camera.lens.distortion_valid_to_deg,
         camera_from_T=pose.L_from_C.T,
         camera_position_T_m=pose.position_L_m,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..camera import Camera
 from ..core import spectra
 from ..core.quantities import BODY, SunInView
-from ..core.sundisc import Pinhole, add_mean
+from ..core.sundisc import add_mean
 from ..faults import FaultContext
 from ..pipeline.development import Development
 from ..pipeline.exposure import add_stars, meter
@@ -182,7 +182,7 @@ def with_sun(view: RenderedView, sun: Mapping[str, float]) -> tuple[Pose, Render
     array = array * np.float32(scale)
     own: F32 | None = np.zeros_like(array)
     assert own is not None
-    if add_mean(own, disc, Pinhole(rendering.scene.view.intrinsics), range(len(array))) is None:
+    if add_mean(own, disc, rendering.scene.view.pixel_map, range(len(array))) is None:
         own = None
     radiance = replace(
         light,

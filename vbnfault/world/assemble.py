@@ -339,7 +339,11 @@ def visible_stars(
     stars = sky.star_radiance(
         sky.load_catalogue().brighter_than(faintest),
         sky.SkyFrame(
-            J_from_C=J_from_C, intrinsics=grid.intrinsics, width_px=grid.width_px, height_px=grid.height_px
+            J_from_C=J_from_C,
+            intrinsics=grid.intrinsics,
+            width_px=grid.width_px,
+            height_px=grid.height_px,
+            projection=camera.lens.calibration,
         ),
         wavelength_nm=radiance.wavelength_nm,
         sigma_px=sigma_px,

@@ -117,13 +117,21 @@ def _focus_distance_m(c: CameraTable) -> float:
 
 def _thin_lens(c: CameraTable, pixel_pitch_um: float) -> ThinLens:
     """Return the thin lens of a camera table."""
+    calibration = c.frame_calibration
+    if calibration is None:
+        focal_mm = focal_length_mm(c.fov_deg, c.width_px, pixel_pitch_um)
+        pixel_rad = 2 * float(np.tan(np.radians(c.fov_deg) / 2)) / c.width_px
+    else:
+        focal_mm = calibration.focal_length_px * pixel_pitch_um * 1e-3
+        pixel_rad = 1 / calibration.focal_length_px
     return ThinLens(
-        focal_length_mm=focal_length_mm(c.fov_deg, c.width_px, pixel_pitch_um),
+        focal_length_mm=focal_mm,
         f_number=THIN_LENS["f_number"] if c.f_number is None else c.f_number,
         transmission=THIN_LENS["transmission"] if c.transmission is None else c.transmission,
         focus_distance_m=_focus_distance_m(c),
         halo=_halo(c.point_spread),
-        pixel_rad=2 * float(np.tan(np.radians(c.fov_deg) / 2)) / c.width_px,
+        pixel_rad=pixel_rad,
+        calibration=calibration,
     )
 
 

@@ -80,8 +80,8 @@ def on_ground(coma: Coma, view: View, truth: Truth, reflectance: BandReflectance
     shape = semantic.shape
     row, column = np.nonzero(semantic[::stride, ::stride] == BODY)
     y, x = stride * row, stride * column
-    fx, fy, cx, cy = view.intrinsics
-    rays = np.stack([(x + 0.5 - cx) / fx, (y + 0.5 - cy) / fy, np.ones(len(x))]).astype(np.float32)
+    across, down, along = view.rays_C(np.asarray(x + 0.5), np.asarray(y + 0.5))
+    rays = np.stack([across / along, down / along, np.ones(len(x))]).astype(np.float32)
     offset = rays * depth_m[y, x]  # in camera axes, as the normals are
     up = offset + (view.L_from_C.T @ (view.position_L_m - coma.centre_L_m))[:, None].astype(np.float32)
     radius = np.maximum(np.linalg.norm(up, axis=0), np.float32(coma.core_m))

@@ -121,6 +121,9 @@ def shape_model(body: Body) -> TerrainMesh:
 
 def pixel_rad(scene: Scene) -> float:
     """Return the angle that a pixel in the middle of the frame subtends."""
+    calibration = scene.camera.frame_calibration
+    if calibration is not None:
+        return 1 / calibration.focal_length_px
     return float(2 * np.tan(np.radians(scene.camera.fov_deg) / 2) / scene.camera.width_px)
 
 

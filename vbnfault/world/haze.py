@@ -78,25 +78,20 @@ class _Frame:
         first = unit(beside)
         return np.stack([first, np.cross(centre, first), centre])
 
-    def slopes(self, x_px: F64, y_px: F64) -> tuple[F64, F64]:
-        """Return the tangents x/z and y/z of image positions."""
-        fx, fy, cx, cy = self.view.intrinsics
-        return (x_px - cx) / fx, (y_px - cy) / fy
-
     def components(self, x_px: F64, y_px: F64) -> list[F32]:
         """Return the components along `axes_L` of unit vectors to image positions, float32, one array each.
 
         `x_px` and `y_px` are float64 of shapes that fit together.
         """
-        x, y = self.slopes(x_px, y_px)
-        length = np.sqrt(1 + x**2 + y**2)
+        x, y, z = self.view.rays_C(x_px, y_px)
+        length = np.sqrt(z**2 + x**2 + y**2)
         axes_C = self.axes_L @ self.view.L_from_C
-        return [(a * x + (b * y + c)).astype(np.float32) / length.astype(np.float32) for a, b, c in axes_C]
+        return [(a * x + (b * y + c * z)).astype(np.float32) / length.astype(np.float32) for a, b, c in axes_C]
 
     def directions(self, x_px: F64, y_px: F64) -> F64:
         """Return unit vectors in L to image positions float64[n] each, float64[n, 3]."""
-        x, y = self.slopes(x_px, y_px)
-        rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ self.view.L_from_C.T
+        x, y, z = self.view.rays_C(x_px, y_px)
+        rays = np.stack(np.broadcast_arrays(x, y, z), axis=-1) @ self.view.L_from_C.T
         return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
     def light(self, directions: F64, length_m: F64) -> tuple[F64, F64]:
@@ -172,8 +167,8 @@ def haze(
     sky = _is_sky(semantic)
     first, second, cosine = frame.components(x_px[None, :], y_px[:, None])
     sine = np.maximum(np.sqrt(first * first + second * second), np.float32(1e-6))
-    x, y = frame.slopes(x_px, y_px)
-    length = np.where(sky, 0, depth_m) * np.sqrt(1 + x[None, :] ** 2 + y[:, None] ** 2).astype(np.float32)
+    x, y, z = view.rays_C(x_px[None, :], y_px[:, None])
+    length = np.where(sky, 0, depth_m) * (np.sqrt(z**2 + x**2 + y**2) / z).astype(np.float32)
     ground_near = ~sky
     if edges is not None:
         ground_near[edges.row, edges.column] = True
@@ -235,9 +230,9 @@ def _edge_columns(frame: _Frame, edges: Edges) -> F32:
     x_px, y_px = edge_positions_px(edges.row, edges.column, round(edges.depth_m.shape[1] ** 0.5))
     first, second, cosine = frame.components(x_px, y_px)
     sine = np.maximum(np.hypot(first, second), np.float32(1e-6))
-    x, y = frame.slopes(x_px, y_px)
+    x, y, z = frame.view.rays_C(x_px, y_px)
     sky = _is_sky(edges.semantic)
-    length = np.where(sky, 0, edges.depth_m) * np.sqrt(1 + x**2 + y**2).astype(np.float32)
+    length = np.where(sky, 0, edges.depth_m) * (np.sqrt(z**2 + x**2 + y**2) / z).astype(np.float32)
     return _columns(frame.coma, frame.distance_m, sine, cosine, length, sky)
 
 
@@ -266,7 +261,7 @@ def sky_around(
     high = np.clip(np.ceil(last_px) + _AROUND_PX, 0, size).astype(int)
     width, height = high - low
     towards = view.L_from_C.T @ frame.axes_L[2]
-    centre = towards[:2] / towards[2] * view.intrinsics[:2] + view.intrinsics[2:]
+    centre = view.pixel_map.pixel_of(towards)
     corner = np.stack(np.meshgrid(*(np.arange(a, b, dtype=float) for a, b in zip(low, high, strict=True))), axis=-1)
     corner, step, total = corner.reshape(-1, 2), 1.0, np.zeros(width * height)
     while len(corner):
@@ -311,13 +306,13 @@ def _on_sky(frame: _Frame, sky: Mask, sine: F32, cosine: F32) -> F32:
     nodes = table.at(x_px, y_px)
     full = cv2.resize(nodes, (len(x_px) * stride, len(y_px) * stride), interpolation=cv2.INTER_CUBIC)
     out = np.ascontiguousarray(full[_PAD * stride :, _PAD * stride :][:height, :width])
-    x, y, z = frame.view.L_from_C.T @ frame.axes_L[2]
-    if stride > 1 and z > 0:  # near the centre every pixel counts
-        fx, fy, cx, cy = frame.view.intrinsics
+    centre = frame.view.L_from_C.T @ frame.axes_L[2]
+    if stride > 1 and centre[2] > 0:  # near the centre every pixel counts
+        middle_x, middle_y = frame.view.pixel_map.pixel_of(centre)
         reach = _FINE_STRIDES * stride
         rows, columns = (
             (max(round(middle - reach), 0), min(round(middle + reach), size))
-            for middle, size in ((fy * y / z + cy, height), (fx * x / z + cx, width))
+            for middle, size in ((middle_y, height), (middle_x, width))
         )
         if rows[0] < rows[1] and columns[0] < columns[1]:
             out[slice(*rows), slice(*columns)] = table.at(_positions_px(*columns), _positions_px(*rows))

@@ -25,6 +25,7 @@ from ..core import spectra
 from ..core.files import file_contents, resources, user_files
 from ..core.frames import J2000_JD
 from ..core.quantities import Radiance
+from ..core.sundisc import Pinhole, Projection
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -189,12 +190,15 @@ class SkyFrame:
         fx, fy, cx, cy in pixels, float64[4], pixel centres at +0.5.
     width_px, height_px
         Size of the frame.
+    projection
+        Map between directions and pixels; None: the pinhole of the intrinsics.
     """
 
     J_from_C: F64
     intrinsics: F64
     width_px: int
     height_px: int
+    projection: Projection | None = None
 
     def positions_px(self, direction_J: F64) -> tuple[F64, F64, I64]:
         """Return the image positions float64[k, 2] and the cosines to the boresight of the directions ahead.
@@ -202,10 +206,9 @@ class SkyFrame:
         The cosines are float64[n] of all n directions; int64[k] are the indices of the directions ahead.
         """
         direction = direction_J @ np.asarray(self.J_from_C, dtype=np.float64)
-        ahead = np.flatnonzero(direction[:, 2] > 1e-6)
-        slope = direction[ahead, :2] / direction[ahead, 2:]
-        fx, fy, cx, cy = (float(v) for v in self.intrinsics)
-        return slope * (fx, fy) + (cx, cy), direction[:, 2], ahead
+        projection = self.projection or Pinhole(self.intrinsics)
+        ahead = np.flatnonzero(direction[:, 2] > (1e-6 if self.projection is None else projection.least_z))
+        return projection.pixel_of(direction[ahead]), direction[:, 2], ahead
 
 
 def star_radiance(
@@ -290,6 +293,8 @@ def _radiance_px_per_irradiance(frame: SkyFrame, cosine: F64, lens_falloff: bool
     The second sum is E over the solid angle of the pixel.
     """
     fx, fy = (float(v) for v in frame.intrinsics[:2])
+    if frame.projection is not None and not frame.projection.foreshortens:  # the pupil of a fisheye turns
+        return np.full(len(cosine), fx * fy)
     return np.asarray(fx * fy * (cosine**-3 if lens_falloff else cosine))
 
 

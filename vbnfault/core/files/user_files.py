@@ -28,6 +28,7 @@ LIMIT_BYTES: dict[str, int] = {
     "lens": 4 * MIB,
     "glass catalogue": 16 * MIB,
     "detector": 4 * MIB,
+    "calibration": MIB,
     "shape": 1024 * MIB,
     "spacecraft": 512 * MIB,
     "texture": 256 * MIB,

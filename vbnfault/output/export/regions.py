@@ -20,10 +20,12 @@ def flare_discs(
 ) -> NDArray[np.float64]:
     """Return x, y and radius in pixels of the flares and the glare that a fault's parameters list, float64[n, 3].
 
-    The flares lie on the line from the Sun through the image's centre. `shape` is (height, width). Parameters
+    The flares lie on the line from the Sun through the image's centre, or that of the parameters. `shape` is
+    (height, width). Parameters
     without them, or a Sun that is not in front of the camera, have none.
     """
     sun, middle = np.asarray(sun_xy_px, dtype=np.float64), np.array([shape[1], shape[0]]) / 2
+    middle = np.asarray(params.get("centre_xy_px", middle), dtype=np.float64)
     if not np.all(np.isfinite(sun)):
         return np.zeros((0, 3))
     lights = [(flare["position"], flare["radius"]) for flare in params.get("flares", ())]

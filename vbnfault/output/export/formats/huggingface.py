@@ -13,7 +13,7 @@ from ..contract import Closing, Entry, ExportPart, Finished, Format, number_text
 from ..folder import Folder
 
 _NUMBERS = ("exposure_s", "sun_azimuth_deg", "sun_elevation_deg", "sun_distance_au", "sun_visible_fraction")
-_VECTORS = ("camera_position_T_m", "camera_from_T", "sun_direction_T", "intrinsics")
+_VECTORS = ("camera_position_T_m", "camera_from_T", "sun_direction_T", "intrinsics", "distortion")
 _ROWS_IN_MEMORY = 8
 
 
