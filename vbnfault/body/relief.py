@@ -48,7 +48,9 @@ _BLOCKS_M = ((17.0, 1.9), (6.0, 0.95), (2.2, 0.40), (0.85, 0.14))
 # (rise, fraction of it that is gathered) of the layers whose edges are scarps along the contours of the ground
 _CONTOURS_M = ((45.0, 0.9), (21.0, 0.8))
 _CONTOUR_FACETS = 2.5  # least width of a scarp: a narrower one has an edge like a saw
-_NOTCH, _NOTCH_FACETS = 0.25, 2.4  # depth of the notch at the foot of a scarp over its rise, and its half-width
+# Of the notch at the foot of a scarp: depth over the rise, half-width, and the most that it is steep; flight frames of
+# 81 to 131 km ask for the depth, and from near a deeper one than its slope would be a ditch
+_NOTCH, _NOTCH_FACETS, _NOTCH_STEEP = 0.25, 2.4, 1.35
 _STRATA_M = ((9.0, 1.3), (3.1, 0.55), (1.1, 0.20))  # thickness of a layer, and how far a hard layer stands out
 
 _DUST_LEAVES_DEG = (27.0, 40.0)  # dust lies on slopes below the first, and has slid off slopes above the second
@@ -338,7 +340,8 @@ def _contour_scarps(noise: Octaves, elevation_m: Float64, slope_deg: Float32) ->
         # a scarp is undercut: its foot lies in a notch, which is dark under any Sun
         foot_m = (inside - foot) * np.float32(rise) / tangent
         notch = np.exp(-((foot_m / (_NOTCH_FACETS * noise.facet_m)) ** 2)).astype(np.float32)
-        total += gentle * kept * (stair - inside - _NOTCH * notch)
+        deep = np.minimum(_NOTCH, _NOTCH_STEEP * _NOTCH_FACETS * noise.facet_m / rise).astype(np.float32)
+        total += gentle * kept * (stair - inside - deep * notch)
     return total
 
 
