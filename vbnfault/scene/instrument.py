@@ -365,15 +365,20 @@ class RenderTable(Table):
         return self
 
 
+_Place = Annotated[float, Field(ge=-1e6, le=1e6)]
 ResponseCurve = Literal["linear", "srgb", "gamma", "table"]
 
 
 class ImageTable(Table):
     """Describe images of one's own, into which `vbnfault inject` puts faults."""
 
-    black_dn: float | None = Field(None, description="number without light; default: 0, of a raw mosaic the bias")
+    black_dn: float | None = Field(
+        None, ge=-1e9, le=1e9, description="number without light; default: 0, of a raw mosaic the bias"
+    )
     white_dn: float | None = Field(
         None,
+        ge=-1e9,
+        le=1e9,
         description="number at white; default: the largest of the data type, 1 of floats, of a raw mosaic that "
         "of the detector",
     )
@@ -386,7 +391,7 @@ class ImageTable(Table):
         "",
         description="CSV of two rising columns, light and number, for response = 'table', from the file's folder",
     )
-    sun: Literal["none", "auto"] | tuple[float, float] | tuple[float, float, float] = Field(
+    sun: Literal["none", "auto"] | tuple[_Place, _Place] | tuple[_Place, _Place, _Place] = Field(
         "none",
         description="position of the Sun: 'auto' finds it as the saturated disc, two numbers are x and y in "
         "pixels, also beyond the frame, three a direction in the camera's axes",
