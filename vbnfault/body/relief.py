@@ -48,8 +48,8 @@ _BLOCKS_M = ((17.0, 1.9), (6.0, 0.95), (2.2, 0.40), (0.85, 0.14))
 # (rise, fraction of it that is gathered) of the layers whose edges are scarps along the contours of the ground
 _CONTOURS_M = ((45.0, 0.9), (21.0, 0.8))
 _CONTOUR_FACETS = 2.5  # least width of a scarp: a narrower one has an edge like a saw
-# Of the notch at the foot of a scarp: depth over the rise, half-width in facets, and greatest slope. Flight frames of 81
-# to 131 km ask for the depth; from near, a steeper notch would be a ditch.
+# Of the notch at the foot of a scarp: depth over the rise, half-width in facets, and greatest slope. Flight frames
+# of 81 to 131 km ask for the depth; from near, a steeper notch would be a ditch.
 _NOTCH, _NOTCH_FACETS, _NOTCH_STEEP = 0.25, 2.4, 1.35
 _STRATA_M = ((9.0, 1.3), (3.1, 0.55), (1.1, 0.20))  # thickness of a layer, and how far a hard layer stands out
 
