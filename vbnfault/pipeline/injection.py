@@ -49,6 +49,7 @@ def inject_faults(
     commanded = [name for name in commanded if name not in in_vain]
     stored = "mask_effect" in stored_layers(spec.scene, spec.faults)
     draws = visible_draws(spec, development, commanded, views, stored=stored)
+    development.image(draws)  # while its signals are in the processor's cache
     return Injection(draws=draws, development=development, in_vain=in_vain)
 
 
