@@ -508,7 +508,8 @@ def test_unusable_arrays(image: np.ndarray, sentence: str) -> None:
 @pytest.mark.parametrize(
     ("name", "content", "sentence"),
     [
-        ("a.png", b"", "is a damaged PNG"),
+        ("a.png", b"", "image file is empty"),
+        ("b.png", b"\x89PNG", "is a damaged PNG"),
         ("a.tif", b"II*\0", "is a damaged TIFF"),
         ("a.fits", b"SIMPLE", "is a damaged FITS|without an image"),
         ("a.exr", b"v/1\x01", "is a damaged OpenEXR"),

@@ -206,6 +206,8 @@ def _contents_of_files(identity: dict[str, Any], scene: Scene) -> None:
         )
     if scene.body.albedo_map is not None and scene.body.albedo_map.file != EARTH:
         identity["body"]["albedo_map"]["file"] = _digest(scene.body.albedo_map.file, "texture")
+    if scene.image is not None and scene.image.response_file:
+        identity["image"]["response_file"] = _digest(scene.image.response_file, "response")
     if scene.spacecraft.model not in ("none", "default"):
         with (
             file_contents.noting() as digests

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import InputError
-from ..core.files import images, tiff
+from ..core.files import images, tiff, user_files
 from ..core.files.whole_files import write_whole
 
 MOST_VALUES = 4 * 10**8  # pixels times channels of one image
@@ -60,7 +60,7 @@ class Png(_Samples):
 
     def __init__(self, path: Path) -> None:
         """Read a PNG file."""
-        self._data = path.read_bytes()
+        self._data = user_files.read_input(path, "image")
         self._split(images.png_numbers(self._data, MOST_VALUES))
 
     def write(self, path: Path, numbers: NDArray[Any], text: str) -> None:
@@ -75,7 +75,7 @@ class Tiff(_Samples):
 
     def __init__(self, path: Path) -> None:
         """Read a TIFF file."""
-        self._data = path.read_bytes()
+        self._data = user_files.read_input(path, "image")
         self._split(tiff.tiff_numbers(self._data, MOST_VALUES))
 
     def write(self, path: Path, numbers: NDArray[Any], text: str) -> None:
@@ -91,8 +91,8 @@ class Npy(ImageFile):
     def __init__(self, path: Path) -> None:
         """Read an array."""
         try:
-            self.numbers = np.load(path, allow_pickle=False)
-        except (ValueError, EOFError, OSError) as error:
+            self.numbers = np.load(io.BytesIO(user_files.read_input(path, "image")), allow_pickle=False)
+        except (ValueError, EOFError) as error:
             raise InputError(f"is no array of numpy: {error}") from None
 
     def write(self, path: Path, numbers: NDArray[Any], text: str) -> None:
@@ -110,7 +110,7 @@ class Fits(ImageFile):
     def __init__(self, path: Path) -> None:
         """Read a FITS file."""
         fits = _astropy_fits()
-        self._data = path.read_bytes()
+        self._data = user_files.read_input(path, "image")
         try:
             with fits.open(io.BytesIO(self._data), do_not_scale_image_data=True, memmap=False) as file:
                 number = next((k for k, part in enumerate(file) if part.is_image and part.data is not None), None)
@@ -183,6 +183,7 @@ class Exr(ImageFile):
 
     def __init__(self, path: Path) -> None:
         """Read an OpenEXR file."""
+        user_files.read_input(path, "image")  # no folder, pipe or device
         self._header, self._channels = images.read_exr(path)
         names: list[str] = [name for name in ("R", "G", "B") if name in self._channels] or ["Y"]
         if len(names) not in _COLOURS or names[0] not in self._channels:
@@ -211,7 +212,6 @@ def read_image(path: Path) -> ImageFile:
         raise InputError(f"{path}: must end with one of {', '.join(ENDINGS)}")
     try:
         return kind(path)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
     except InputError as error:
-        raise InputError(f"{path}: {error}") from None
+        text = str(error)
+        raise InputError(text if text.startswith(str(path)) else f"{path}: {text}") from None

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..core.errors import InputError
+from ..core.files import user_files
 from ..scene.instrument import ResponseCurve
 
 F64 = NDArray[np.float64]
@@ -70,8 +71,9 @@ def read_table(path: str) -> F64:
     Raises InputError if it cannot be read, or does not rise.
     """
     try:
-        rows = np.atleast_2d(np.loadtxt(Path(path), delimiter=",", comments="#", skiprows=0))
-    except (OSError, ValueError) as error:
+        text = user_files.read_input(path, "response").decode()
+        rows = np.atleast_2d(np.loadtxt(io.StringIO(text), delimiter=",", comments="#"))
+    except ValueError as error:  # also of text that is no UTF-8
         raise InputError(f"image.response_file = {path!r}: cannot be read: {error}") from None
     if rows.shape[1] != 2 or len(rows) < 2:
         raise InputError(

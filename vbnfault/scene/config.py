@@ -295,6 +295,7 @@ def _anchor_paths(table: dict[str, Any], folder: Path, overrides: Collection[str
     anchor_file(table.get("camera"), "camera.detector")
     camera = table.get("camera")
     anchor(camera.get("calibration") if isinstance(camera, dict) else None, "camera.calibration.file")
+    anchor(table.get("image"), "image.response_file")
     anchor(table.get("trajectory"), "trajectory.file")
     anchor(table.get("spice"), "spice.kernels")
     plugins, faults = table.get("plugins"), table.get("faults")

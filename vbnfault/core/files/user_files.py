@@ -32,6 +32,8 @@ LIMIT_BYTES: dict[str, int] = {
     "shape": 1024 * MIB,
     "spacecraft": 512 * MIB,
     "texture": 256 * MIB,
+    "image": 4096 * MIB,
+    "response": 4 * MIB,
     "data": 1024 * MIB,
     "trajectory": 256 * MIB,
     "plug-in": 64 * MIB,
