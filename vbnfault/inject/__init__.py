@@ -10,8 +10,10 @@ The package itself can be called, as its function `inject`. Its modules: `respon
 import sys
 
 from ..core.callable_package import CallablePackage
-from .injector import Injected, Injector, inject
+from .injector import Injected as Injected
+from .injector import Injector as Injector
+from .injector import inject as inject
 
-__all__ = ["Injected", "Injector", "inject"]
+__all__ = ["inject"]  # the classes are names of `vbnfault` itself
 
 sys.modules[__name__].__class__ = CallablePackage
