@@ -8,12 +8,13 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import tifffile
@@ -130,47 +131,21 @@ def test_every_model_was_seen_in_some_image() -> None:
 # --- noise --------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Half(vbnfault.Fault):
-    fault = "test_half"
-    model = "half"
-    default = True
-    after = "dust_on_optics"
-    step = "electrons"
+@pytest.fixture
+def simple_faults() -> Iterator[None]:
+    """Define faults of known effect, and take them out of the registry again."""
 
-    def apply(self, quantity: Any, params: Any, context: Any) -> Any:
-        return quantity.with_array(quantity.array * np.float32(0.5))
+    def define(name: str, act: Callable[[Any], Any]) -> None:
+        @dataclass(frozen=True, kw_only=True)
+        class Simple(vbnfault.Fault):
+            fault, model, default, step, after = name, "simple", True, "electrons", "dust_on_optics"
 
+            def apply(self, quantity: Any, params: Any, context: Any) -> Any:
+                return quantity.with_array(act(quantity.array))
 
-@dataclass(frozen=True, kw_only=True)
-class _Veil(vbnfault.Fault):
-    fault = "test_veil"
-    model = "veil"
-    default = True
-    after = "dust_on_optics"
-    step = "electrons"
-
-    def apply(self, quantity: Any, params: Any, context: Any) -> Any:
-        return quantity.with_array(quantity.array + np.float32(2000))
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Blur(vbnfault.Fault):
-    fault = "test_blur"
-    model = "box"
-    default = True
-    after = "dust_on_optics"
-    step = "electrons"
-
-    def apply(self, quantity: Any, params: Any, context: Any) -> Any:
-        import cv2
-
-        return quantity.with_array(cv2.blur(quantity.array, (5, 5)))
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _forgotten() -> Iterator[None]:
-    """Take the models of this module out of the registry again."""
+    define("test_half", lambda array: array * np.float32(0.5))
+    define("test_veil", lambda array: array + np.float32(2000))
+    define("test_blur", lambda array: cv2.blur(array, (5, 5)))
     yield
     forget(__name__)
 
@@ -185,6 +160,7 @@ def _forgotten() -> Iterator[None]:
         ("test_blur", 10000.0, 10169.0),
     ],
 )
+@pytest.mark.usefixtures("simple_faults")
 def test_noise_is_that_of_the_light_that_remains(name: str, mean: float, variance: float) -> None:
     """The variance of n = 65,536 pixels is χ² with a standard deviation of √(2/n) = 0.6 %; the bound is four such.
 

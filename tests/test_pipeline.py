@@ -352,7 +352,7 @@ def test_what_overflows_from_a_track_is_in_its_mask() -> None:
     # How far the charge runs depends on its shot noise, which the mask does not know: with noise it may reach one
     # more pixel, and so change the colours of those around it.
     detector, signal = s.base_camera.detector, development.signal({}, []).merged
-    alone = [detector.raw(signal, frame.camera.exposure_s, None, development._acts(of)) for of in (draws, {})]
+    alone = [detector.raw(signal, frame.camera.exposure_s, None, development.acts(of)) for of in (draws, {})]
     more = np.abs(development.raw(draws).astype(int) - development.raw({}))
     farther = (more > 1) & (alone[0] == alone[1])
     ends = cv2.dilate(farther.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
