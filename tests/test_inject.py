@@ -417,6 +417,12 @@ def test_a_store_of_images_is_verified_exported_and_read_as_any_other(tmp_path: 
     assert vbnfault.verify(path).digest == report.digest
 
 
+def test_results_below_the_images_are_no_images_of_the_next_run(tmp_path: Path) -> None:
+    pictures, scene = _pictures(tmp_path / "in", 2), load_scene("quickstart", BATCH)
+    for _ in range(2):
+        assert inject_files([pictures], scene, pictures / "out", progress=False).names == ("00.png", "01.png")
+
+
 def test_a_batch_goes_on_past_a_damaged_image_and_names_it(tmp_path: Path) -> None:
     pictures = _pictures(tmp_path / "in", 3)
     (pictures / "01.png").write_bytes((pictures / "01.png").read_bytes()[:200])

@@ -13,7 +13,7 @@ import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -158,16 +158,6 @@ class Batch:
 # --- files alone --------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _Workers:
-    """Make a worker of a batch; the object is a function that can be pickled."""
-
-    batch: Batch
-
-    def __call__(self) -> _Worker:
-        return _Worker(self.batch)
-
-
 class _Worker:
     """Inject into images, one a task."""
 
@@ -204,16 +194,6 @@ class _Images(Job):
 
 
 # --- a store beside them ------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class _Factory:
-    """Make the samples of a batch in a worker; the object is a function that can be pickled."""
-
-    batch: Batch
-
-    def __call__(self) -> _Samples:
-        return _Samples(self.batch)
 
 
 class _Samples:
@@ -300,7 +280,7 @@ def inject_files(
         return batch
     job = _Images(out, Progress(len(names), shown=progress, noun="images"), dict.fromkeys(range(len(names)), 0))
     with job.progress:
-        build.do_tasks(_Workers(batch), job, options)
+        build.do_tasks(partial(_Worker, batch), job, options)
     job.raise_failures(of=f" of {len(names)}")
     return batch
 
@@ -335,16 +315,19 @@ def _build(batch: Batch, options: build.BuildOptions) -> None:
     batch = dataclasses.replace(batch, scene=scene)
     out = store.located(batch.out / STORE)
     batch.out.mkdir(parents=True, exist_ok=True)
-    with_card(out, build.build(_Factory(batch), made, out, options))
+    with_card(out, build.build(partial(_Samples, batch), made, out, options))
 
 
 def _found(images: Sequence[str | Path], out: Path) -> tuple[Path, tuple[str, ...]]:
     """Return the folder that holds all images, and their paths below it, sorted."""
     paths: list[Path] = []
+    results = out.absolute()
     for given in map(str, images):
         path = Path(given)
         if path.is_dir():
-            inside = sorted(p for p in path.rglob("*") if p.suffix.lower() in ENDINGS and p.is_file())
+            _check_apart(path, out)
+            every = sorted(p for p in path.rglob("*") if p.suffix.lower() in ENDINGS and p.is_file())
+            inside = [p for p in every if not p.absolute().is_relative_to(results)]  # results of an earlier run
             if not inside:
                 raise InputError(f"{path}: holds no image; they end with one of {', '.join(ENDINGS)}")
             paths += inside
@@ -365,6 +348,11 @@ def _found(images: Sequence[str | Path], out: Path) -> tuple[Path, tuple[str, ..
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
         raise InputError(f"{root / twice[0]}: is named twice")
-    if out.absolute() == root:
-        raise InputError(f"--out {out}: holds the images, which would be replaced; choose another folder")
+    _check_apart(root, out)
     return root, tuple(names)
+
+
+def _check_apart(folder: Path, out: Path) -> None:
+    """Raise InputError if the results would replace the images of a folder."""
+    if folder.absolute() == out.absolute():
+        raise InputError(f"--out {out}: holds the images, which would be replaced; choose another folder")

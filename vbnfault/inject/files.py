@@ -206,7 +206,7 @@ ENDINGS = tuple(_KINDS)
 
 
 def read_image(path: Path) -> ImageFile:
-    """Return the image of a file. Raises InputError, with its name, if it is none that can be used."""
+    """Return the image of a file. Raises InputError, which names the file, if it cannot be used."""
     kind = _KINDS.get(path.suffix.lower())
     if kind is None:
         raise InputError(f"{path}: must end with one of {', '.join(ENDINGS)}")

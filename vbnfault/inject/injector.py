@@ -19,7 +19,7 @@ from ..faults import Fault, FaultContext
 from ..pipeline.development import Development, Draws, without
 from ..pipeline.injection import draw_faults, visible_draws
 from ..pipeline.labels import labels_of
-from ..pipeline.spec import Draw, Injection, SceneExposure, SceneLight
+from ..pipeline.spec import Draw, Injection, SceneExposure, SceneLight, mask_any_faults
 from ..scene import keyed_random
 from ..scene.config import Scene, configure_faults, load_scene
 from ..scene.instrument import ImageTable
@@ -53,7 +53,7 @@ class Injected:
     masks
         bool[fault, y, x]: the mask of each class.
     mask_any
-        bool[y, x]: pixels of any localised class.
+        bool[y, x]: pixels of the classes of `dataset.mask_any`, by default the localised ones.
     mask_effect
         bool[fault, y, x]: pixels of the noise-free image that change by 1 DN of 8 bits or more; None if the
         injector does not compute them.
@@ -221,7 +221,7 @@ class Injector:
                     draws, (result, electrons) = others, lacking
                     left_out[name] = "changes no number of the image"
         injection = Injection(draws=draws, development=development)
-        members = [name for name, fault in self.faults.items() if fault.localised]
+        members = mask_any_faults(self.scene, self.faults)
         effects, nothing = None, np.zeros(development.context.shape, dtype=bool)
         if self.effects:
             labels = labels_of(self.faults, injection, members, ("mask_effect",))
@@ -279,11 +279,13 @@ class Injector:
         if exposure_s == "auto":
             exposure_s = _ASSUMED_EXPOSURE_S
             assumed.append(f"camera.exposure_s = {exposure_s:g}: assumed, since the scene leaves it to be metered")
-        for key, default in (("fov_deg", 65.0), ("detector", "")):
-            if key == "fov_deg" and table.calibration is not None:
-                continue
-            if key not in table.model_fields_set and "focal_length_mm" not in table.model_fields_set:
-                assumed.append(f"camera.{key} = {default!r}: assumed, since the scene does not give it")
+        given_keys = table.model_fields_set
+        if table.calibration is None and not {"fov_deg", "focal_length_mm", "lens"} & given_keys:
+            assumed.append(f"camera.fov_deg = {table.fov_deg:g}: assumed, since the scene does not give it")
+        if "detector" not in given_keys:
+            assumed.append(
+                "camera.detector = '': assumed, three colours in every pixel, since the scene names none"
+            )
         if shape not in self._cameras:
             own = table.model_copy(update={"width_px": width, "height_px": height})
             self._cameras[shape] = cameras.base_camera(self.scene.model_copy(update={"camera": own}))

@@ -184,7 +184,7 @@ def _ros(table: Mapping[str, Any]) -> Calibration:
 
 
 def _opencv(text: str, camera: str, model: str, size_px: tuple[int, int] | None) -> Calibration:
-    """Return the calibration of a FileStorage; `camera` ends the names of what belongs to it, as in M1 and D1."""
+    """Return the calibration of a FileStorage; `camera` is the ending of its keys, as in M1 and D1."""
     try:
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         root = storage.root()
