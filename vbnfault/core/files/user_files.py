@@ -68,7 +68,7 @@ def read_input(path: str | Path, what: str, *, types: Sequence[str] = (), limit_
     limit = LIMIT_BYTES[what] if limit_bytes is None else limit_bytes
     with _opened(Path(path), what, types, limit) as file:
         try:
-            data = file.read(limit + 1)  # one more than allowed: the size may be wrong, or have grown
+            data = file.read()  # not `limit` bytes: that many would be allocated before one is read
         except OSError as error:
             raise InputError(f"{path}: {what} file cannot be read: {error.strerror}.") from None
     if len(data) > limit:
