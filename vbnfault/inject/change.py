@@ -22,6 +22,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.process.llvm import backend, evaluated, flat, on_device
 from ..core.quantities import RGBI, Electrons
 from ..detector.mosaic import sample
 from ..detector.noise import draw_normals, poisson
@@ -70,24 +71,29 @@ def _missing_noise(picture: Picture, change: F32, act: Callable[[Electrons], F32
 
     `act` returns the change of what the faults make of the image's electrons if these are others.
     """
-    touched = change != 0
-    if not touched.any():
+    if not change.any():
         return np.zeros_like(change)
-    white = picture.white_e
-    read2 = np.float32(picture.camera.detector.read_noise_e_rms**2)
-    signs = 2 * rng("inject", "signs").integers(0, 2, change.shape, np.int8) - np.int8(1)
-    probe = np.sqrt(picture.light * white + read2) / white * signs
-    left = picture.in_image(act(picture.seen(picture.light + probe))) * white
-    variance = left**2
+    be, shape = backend(), change.shape
+    dr, normal = be.dr, draw_normals(shape, rng("inject", "noise"))
+    white = dr.tile(on_device(picture.white_e), change.size // len(picture.white_e))
+    read2 = dr.opaque(be.Float, picture.camera.detector.read_noise_e_rms**2)
+    light, moved = on_device(picture.light), on_device(change)
+    # the lowest bit of a variate's number says nothing of its size, and serves as the sign of the perturbation
+    signs = be.Float(1 - 2 * be.Int32(be.UInt8(flat((normal.codes & 1).astype(np.uint8)))))
+    probe = evaluated(light + dr.sqrt(light * white + read2) / white * signs).reshape(shape)
+    left = on_device(picture.in_image(act(picture.seen(probe)))) * white
+    variance = left * left
     # a fault that acts on each pixel alone keeps the signs; a blur mixes them, and its variance varies slowly
-    mixed = cv2.blur((left * signs < 0).astype(np.float32), (_NEARBY_PX, _NEARBY_PX)).reshape(left.shape) > _MIXED
-    if mixed.any():
-        smooth = cv2.blur(variance, (_NEARBY_PX, _NEARBY_PX)).reshape(variance.shape)
-        variance = np.where(mixed, smooth, variance)
-    after = np.maximum(picture.light + change, 0) * white
-    missing = np.maximum(after + read2 - variance, 0).astype(np.float32)
-    noise = poisson(missing, draw_normals(change.shape, rng("inject", "noise"))) - missing
-    return np.where(touched, noise / white, np.float32(0))
+    turned = evaluated(be.UInt8(dr.select(left * signs < 0, be.UInt32(255), be.UInt32(0)))).reshape(shape)
+    if turned.any():
+        near = cv2.blur(turned, (_NEARBY_PX, _NEARBY_PX))
+        smooth = cv2.blur(evaluated(variance).reshape(shape), (_NEARBY_PX, _NEARBY_PX))
+        mixed = be.UInt8(flat(near)) > round(255 * _MIXED)
+        variance = dr.select(mixed, on_device(smooth), variance)
+    after = dr.maximum(light + moved, 0) * white
+    missing = dr.maximum(after + read2 - variance, 0)
+    drawn = on_device(poisson(evaluated(missing).reshape(shape), normal))
+    return evaluated(dr.select(moved != 0, (drawn - missing) / white, 0)).reshape(shape)
 
 
 def _through_sensor(picture: Picture, development: Development, draws: Draws, after: F32, rng: Rng) -> F32:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import Any
 
 import cv2
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ..camera import Camera
 from ..core.errors import InputError
+from ..core.process.llvm import backend, evaluated, on_device
 from ..core.quantities import LUMINANCE, RGBI, Electrons
 from ..detector.demosaic import interpolate
 from ..detector.interface import with_luminance
@@ -70,9 +71,10 @@ class Picture:
                 f"image: has {numbers.shape[2]} channels, but camera.detector {detector.name} sees no colours"
             )
         response, assumptions = _response(numbers.dtype, table, camera, raw=raw)
-        highest = np.iinfo(numbers.dtype).max if numbers.dtype.kind in "ui" else np.inf
-        lost = (numbers >= min(response.white_dn, highest)) | (numbers <= np.minimum(0, response.black_dn))
-        light = np.atleast_3d(np.maximum(response.light(numbers), 0).astype(np.float32))
+        top = min(response.white_dn, np.iinfo(numbers.dtype).max if numbers.dtype.kind in "ui" else np.inf)
+        bottom = min(0, response.black_dn)
+        lost = response.of_image(numbers, lambda n: ((n >= top) | (n <= bottom)).astype(np.uint8))
+        light = np.atleast_3d(response.of_image(numbers, response.lit))
         return cls(
             numbers=numbers,
             light=light,
@@ -80,7 +82,7 @@ class Picture:
             response=response,
             camera=camera,
             raw=raw,
-            unrecoverable=lost.any(axis=2) if lost.ndim == 3 else lost,
+            unrecoverable=np.asarray(reduce(np.maximum, cv2.split(lost))).view(np.bool_),
             assumptions=assumptions,
         )
 
@@ -111,11 +113,17 @@ class Picture:
 
     def with_change(self, change: F32) -> NDArray[Any]:
         """Return the numbers with a change of light, float32[y, x, channel]; others stay as they are."""
-        change = change.reshape(self.numbers.shape)
+        numbers, response = self.numbers, self.response
+        change = change.reshape(numbers.shape)
+        if numbers.dtype in (np.uint8, np.uint16) and response.table is None:
+            be, light = backend(), response.of_image(numbers, lambda n: response.light(n).astype(np.float32))
+            moved = on_device(change)
+            value = be.dr.round(response.numbers(on_device(light) + moved, be.dr))
+            value = be.dr.select(moved != 0, be.dr.clip(value, 0, self._top_dn), on_device(numbers))
+            return evaluated(value).astype(numbers.dtype).reshape(numbers.shape)
         changed = change != 0
-        out = self.numbers.copy()
-        light = self.response.light(self.numbers[changed])
-        out[changed] = self._rounded(self.response.numbers(light + change[changed]))
+        out = numbers.copy()
+        out[changed] = self._rounded(response.numbers(response.light(numbers[changed]) + change[changed]))
         return out
 
     def spread(self, mosaic_e: F32) -> F32:
@@ -133,15 +141,16 @@ class Picture:
         of more bits keep their last digits.
         """
         channels = 1 if numbers.ndim == 2 else numbers.shape[2]
-        pick = [3] if channels == 1 else list(range(channels))
-        old, new = (x.array[..., pick].reshape(numbers.shape) for x in (before, after))
-        changed = new != old
-        level = new[changed].astype(np.float64)
-        step = (self.response.white_dn - self.response.black_dn) / 255
-        moved = numbers[changed] + (level - old[changed]) * step
+        first = 3 if channels == 1 else 0  # grey is the intensity, which stands behind the colours
+        pixels = np.flatnonzero(before.array.view(np.uint32) != after.array.view(np.uint32))
+        old, new = (x.array.reshape(-1, 4)[pixels, first : first + channels] for x in (before, after))
         out = numbers.copy()
-        ends = [level == 0, level == 255]
-        out[changed] = self._rounded(np.select(ends, [self.response.black_dn, self.response.white_dn], moved))
+        rows = out.reshape(-1, channels)
+        step = (self.response.white_dn - self.response.black_dn) / 255
+        moved = rows[pixels] + (new.astype(np.float64) - old) * step
+        ends = [new == old, new == 0, new == 255]
+        values = [rows[pixels], self.response.black_dn, self.response.white_dn]
+        rows[pixels] = np.where(ends[0], values[0], self._rounded(np.select(ends, values, moved)))
         return out
 
     def _rounded(self, values: NDArray[np.float64]) -> NDArray[Any]:
@@ -149,18 +158,20 @@ class Picture:
         dtype = self.numbers.dtype
         if dtype.kind == "f":
             return values.astype(dtype)
-        limits = np.iinfo(dtype)
+        return np.clip(np.rint(values), np.iinfo(dtype).min, self._top_dn).astype(dtype)
+
+    @cached_property
+    def _top_dn(self) -> float:
+        """Return the highest whole number: that of white, or of a mosaic's converter, as far as the type holds it."""
         top = self.camera.mosaic.sensor.readout.top_dn if self.raw else self.response.white_dn
-        return np.clip(np.rint(values), limits.min, min(top, limits.max)).astype(dtype)
+        return float(min(top, np.iinfo(self.numbers.dtype).max))
 
 
 def levels(numbers: NDArray[Any], response: Response) -> NDArray[np.uint8]:
     """Return numbers as an image of 8 bits, uint8[y, x, 4] with R, G, B and I."""
-    scale = np.float32(255 / (response.white_dn - response.black_dn))
-    code = (numbers.astype(np.float32) - np.float32(response.black_dn)) * scale
-    eight = np.atleast_3d(np.clip(np.rint(code), 0, 255).astype(np.uint8))
+    eight = np.atleast_3d(response.of_image(numbers, response.levels))
     if eight.shape[2] == 1:
-        eight = np.repeat(eight, 4, axis=2)
+        eight = cv2.merge([eight] * 4)
     elif eight.shape[2] == 3:
         eight = with_luminance(eight)
     return np.ascontiguousarray(eight)

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any, TypeVar
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -14,6 +17,7 @@ from ..core.files import user_files
 from ..scene.instrument import ResponseCurve
 
 F64 = NDArray[np.float64]
+T = TypeVar("T", bound=np.generic)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -37,6 +41,15 @@ class Response:
     gamma: float = 2.2
     table: F64 | None = None
 
+    def of_image(self, numbers: NDArray[Any], function: Callable[[Any], NDArray[T]]) -> NDArray[T]:
+        """Return a function of numbers, in their shape; for whole numbers of 16 bits or less by a table of all."""
+        if numbers.dtype not in (np.uint8, np.uint16):
+            return function(numbers)
+        table = function(np.arange(np.iinfo(numbers.dtype).max + 1, dtype=numbers.dtype))
+        if numbers.dtype == np.uint8:
+            return np.asarray(cv2.LUT(numbers, table)).reshape(numbers.shape)  # ten times as fast as numpy
+        return np.take(table, numbers)
+
     def light(self, numbers: ArrayLike) -> F64:
         """Return linear light over that of white, float64 in the shape of the numbers; negative below black."""
         code = (np.asarray(numbers, dtype=np.float64) - self.black_dn) / (self.white_dn - self.black_dn)
@@ -50,17 +63,31 @@ class Response:
         bright = np.maximum(code, 0.04045)
         return np.where(code <= 0.04045, code / 12.92, ((bright + 0.055) / 1.055) ** 2.4)
 
-    def numbers(self, light: ArrayLike) -> F64:
-        """Return the numbers of linear light, float64, neither rounded nor clipped."""
-        value = np.asarray(light, dtype=np.float64)
+    def lit(self, numbers: ArrayLike) -> NDArray[np.float32]:
+        """Return `light` in single precision, at least 0."""
+        return np.maximum(self.light(numbers), 0).astype(np.float32)
+
+    def levels(self, numbers: ArrayLike) -> NDArray[np.uint8]:
+        """Return the numbers as levels of 8 bits from black to white, uint8 in their shape."""
+        scale = np.float32(255 / (self.white_dn - self.black_dn))
+        code = (np.asarray(numbers, dtype=np.float32) - np.float32(self.black_dn)) * scale
+        return np.clip(np.rint(code), 0, 255).astype(np.uint8)
+
+    def numbers(self, light: Any, xp: Any = np) -> Any:
+        """Return the numbers of linear light, neither rounded nor clipped.
+
+        `xp` is the array namespace, numpy (float64) or drjit (single precision, which knows no table).
+        """
+        value = np.asarray(light, dtype=np.float64) if xp is np else light
+        where = np.where if xp is np else xp.select
         if self.curve == "table":
             assert self.table is not None
             value = np.interp(value, self.table[:, 0], self.table[:, 1])
         elif self.curve == "gamma":
-            value = np.sign(value) * np.abs(value) ** (1 / self.gamma)
+            value = xp.sign(value) * xp.power(xp.abs(value), 1 / self.gamma)
         elif self.curve == "srgb":
-            bright = np.maximum(value, 0.0031308)
-            value = np.where(value <= 0.0031308, 12.92 * value, 1.055 * bright ** (1 / 2.4) - 0.055)
+            bright = xp.maximum(value, 0.0031308)
+            value = where(value <= 0.0031308, 12.92 * value, 1.055 * xp.power(bright, 1 / 2.4) - 0.055)
         return self.black_dn + (self.white_dn - self.black_dn) * value
 
 
