@@ -9,7 +9,7 @@ import pytest
 
 from vbnfault.core.process.llvm import backend
 from vbnfault.core.quantities import RGBI, Electrons
-from vbnfault.detector import Noise, ThreeColourDetector
+from vbnfault.detector import GreyDetector, Noise, ThreeColourDetector
 from vbnfault.detector.noise import NormalField, draw_normals, variates_by_code
 
 EXPOSURE_S = 0.02
@@ -199,3 +199,20 @@ def test_exposures_and_variates_share_kernels() -> None:
             hashes.append({kernel["hash"] for kernel in dr.kernel_history() if "hash" in kernel})
     assert len(hashes[0]) == 3
     assert all(of_exposure == hashes[0] for of_exposure in hashes)
+
+
+@pytest.mark.parametrize("noisy", [False, True])
+@pytest.mark.parametrize("width", [64, 33])
+def test_a_grey_detector_has_the_bits_of_its_steps_and_reuses_an_image(width: int, noisy: bool) -> None:
+    detector = GreyDetector(width_px=width, height_px=40)
+    assert detector.white_e.tolist() == [detector.full_well_e]  # white reaches the full well
+    signal = sky((40, width), 0.6)[..., :1].copy()
+    noise = Noise.draw((40, width), np.random.default_rng(3), 1) if noisy else None
+    assert differing(detector, signal, noise) == 0
+    expected = Electrons(array=signal, white_e=detector.white_e)
+    image = detector.develop(expected, EXPOSURE_S, noise)
+    assert (image.array == image.array[..., :1]).all()
+    brighter = expected.with_array(np.where(np.arange(width)[None, :, None] < 9, signal * 2, signal))
+    reused = detector.develop(brighter, EXPOSURE_S, noise, base=(expected, image)).array
+    np.testing.assert_array_equal(reused, detector.develop(brighter, EXPOSURE_S, noise).array)
+    assert (reused != image.array).any()

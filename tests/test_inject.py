@@ -145,7 +145,7 @@ def simple_faults() -> Iterator[None]:
 
     define("test_half", lambda array: array * np.float32(0.5))
     define("test_veil", lambda array: array + np.float32(2000))
-    define("test_blur", lambda array: cv2.blur(array, (5, 5)))
+    define("test_blur", lambda array: cv2.blur(array, (5, 5)).reshape(array.shape))
     yield
     forget(__name__)
 
@@ -175,10 +175,6 @@ def test_noise_is_that_of_the_light_that_remains(name: str, mean: float, varianc
     for given in (colours, numbers):
         result = vbnfault.inject(given, {name: {}}, camera=CAMERA, seed=3)
         after = np.atleast_3d(result.image)[..., 1 if given.ndim == 3 else 0] / 65535 * white
-        if (
-            name == "test_veil" and given.ndim == 2
-        ):  # 2000 electrons of each colour are more of white in two of them
-            mean, variance = after.mean(), after.mean() + 169
         assert after.mean() == pytest.approx(mean, rel=4 * np.sqrt(variance) / mean / 256)
         assert after.var() == pytest.approx(variance, rel=4 * np.sqrt(2 / after.size))
 

@@ -2,9 +2,9 @@
 
     irradiance → photo-electrons expected → electrons → raw DN → RGBI
 
-Every pixel senses three colours (no mosaic), as in the image model of Gallon et al. Noise comes from a fixed number
-of variates per pixel that do not depend on the signal. Two exposures of twins therefore differ only where their
-signals differ.
+Every pixel senses three colours (no mosaic), as in the image model of Gallon et al., or all light as one. Noise
+comes from a fixed number of variates per pixel that do not depend on the signal. Two exposures of twins therefore
+differ only where their signals differ.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ class Noise:
     Attributes
     ----------
     codes
-        Codes of the variates of shot noise and of read noise beside each other, uint16[y, x, 3, 2].
+        Codes of the variates of shot noise and of read noise beside each other, uint16[y, x, channel, 2].
     shot, read
-        The two fields, [y, x, 3] each; their codes are views of `codes`.
+        The two fields, [y, x, channel] each; their codes are views of `codes`.
     """
 
     codes: NDArray[np.uint16]
@@ -53,9 +53,9 @@ class Noise:
     read: NormalField
 
     @classmethod
-    def draw(cls, shape: tuple[int, int], rng: np.random.Generator) -> Noise:
+    def draw(cls, shape: tuple[int, int], rng: np.random.Generator, channels: int = 3) -> Noise:
         """Draw two fields of normal variates for a (height, width) sensor."""
-        both = draw_normals((*shape, 3, 2), rng)
+        both = draw_normals((*shape, channels, 2), rng)
         place, which = np.divmod(both.tail, 2)
         fields = [
             NormalField(codes=both.codes[..., k], tail=place[which == k], tail_values=both.tail_values[which == k])
@@ -66,7 +66,7 @@ class Noise:
     @cached_property
     def outermost_pixels(self) -> NDArray[np.intp]:
         """Return the flat indices of the pixels with an outermost code, whose variates no table holds, intp[n]."""
-        return np.unique(np.concatenate([self.shot.tail, self.read.tail]) // 3)
+        return np.unique(np.concatenate([self.shot.tail, self.read.tail]) // self.codes.shape[2])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,7 +103,7 @@ class ThreeColourDetector(Detector):
 
     def draw_noise(self, shape: tuple[int, int], rng: Callable[[str], np.random.Generator]) -> Noise:
         """Draw the variates of one exposure. `rng` returns the random generator for a name."""
-        return Noise.draw(shape, rng("noise"))
+        return Noise.draw(shape, rng("noise"), len(self.channels))
 
     @property
     def adc_max_dn(self) -> int:
@@ -117,12 +117,12 @@ class ThreeColourDetector(Detector):
 
     @property
     def efficiency(self) -> QuantumEfficiency:
-        """Return the QE (electrons per photon) in R, G, B."""
-        return QuantumEfficiency(response=self.response, peak=self.quantum_efficiency_peak)
+        """Return the QE (electrons per photon) of the channels."""
+        return QuantumEfficiency(channels=self.channels, response=self.response, peak=self.quantum_efficiency_peak)
 
     @property
     def white_e(self) -> F32:
-        """Return the signal of R, G, B in electrons that the 8 bit image shows as 255, float32[3]."""
+        """Return the signal in electrons that the 8 bit image shows as 255, float32[channel]."""
         return np.asarray(self.full_well_e / self.gain / self.white_balance, dtype=np.float32)
 
     @property
@@ -175,7 +175,7 @@ class ThreeColourDetector(Detector):
         if noise is not None and len(noise.outermost_pixels):
             beyond = noise.outermost_pixels[None]
             shot, read = (field.of_pixels(beyond).values() for field in (noise.shot, noise.read))
-            electrons = self.collected_e(expected.array.reshape(-1, 3)[beyond], exposure_s, shot)
+            electrons = self.collected_e(expected.array.reshape(-1, shape[2])[beyond], exposure_s, shot)
             image.reshape(-1, 4)[beyond] = self.shown(self.converted_dn(electrons, read), exposure_s)
         return RGBI(array=image)
 
@@ -197,15 +197,23 @@ class ThreeColourDetector(Detector):
         """Return 8 bit R, G, B, I: subtract bias and mean dark signal, balance white, add the luminance as I."""
         black, scale = self.black_and_scale(exposure_s)
         # OpenCV multiplies with 64 bits, rounds to even and saturates at 0 and 255 as it converts
-        return with_luminance(np.asarray(cv2.multiply(dn - black, (*scale.tolist(), 0.0), dtype=cv2.CV_8U)))
+        levels = np.asarray(cv2.multiply(dn - black, (*scale.tolist(), 0.0), dtype=cv2.CV_8U))
+        return with_luminance(levels) if len(scale) == 3 else cv2.merge([levels] * 4)
 
     def black_and_scale(self, exposure_s: float) -> tuple[np.float32, F32]:
-        """Return the code that is shown as 0, and the levels per code of R, G and B, float32[3]."""
+        """Return the code that is shown as 0, and the levels per code of the channels, float32[channel]."""
         # white is the range above the black level, so a saturated pixel stays white after a long exposure. Where
         # the dark signal alone saturates the pixels, 1 % of the range is left
         dark_dn = self.bias_dn + self.dark_current_e_s * exposure_s * self.gain_dn_per_e
         black = np.float32(min(dark_dn, self.adc_max_dn - 0.01 * (self.adc_max_dn - self.bias_dn)))
         return black, (255.0 / (self.adc_max_dn - float(black)) * self.white_balance).astype(np.float32)
+
+
+@dataclass(frozen=True, kw_only=True)
+class GreyDetector(ThreeColourDetector):
+    """Describe a sensor without colour filters, whose quantum efficiency is the same at all wavelengths."""
+
+    channels: ClassVar[tuple[str, ...]] = ("W",)
 
 
 # --- compiled ---------------------------------------------------------------------------------------------------
@@ -242,16 +250,17 @@ class _Curve:
         Parameters
         ----------
         signal
-            Expected photo-electrons, float32[y, x, 3], of at least one pixel.
+            Expected photo-electrons, float32[y, x, channel], of at least one pixel, with one channel or three.
         codes
-            Codes of the variates of shot noise and of read noise, uint16[y, x, 3, 2]; None for no noise. The two
-            outermost codes stand for variates that no table holds; here they are the medians of their bins.
+            Codes of the variates of shot noise and of read noise, uint16[y, x, channel, 2]; None for no noise. The
+            two outermost codes stand for variates that no table holds; here they are the medians of their bins.
         base
-            Another signal, float32[y, x, 3], and its image with the same variates, uint8[y, x, 4]. Where a value of
-            the signal is the same, its level is taken from this image.
+            Another signal, float32[y, x, channel], and its image with the same variates, uint8[y, x, 4]. Where a
+            value of the signal is the same, its level is taken from this image.
         """
         be = backend()
         dr, level = be.dr, self._noise_free_level if codes is None else self._level
+        channels = signal.shape[2]
         words = be.UInt32(0) if codes is None else be.UInt32(flat(codes).view(np.uint32))
         given = be.Float(flat(signal)), dr.arange(be.UInt32, signal.size), words
         if base is None:
@@ -260,10 +269,12 @@ class _Curve:
             of_base = be.UInt32(flat(base[1]).view(np.uint32))
 
             def known(_: Any, place: Any, __: Any) -> Any:
-                pixel = place // 3
-                return dr.gather(be.UInt32, of_base, pixel) >> 8 * (place - 3 * pixel) & 0xFF
+                pixel = place // channels
+                return dr.gather(be.UInt32, of_base, pixel) >> 8 * (place - channels * pixel) & 0xFF
 
             found = dr.if_stmt(given, given[0] != be.Float(flat(base[0])), level, known)
+        if channels == 1:
+            return evaluated(found * 0x01010101).view(np.uint8).reshape(*signal.shape[:2], 4)
         return _with_luminance(evaluated(be.UInt8(found))).reshape(*signal.shape[:2], 4)
 
     def _noise_free_level(self, signal: Any, place: Any, codes: Any) -> Any:
@@ -289,8 +300,9 @@ class _Curve:
         be = backend()
         dr = be.dr
         dn = dr.clip(dr.round(dn + self._bias), 0, self._top)
-        colour = place % 3
-        scale = dr.select(colour == 0, self._scale[0], dr.select(colour == 1, self._scale[1], self._scale[2]))
+        scale, colour = self._scale[0], place % len(self._scale)
+        for k, other in enumerate(self._scale[1:], start=1):
+            scale = dr.select(colour == k, other, scale)
         return be.UInt32(be.Int32(dr.clip(dr.round(be.Float64(dn - self._black) * scale), 0, 255)))
 
 

@@ -15,6 +15,7 @@ from ..camera import Camera
 from ..core import spectra
 from ..core.errors import InputError
 from ..core.quantities import RGBI, Electrons, Radiance
+from ..detector import GreyDetector, ThreeColourDetector
 from ..faults import Fault, FaultContext
 from ..pipeline.development import Development, Draws, without
 from ..pipeline.injection import draw_faults, visible_draws
@@ -153,7 +154,7 @@ class Injector:
             source, scene = str(scene), load_scene(scene)
         self.scene, self.source, self.effects = scene, source, effects
         self.faults = configure_faults(scene, source)
-        self._cameras: dict[tuple[int, int], Camera] = {}
+        self._cameras: dict[tuple[tuple[int, int], bool], Camera] = {}
 
     def __call__(
         self,
@@ -196,7 +197,9 @@ class Injector:
             The image cannot be used with this camera.
         """
         given = image if isinstance(image, Electrons | Radiance) else _checked_array(image)
-        camera, assumed = self._camera(_shape(given), camera)
+        camera, assumed = self._camera(
+            _shape(given), camera, grey=isinstance(given, np.ndarray) and given.ndim == 2
+        )
         picture = None
         if isinstance(given, Electrons | Radiance):
             light = given if isinstance(given, Electrons) else camera.expose(given, camera.exposure_s)
@@ -263,8 +266,8 @@ class Injector:
 
     # --- camera and Sun ------------------------------------------------------------------------------------------
 
-    def _camera(self, shape: tuple[int, int], given: Camera | None) -> tuple[Camera, list[str]]:
-        """Return the camera of images of a shape, and what was assumed of it."""
+    def _camera(self, shape: tuple[int, int], given: Camera | None, *, grey: bool) -> tuple[Camera, list[str]]:
+        """Return the camera of images of a shape, grey or in colours, and what was assumed of it."""
         height, width = shape
         if given is not None:
             if (given.height_px, given.width_px) != shape:
@@ -283,13 +286,15 @@ class Injector:
         if table.calibration is None and not {"fov_deg", "focal_length_mm", "lens"} & given_keys:
             assumed.append(f"camera.fov_deg = {table.fov_deg:g}: assumed, since the scene does not give it")
         if "detector" not in given_keys:
-            assumed.append(
-                "camera.detector = '': assumed, three colours in every pixel, since the scene names none"
-            )
-        if shape not in self._cameras:
+            pixels = "pixels without colour filters" if grey else "three colours in every pixel"
+            assumed.append(f"camera.detector = '': assumed, {pixels}, since the scene names none")
+        if (shape, grey) not in self._cameras:
             own = table.model_copy(update={"width_px": width, "height_px": height})
-            self._cameras[shape] = cameras.base_camera(self.scene.model_copy(update={"camera": own}))
-        return replace(self._cameras[shape], exposure_s=float(exposure_s)), assumed
+            self._cameras[shape, grey] = cameras.base_camera(
+                self.scene.model_copy(update={"camera": own}),
+                generic=GreyDetector if grey else ThreeColourDetector,
+            )
+        return replace(self._cameras[shape, grey], exposure_s=float(exposure_s)), assumed
 
     def _context(
         self, camera: Camera, sun: str | Sequence[float] | None, depth_m: Any, picture: Picture | None

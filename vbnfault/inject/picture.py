@@ -148,9 +148,8 @@ class Picture:
         rows = out.reshape(-1, channels)
         step = (self.response.white_dn - self.response.black_dn) / 255
         moved = rows[pixels] + (new.astype(np.float64) - old) * step
-        ends = [new == old, new == 0, new == 255]
-        values = [rows[pixels], self.response.black_dn, self.response.white_dn]
-        rows[pixels] = np.where(ends[0], values[0], self._rounded(np.select(ends, values, moved)))
+        moved = np.select([new == 0, new == 255], [self.response.black_dn, self.response.white_dn], moved)
+        rows[pixels] = np.where(new == old, rows[pixels], self._rounded(moved))
         return out
 
     def _rounded(self, values: NDArray[np.float64]) -> NDArray[Any]:
@@ -162,7 +161,7 @@ class Picture:
 
     @cached_property
     def _top_dn(self) -> float:
-        """Return the highest whole number: that of white, or of a mosaic's converter, as far as the type holds it."""
+        """Return the highest whole number: white, or that of a mosaic's converter, if the type holds it."""
         top = self.camera.mosaic.sensor.readout.top_dn if self.raw else self.response.white_dn
         return float(min(top, np.iinfo(self.numbers.dtype).max))
 

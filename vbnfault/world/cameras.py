@@ -31,8 +31,18 @@ from .ephemeris import wavelengths_nm
 _DARK_FRACTION = 1e-3
 
 
-def base_camera(scene: Scene, *, architecture: int = 0, readout_direction: int = 0, individual: int = 0) -> Camera:
-    """Return the scene's camera before an exposure is set. The integers are indices into its lists of options."""
+def base_camera(
+    scene: Scene,
+    *,
+    architecture: int = 0,
+    readout_direction: int = 0,
+    individual: int = 0,
+    generic: type[ThreeColourDetector] = ThreeColourDetector,
+) -> Camera:
+    """Return the scene's camera before an exposure is set. The integers are indices into its lists of options.
+
+    `generic` is the kind of detector of a scene that names none.
+    """
     c = scene.camera
     direction = c.readout_directions[readout_direction]
     if c.detector:
@@ -41,7 +51,7 @@ def base_camera(scene: Scene, *, architecture: int = 0, readout_direction: int =
         pitch_um, which = sensor.pixel_pitch_um, sensor.architecture
     else:
         which = c.architectures[architecture]
-        detector = _three_colours(c, which)
+        detector = _generic(c, which, generic)
         pitch_um = detector.pixel_pitch_um
     return Camera(
         lens=real_lens(c, pitch_um) if c.lens else _thin_lens(c, pitch_um),
@@ -52,10 +62,10 @@ def base_camera(scene: Scene, *, architecture: int = 0, readout_direction: int =
     )
 
 
-def _three_colours(c: CameraTable, architecture: str) -> ThreeColourDetector:
-    """Return the three-colour detector of a camera table; a CCD reads the sum of binned pixels once."""
+def _generic(c: CameraTable, architecture: str, kind: type[ThreeColourDetector]) -> ThreeColourDetector:
+    """Return the detector of a camera table that names none; a CCD reads the sum of binned pixels once."""
     pixels, readouts = c.binning**2, 1 if architecture != "cmos" else c.binning
-    return ThreeColourDetector(
+    return kind(
         width_px=c.width_px,
         height_px=c.height_px,
         pixel_pitch_um=c.pixel_pitch_um * c.binning,
