@@ -33,7 +33,7 @@ from .interface import luminance
 from .measured import as_measured
 from .mosaic import channel_of
 from .noise import NormalField, draw_normals
-from .readout import ReadoutIndividual, ReadoutNoise, read_out
+from .readout import ReadoutIndividual, ReadoutNoise, ReadoutSpec, read_out
 from .sensor import Sensor
 
 F32 = NDArray[np.float32]
@@ -68,6 +68,42 @@ class MosaicNoise:
         )
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Maps:
+    """Hold the maps of a device that do not depend on its readout; a fault that changes this leaves them alone."""
+
+    drawn: Individual
+    individual: Individual
+    response: F32
+    offset_e: F32
+    dark_rate_e_s: F32
+    transfer_dark_e: F32 | None
+
+    @cached_property
+    def transfer_rows_e(self) -> F32:
+        """Return the median of `transfer_dark_e` in each row, float32[y, 1]."""
+        return np.asarray(np.median(self.transfer_dark_e, axis=1, keepdims=True))
+
+
+@lru_cache(maxsize=2)
+def _maps(sensor: Sensor, seed: int, shape: tuple[int, int], temperature_K: float, direction: str) -> _Maps:
+    """Return the maps of a device of a sensor without its readout, except its nodes."""
+    drawn = individual(sensor.individual, shape, sensor.pixel_pitch_um, seed)
+    own = as_measured(drawn, sensor)
+    rate = dark_rate_e_s(own, temperature_K)
+    moved = None  # a dark frame has this signal, too
+    if sensor.measured is None or sensor.measured.dark_e_s is None:
+        moved = transfer_dark_e(sensor, rate, direction)
+    return _Maps(
+        drawn=drawn,
+        individual=own,
+        response=response(own),
+        offset_e=offset_e(own),
+        dark_rate_e_s=rate,
+        transfer_dark_e=moved,
+    )
+
+
 class Device:
     """Simulate one device of a sensor at one temperature.
 
@@ -99,20 +135,17 @@ class Device:
         self.sensor, self.seed, self.direction = sensor, seed, direction
         self.shape = (sensor.height_px, sensor.width_px) if shape is None else shape
         self.temperature_K = sensor.temperature_K if temperature_K is None else temperature_K
-        self.drawn = individual(sensor.individual, self.shape, sensor.pixel_pitch_um, seed)
-        self.individual = as_measured(self.drawn, sensor)
-        self.response = response(self.individual)
-        self.offset_e = offset_e(self.individual)
+        bare = replace(sensor, readout=ReadoutSpec(nodes=sensor.readout.nodes), effects=())
+        self.maps = _maps(bare, seed, self.shape, self.temperature_K, direction)
+        self.drawn, self.individual = self.maps.drawn, self.maps.individual
+        self.response, self.offset_e = self.maps.response, self.maps.offset_e
+        self.dark_rate_e_s, self.transfer_dark_e = self.maps.dark_rate_e_s, self.maps.transfer_dark_e
         drawn = ReadoutIndividual.draw(
             self.shape, sensor.readout, np.random.default_rng(np.random.SeedSequence([seed, *b"readout"]))
         )
         if sensor.measured is not None and sensor.measured.offset_e is not None:
             drawn = replace(drawn, row_e=None, column_e=None)  # the measured offsets have these patterns
         self.readout_individual = replace(drawn, pixel_e=self.offset_e)
-        self.dark_rate_e_s = dark_rate_e_s(self.individual, self.temperature_K)
-        self.transfer_dark_e = None  # a dark frame has this signal, too
-        if sensor.measured is None or sensor.measured.dark_e_s is None:
-            self.transfer_dark_e = transfer_dark_e(sensor, self.dark_rate_e_s, direction)
         self.telegraph = self.individual.rts.at(self.temperature_K)
         self.chain = chain_of(sensor.effects)
 
@@ -174,7 +207,7 @@ class Device:
         """
         if self.transfer_dark_e is None or self.sensor.black == "bias":
             return None
-        rows = np.median(self.transfer_dark_e, axis=1, keepdims=True) * self.sensor.readout.system_gain_dn_per_e
+        rows = self.maps.transfer_rows_e * self.sensor.readout.system_gain_dn_per_e
         return rows.astype(np.float32) if rows.max() > _LEAST_BLACK_DN else None
 
     @cached_property

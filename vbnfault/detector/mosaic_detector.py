@@ -185,7 +185,7 @@ class MosaicDetector(Detector):
         return _device(self.sensor, self.seed, (self.height_px, self.width_px), self.direction)
 
 
-@lru_cache(maxsize=2)  # a device takes 13 MB for 1024 pixels
+@lru_cache(maxsize=6)  # a device of another readout takes 2 MB for 1024 pixels (`chain._maps`)
 def _device(sensor: Sensor, seed: int, shape: tuple[int, int], direction: str) -> Device:
     """Return a device from the cache, or make it."""
     return Device(sensor, seed, shape=shape, direction=direction)
