@@ -536,3 +536,17 @@ def test_unusable_batches(tmp_path: Path) -> None:
     write_png(pictures / "large.png", np.zeros((80, 96), np.uint8))
     with pytest.raises(InputError, match="a store holds images of one size, and these have 96 x 64, 96 x 80"):
         inject_files([pictures], scene, tmp_path / "out", labels="zarr", progress=False)
+
+
+def test_images_with_one_sun_share_its_straylight_and_have_the_bits_of_their_own() -> None:
+    image = np.full((64, 96), 90, np.uint8)
+    camera = {**CAMERA, "exposure_s": 2e-6}
+    tables = {"title": "inject", "camera": camera, "faults": {"straylight": {"model": "traced"}}}
+    scene = Scene.model_validate(tables)
+    injector = Injector(scene)
+    places = [(40.0, 20.0), (40.0, 20.0), (10.0, 50.0), (40.0, 20.0)]
+    results = [injector(image, number, sun=place) for number, place in enumerate(places)]
+    for number, (place, result) in enumerate(zip(places, results, strict=True)):
+        assert result.injected.all()
+        np.testing.assert_array_equal(Injector(scene)(image, number, sun=place).image, result.image)
+    assert (results[0].image != results[2].image).any()

@@ -15,6 +15,7 @@ from ..camera import Camera
 from ..core import spectra
 from ..core.errors import InputError
 from ..core.quantities import RGBI, Electrons, Radiance
+from ..core.shared_results import SharedResults
 from ..detector import GreyDetector, ThreeColourDetector
 from ..faults import Fault, FaultContext
 from ..pipeline.development import Development, Draws, without
@@ -155,6 +156,7 @@ class Injector:
         self.scene, self.source, self.effects = scene, source, effects
         self.faults = configure_faults(scene, source)
         self._cameras: dict[tuple[tuple[int, int], bool], Camera] = {}
+        self._shared: tuple[Any, SharedResults] | None = None
 
     def __call__(
         self,
@@ -314,7 +316,15 @@ class Injector:
             sun_angular_radius_rad=spectra.sun_angular_radius_rad(distance_au),
             sun_visible_fraction=None if direction is None else 1.0,
             depth_m=None if depth_m is None else np.asarray(depth_m),
+            of_view=self._shared_by(camera, direction),
         )
+
+    def _shared_by(self, camera: Camera, sun: NDArray[np.float64] | None) -> SharedResults:
+        """Return what images of one camera with the same Sun share, kept for the last such pair."""
+        key = camera, None if sun is None else sun.tobytes()
+        if self._shared is None or self._shared[0] != key:
+            self._shared = key, SharedResults(kept=True)
+        return self._shared[1]
 
     def _impossible(self, names: Sequence[str], context: FaultContext) -> dict[str, str]:
         """Return why some of the classes cannot act on an image."""
