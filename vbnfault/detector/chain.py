@@ -82,6 +82,7 @@ class _Maps:
     @cached_property
     def transfer_rows_e(self) -> F32:
         """Return the median of `transfer_dark_e` in each row, float32[y, 1]."""
+        assert self.transfer_dark_e is not None
         return np.asarray(np.median(self.transfer_dark_e, axis=1, keepdims=True))
 
 

@@ -19,12 +19,13 @@ from ..core.shared_results import SharedResults
 from ..detector import GreyDetector, ThreeColourDetector
 from ..faults import Fault, FaultContext
 from ..pipeline.development import Development, Draws, without
+from ..pipeline.exposure import reference_exposure_s
 from ..pipeline.injection import draw_faults, visible_draws
 from ..pipeline.labels import labels_of
 from ..pipeline.spec import Draw, Injection, SceneExposure, SceneLight, mask_any_faults
 from ..scene import keyed_random
 from ..scene.config import Scene, configure_faults, load_scene
-from ..scene.instrument import ImageTable
+from ..scene.instrument import CameraTable, ImageTable
 from ..world import cameras, ephemeris
 from .change import struck
 from .picture import Picture
@@ -35,7 +36,6 @@ F32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 _LEAST_PX = 16
-_ASSUMED_EXPOSURE_S = 0.01
 _ROUNDING_DN = 2.0  # a larger change of the model's image of 8 bits shows in any image
 
 
@@ -280,10 +280,6 @@ class Injector:
         if min(shape) < _LEAST_PX:
             raise InputError(f"image of {width} x {height} pixels: must have at least {_LEAST_PX} x {_LEAST_PX}")
         table, assumed = self.scene.camera, []
-        exposure_s = table.exposure_s
-        if exposure_s == "auto":
-            exposure_s = _ASSUMED_EXPOSURE_S
-            assumed.append(f"camera.exposure_s = {exposure_s:g}: assumed, since the scene leaves it to be metered")
         given_keys = table.model_fields_set
         if table.calibration is None and not {"fov_deg", "focal_length_mm", "lens"} & given_keys:
             assumed.append(f"camera.fov_deg = {table.fov_deg:g}: assumed, since the scene does not give it")
@@ -291,12 +287,27 @@ class Injector:
             pixels = "pixels without colour filters" if grey else "three colours in every pixel"
             assumed.append(f"camera.detector = '': assumed, {pixels}, since the scene names none")
         if (shape, grey) not in self._cameras:
-            own = table.model_copy(update={"width_px": width, "height_px": height})
-            self._cameras[shape, grey] = cameras.base_camera(
-                self.scene.model_copy(update={"camera": own}),
-                generic=GreyDetector if grey else ThreeColourDetector,
+            self._cameras[shape, grey] = self._made_camera(
+                table.model_copy(update={"width_px": width, "height_px": height}),
+                GreyDetector if grey else ThreeColourDetector,
             )
-        return replace(self._cameras[shape, grey], exposure_s=float(exposure_s)), assumed
+        camera = self._cameras[shape, grey]
+        if table.exposure_s == "auto":
+            assumed.append(
+                f"camera.exposure_s = {camera.exposure_s:.3g}: assumed, as ground of body.reflectance lit at 45 "
+                "degrees is metered"
+            )
+        return camera, assumed
+
+    def _made_camera(self, table: CameraTable, generic: type[ThreeColourDetector]) -> Camera:
+        """Return the camera of a table, with its exposure; `generic` is as in `cameras.base_camera`."""
+        scene = self.scene.model_copy(update={"camera": table})
+        camera = cameras.base_camera(scene, generic=generic)
+        exposure_s = table.exposure_s
+        if exposure_s == "auto":
+            reference_s = reference_exposure_s(scene, camera)
+            exposure_s = float(np.clip(reference_s, table.exposure_min_s, table.exposure_max_s))
+        return replace(camera, exposure_s=float(exposure_s))
 
     def _context(
         self, camera: Camera, sun: str | Sequence[float] | None, depth_m: Any, picture: Picture | None
