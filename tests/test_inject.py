@@ -550,3 +550,8 @@ def test_images_with_one_sun_share_its_straylight_and_have_the_bits_of_their_own
         assert result.injected.all()
         np.testing.assert_array_equal(Injector(scene)(image, number, sun=place).image, result.image)
     assert (results[0].image != results[2].image).any()
+
+
+def test_a_wrong_third_number_of_the_sun_is_named() -> None:
+    with pytest.raises(InputError, match=r"image\.sun\[2\] = 'x': must be a number"):
+        load_scene("quickstart", {"image.sun": [1.0, 2.0, "x"]})

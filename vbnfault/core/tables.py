@@ -478,6 +478,7 @@ def _locate(loc: Sequence[int | str], root: Mapping[str, Any]) -> tuple[list[int
         choices = _choices(node, root)
         tables = [choice for choice in choices if part in choice.get("properties", {})]
         lists = [choice for choice in choices if isinstance(part, int) and choice.get("type") == "array"]
+        lists.sort(key=lambda choice: -len(choice.get("prefixItems", ())))  # a longer one has the same first items
         if tables:
             node = tables[0]["properties"][part]
         elif lists and "prefixItems" in lists[0]:
