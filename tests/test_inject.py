@@ -555,3 +555,15 @@ def test_images_with_one_sun_share_its_straylight_and_have_the_bits_of_their_own
 def test_a_wrong_third_number_of_the_sun_is_named() -> None:
     with pytest.raises(InputError, match=r"image\.sun\[2\] = 'x': must be a number"):
         load_scene("quickstart", {"image.sun": [1.0, 2.0, "x"]})
+
+
+@pytest.mark.parametrize("exposure_s", [0.3, 5e-4])
+def test_light_of_a_flare_smears_in_the_image_as_in_its_mask(exposure_s: float) -> None:
+    """In a frame-transfer CCD a short exposure has lines above and below a flare; both say where."""
+    image = np.full((128, 128), 20, np.uint8)
+    camera = {"fov_deg": 5.0, "detector": "rosetta_navcam", "exposure_s": exposure_s}
+    result = vbnfault.inject(image, {"straylight": {"model": "texture"}}, camera=camera, sun=(90.0, 30.0), seed=3)
+    changed, mask = result.image != image, result.masks[0]
+    assert 0.1 < mask.mean() < 0.9
+    assert (changed != mask).mean() < 0.05  # levels that noise moves across a rounding, at the edge of the flare
+    assert (mask.all(axis=0).mean() > 0.2) == (exposure_s < 0.01)

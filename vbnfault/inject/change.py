@@ -10,7 +10,8 @@ the readout. So the noise that is added has, in each pixel, the variance
 where S' are the electrons after the fault and v is the variance that the fault leaves of the image's own noise. It
 is measured: the same draws act on the image with a small perturbation of known variance. Light that a fault adds
 gets its own shot noise in this way, and light that it leaves alone none. A pixel that no fault changes keeps its
-number.
+number. Where the camera names its sensor, changed light passes through this, too: it smears and overflows as the
+sensor's charge does.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ def struck(
         )
         change, after = change + noise, after + (picture.seen(noise).array if noise.any() else 0)
     inside = any(acting_at(draws, step) for step in MOSAIC_STEPS)
-    if inside:
+    if inside or (optical and development.exposure.camera.detector.mosaic is not None):
         change = picture.in_image(_through_sensor(picture, development, draws, after, rng))
     numbers = picture.with_change(change)
     on_image = bool(acting_at(draws, "rgbi"))
