@@ -25,7 +25,7 @@ from vbnfault.core.errors import InputError, VbnfaultError
 from vbnfault.output.export import Entry, Format, export_store, formats
 from vbnfault.output.export.folder import Folder
 from vbnfault.output.export.formats import coco
-from vbnfault.output.export.regions import coco_text, flare_discs, polygon, regions, whole
+from vbnfault.output.export.regions import coco_text, flare_discs, instances, polygon, regions, whole
 
 NAMES = ("coco", "exr", "huggingface", "png", "webdataset", "yolo")
 SAMPLES = 6
@@ -314,6 +314,15 @@ def test_a_flare_in_pieces_is_one_instance() -> None:
     assert [region.area for region in found] == [int((near[k] & crumbs).sum()) for k in (2, 0, 1)]
     assert flare_discs(params, np.array([np.nan, np.nan]), shape).shape == (0, 3)
     assert flare_discs({}, sun, shape).shape == (0, 3)
+
+
+@pytest.mark.parametrize("drawn", [5, {"flares": 3}, {"flares": [{}]}, {"centre_xy_px": "middle"}])
+def test_parameters_of_a_stranger_are_named(drawn: Any, data: st.Store) -> None:
+    sample, fault = data.read_sample(0), (data.spec.localised_faults or ("",))[0]
+    sample.scalars["sun_xy_px"] = np.array([3.0, 4.0])
+    sample.scalars["parameters"] = json.dumps({fault: drawn})
+    with pytest.raises(InputError, match=f"sample 0: parameters of {fault} list no flares"):
+        list(instances(data.spec, sample, 1))
 
 
 @pytest.mark.parametrize("name", ["coco", "yolo"])

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.errors import InputError
 from ...core.quantities import Sample
 from ...store import StoreSpec
 
@@ -21,8 +22,7 @@ def flare_discs(
     """Return x, y and radius in pixels of the flares and the glare that a fault's parameters list, float64[n, 3].
 
     The flares lie on the line from the Sun through the image's centre, or that of the parameters. `shape` is
-    (height, width). Parameters
-    without them, or a Sun that is not in front of the camera, have none.
+    (height, width). Parameters without them, or a Sun that is not in front of the camera, have none.
     """
     sun, middle = np.asarray(sun_xy_px, dtype=np.float64), np.array([shape[1], shape[0]]) / 2
     middle = np.asarray(params.get("centre_xy_px", middle), dtype=np.float64)
@@ -87,8 +87,15 @@ def instances(
     for fault, mask in zip(spec.faults, sample.layers["mask"], strict=True):
         found: list[Region] = []
         if fault in (spec.localised_faults or ()):
-            params = parameters.get(fault) or {}
-            found = regions(mask, flare_discs(params, sample.scalars["sun_xy_px"], (spec.height, spec.width)))
+            try:
+                discs = flare_discs(
+                    parameters.get(fault) or {}, sample.scalars["sun_xy_px"], (spec.height, spec.width)
+                )
+            except (TypeError, ValueError, KeyError, AttributeError):  # of a store that vbnfault did not write
+                raise InputError(
+                    f"sample {sample.index}: parameters of {fault} list no flares as vbnfault does"
+                ) from None
+            found = regions(mask, discs)
         elif whole_frame and mask.any():
             found = [whole(mask)]
         yield [region for region in found if region.area >= min_area_px]
