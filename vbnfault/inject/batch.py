@@ -36,7 +36,7 @@ from ..pipeline.record import proposal
 from ..scene import plan
 from ..scene.config import Scene
 from ..store.schema import SCALARS
-from .files import ENDINGS, ImageFile, read_image
+from .files import ENDINGS, ImageFile, read_image, source_files
 from .injector import Injected, Injector
 from .picture import levels
 
@@ -81,7 +81,9 @@ class Batch:
 
     def key(self, index: int) -> str:
         """Return a digest of the input of an image: its file, its number, the scene and the Sun."""
-        digest = hashlib.sha256((self.root / self.names[index]).read_bytes())
+        digest = hashlib.sha256()
+        for path in source_files(self.root / self.names[index]):
+            digest.update(path.read_bytes())
         scene = self.scene.model_dump(mode="json")
         digest.update(json.dumps([index, self.sun, len(self.names), scene], sort_keys=True).encode())
         return digest.hexdigest()
@@ -127,7 +129,7 @@ class Batch:
         """Write the files of an image; the JSON file comes last."""
         name = self.names[index]
         names = [fault for fault, has in zip(result.faults, result.injected, strict=True) if has]
-        files = [name]
+        files = [p.relative_to(self.root).as_posix() for p in source_files(self.root / name)]
         with writing(self.out, within=True):
             target = own(self.out / name)
             target.parent.mkdir(parents=True, exist_ok=True)
