@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import json
+import shutil
+import sys
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
+import av
 import numpy as np
 import pytest
 
-from vbnfault.core.errors import InputError
+import vbnfault
+from vbnfault.core.errors import InputError, VbnfaultError
 from vbnfault.inject.batch import inject_files
 from vbnfault.inject.files import read_image
+from vbnfault.inject.films import assemble, unpack
 from vbnfault.scene.config import load_scene
 
 SCENE = {"plan.faulty_fraction": 1.0, "camera.exposure_s": 0.01}
@@ -208,4 +215,158 @@ def test_unusable_archives(tmp_path: Path) -> None:
     (tmp_path / "b.xml").write_text("<Product_Observational>")
     for name, sentence in (("a.img", "has no IMAGE in the label a.img"), ("b.img", "label b.xml")):
         with pytest.raises(InputError, match=rf"{name}: .*{sentence}"):
+            read_image(tmp_path / name)
+
+
+# --- films --------------------------------------------------------------------------------------------------------
+
+
+def _film(path: Path, codec: str, pixels: str, frames: int = 6, rate: int = 12) -> np.ndarray:
+    """Write a film of noise that moves, and return its frames as RGB of 8 bits."""
+    noise = np.random.default_rng(3).integers(20, 200, (64, 96 + frames, 3), np.uint8)
+    images = np.array([np.ascontiguousarray(noise[:, k : k + 96]) for k in range(frames)])
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=rate)
+        stream.width, stream.height, stream.pix_fmt = 96, 64, pixels
+        for image in images:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+        container.mux(stream.encode())
+    return images
+
+
+def _read(path: Path, pixels: str) -> tuple[np.ndarray, Fraction]:
+    """Return the frames of a film and its rate."""
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        return np.array([f.to_ndarray(format=pixels) for f in container.decode(stream)]), stream.average_rate
+
+
+@pytest.mark.parametrize(
+    ("name", "codec", "given", "read", "dtype"),
+    [
+        ("colour.mp4", "mpeg4", "yuv420p", "rgb24", np.uint8),
+        ("lossless.avi", "ffv1", "bgr0", "rgb24", np.uint8),
+        ("grey.mov", "mjpeg", "yuvj420p", "rgb24", np.uint8),
+        ("grey.avi", "ffv1", "gray", "gray", np.uint8),
+        ("deep.mkv", "ffv1", "gray16le", "gray16le", np.uint16),
+        ("deep_colour.mkv", "ffv1", "gbrp16le", "rgb48le", np.uint16),
+    ],
+)
+def test_frames_go_through_ffv1_without_loss(
+    name: str, codec: str, given: str, read: str, dtype: Any, tmp_path: Path
+) -> None:
+    images = _film(tmp_path / name, codec, given)
+    film = unpack(tmp_path / name, tmp_path / "frames", 10**6)
+    assert (film.frames, Fraction(film.rate), film.ended) == (6, 12, "")
+    first = read_image(tmp_path / "frames" / "000001.png").numbers
+    assert first.dtype == dtype
+    if name == "lossless.avi":
+        np.testing.assert_array_equal(first, images[0])
+    before = _read(tmp_path / name, read)[0]
+    assemble(tmp_path / "frames", tmp_path / "again.mkv", film)
+    after, rate = _read(tmp_path / "again.mkv", read)
+    np.testing.assert_array_equal(after, before)
+    assert rate == 12
+    data = (tmp_path / "again.mkv").read_bytes()
+    assemble(tmp_path / "frames", tmp_path / "again.mkv", film)
+    assert (tmp_path / "again.mkv").read_bytes() == data
+
+
+def _results(folder: Path) -> dict[str, bytes]:
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and "dataset.zarr" not in path.parts
+    }
+
+
+def test_a_film_becomes_images_with_masks_and_a_film(tmp_path: Path) -> None:
+    (tmp_path / "in").mkdir()
+    _film(tmp_path / "in" / "film.mp4", "mpeg4", "yuv420p")
+    scene, out = load_scene("quickstart", SCENE), tmp_path / "out"
+    batch = inject_files([tmp_path / "in"], scene, out, sun=(60.0, 20.0), progress=False)
+    assert batch.names == tuple(f"film/{k:06d}.png" for k in range(1, 7))
+    faulty, rate = _read(out / "film.mkv", "rgb24")
+    assert rate == 12
+    before = _read(tmp_path / "in" / "film.mp4", "rgb24")[0]
+    masks = []
+    for k, name in enumerate(batch.names):
+        np.testing.assert_array_equal(faulty[k], read_image(out / name).numbers)
+        masks.append(read_image(out / "masks" / f"{name}_any.png").numbers > 0)
+        label = json.loads((out / "labels" / f"{name}.json").read_text())
+        assert label["number"] == k
+        assert label["injected"]
+    assert (faulty != before).any(axis=(1, 2, 3)).all()
+    expected = _results(out)
+    inject_files([tmp_path / "in"], scene, tmp_path / "two", sun=(60.0, 20.0), workers=2, progress=False)
+    assert _results(tmp_path / "two") == expected
+    inject_files([tmp_path / "in"], scene, tmp_path / "two", sun=(60.0, 20.0), labels="zarr", progress=False)
+    assert not vbnfault.verify(tmp_path / "two" / "dataset.zarr").problems
+    assert (tmp_path / "two" / "film.mkv").read_bytes() == expected["film.mkv"]
+    # what an interruption left over is kept, and what it lacks is made
+    changed = out / "film" / "000002.png"
+    at = changed.stat().st_mtime_ns
+    for lost in ("film.mkv", "labels/film/000005.png.json", "film/000006.png"):
+        (out / lost).unlink()
+    inject_files([tmp_path / "in"], scene, out, sun=(60.0, 20.0), progress=False)
+    assert _results(out) == expected
+    assert changed.stat().st_mtime_ns == at
+
+
+@pytest.mark.parametrize(
+    ("name", "codec", "pixels", "left"),
+    [
+        ("film.mkv", "ffv1", "bgr0", 0.6),
+        ("film.avi", "mjpeg", "yuvj420p", 0.5),
+        ("film.mkv", "mpeg4", "yuv420p", 0.9),
+    ],
+)
+def test_a_film_that_ends_early_is_made_as_far_as_it_goes(
+    name: str, codec: str, pixels: str, left: float, tmp_path: Path
+) -> None:
+    whole, film = tmp_path / f"whole_{name}", tmp_path / name
+    _film(whole, codec, pixels, frames=12)
+    data = whole.read_bytes()
+    film.write_bytes(data[: int(left * len(data))])
+    with pytest.raises(
+        VbnfaultError, match=rf"{name}: frame \d+ (is|cannot).*; the \d+ frames before it are made"
+    ) as e:
+        inject_files([film], load_scene("quickstart", SCENE), tmp_path / "out", progress=False)
+    assert not isinstance(e.value, InputError)  # exit status 1: the others are made
+    made = len(list((tmp_path / "out" / "film").iterdir()))
+    assert 0 < made < 12
+    assert f"frame {made + 1} " in str(e.value)
+    faulty = _read(tmp_path / "out" / "film.mkv", "rgb24")[0]
+    assert len(faulty) == made
+    frames = _read(whole, "rgb24")[0]
+    for k in range(made):  # frames before the end are those of the whole film
+        np.testing.assert_array_equal(
+            read_image(tmp_path / "out" / "clean" / "film" / f"{k + 1:06d}.png").numbers, frames[k]
+        )
+
+
+def test_unusable_films(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, path = load_scene("quickstart", SCENE), tmp_path / "a.mp4"
+    _film(tmp_path / "b.mp4", "mpeg4", "yuv420p")
+    for content, sentence in (
+        (b"", "film file is empty"),
+        (b"#EXTM3U\n#EXTINF:1\n/etc/hostname\n", "a.mp4: frame 1 cannot be decoded"),
+        ((tmp_path / "b.mp4").read_bytes()[:900], "a.mp4: frame 1 cannot be decoded"),
+    ):
+        path.write_bytes(content)
+        with pytest.raises(InputError, match=sentence):
+            inject_files([path], scene, tmp_path / "out", progress=False)
+    shutil.copy(tmp_path / "b.mp4", tmp_path / "b.mov")
+    with pytest.raises(InputError, match=r"000001\.png: is named twice"):
+        inject_files([tmp_path / "b.mp4", tmp_path / "b.mov"], scene, tmp_path / "out", progress=False)
+    with pytest.raises(InputError, match="at most 1000"):
+        unpack(tmp_path / "b.mp4", tmp_path / "frames", 1000)
+    for name in ("av", "pdr", "pds4_tools"):
+        monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(InputError, match=r"vbnfault\[video\]"):
+        unpack(tmp_path / "b.mp4", tmp_path / "frames", 10**6)
+    _pds3(tmp_path / "a.img", np.zeros((20, 24), ">i2"), "MSB_INTEGER")
+    _pds4(tmp_path / "b.img", np.zeros((20, 24), ">i2"), "SignedMSB2")
+    for name in ("a.img", "b.img"):
+        with pytest.raises(InputError, match=r"vbnfault\[pds\]"):
             read_image(tmp_path / name)

@@ -21,8 +21,8 @@ from ..core.files.tiff import check_values
 
 _LABELS = (".xml", ".XML", ".lbl", ".LBL")
 _MOST_LABEL_BYTES = 16 * user_files.MIB
-# Special constants of labels (PDS3 data dictionary; PDS4's Special_Constants); what PDS4 calls valid or saturated is
-# light.
+# Special constants of labels (PDS3 data dictionary; PDS4's Special_Constants). What PDS4 calls valid or saturated
+# is light.
 _PDS3_MISSING = ("MISSING", "INVALID", "NULL", "UNKNOWN", "NOT_APPLICABLE", "CORE_NULL", "SAMPLE_NULL")
 _PDS4_MISSING = ("missing", "invalid", "error", "unknown", "not_applicable")
 
