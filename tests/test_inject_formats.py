@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import shutil
 import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -15,6 +17,9 @@ import pytest
 
 import vbnfault
 from vbnfault.core.errors import InputError, VbnfaultError
+from vbnfault.core.files.images import read_exr, write_exr, write_png
+from vbnfault.core.registry import forget
+from vbnfault.detector.three_colour import ThreeColourDetector
 from vbnfault.inject.batch import inject_files
 from vbnfault.inject.files import read_image
 from vbnfault.inject.films import assemble, unpack
@@ -341,7 +346,7 @@ def test_a_film_that_ends_early_is_made_as_far_as_it_goes(
     frames = _read(whole, "rgb24")[0]
     for k in range(made):  # frames before the end are those of the whole film
         np.testing.assert_array_equal(
-            read_image(tmp_path / "out" / "clean" / "film" / f"{k + 1:06d}.png").numbers, frames[k]
+            read_image(tmp_path / "out" / "frames" / "film" / f"{k + 1:06d}.png").numbers, frames[k]
         )
 
 
@@ -370,3 +375,87 @@ def test_unusable_films(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     for name in ("a.img", "b.img"):
         with pytest.raises(InputError, match=r"vbnfault\[pds\]"):
             read_image(tmp_path / name)
+
+
+# --- renders without noise ----------------------------------------------------------------------------------------
+
+CAMERA = {"fov_deg": 20.0, "full_well_e": 13500.0, "read_noise_e_rms": 13.0, "exposure_s": 0.01}
+
+
+@pytest.fixture
+def half() -> Iterator[None]:
+    """Define a fault that takes half of the light away."""
+
+    @dataclass(frozen=True, kw_only=True)
+    class Half(vbnfault.Fault):
+        fault, model, default, step, after = "test_half", "simple", True, "electrons", "dust_on_optics"
+
+        def apply(self, quantity: Any, params: Any, context: Any) -> Any:
+            return quantity.with_array(quantity.array * np.float32(0.5))
+
+    yield
+    forget(__name__)
+
+
+@pytest.mark.usefixtures("half")
+@pytest.mark.parametrize(("dtype", "white"), [(np.float32, 2.0), (np.uint16, 60000)])
+def test_the_camera_adds_the_noise_of_light_and_readout_to_a_render(dtype: Any, white: float) -> None:
+    """Of a flat of λ electrons the variance is λ + σ², and of half of its light λ / 2 + σ².
+
+    The variance of n values is χ² with a relative standard deviation of √(2 / n), and the mean is normal with
+    √(variance / n); the bounds are four such. Whole numbers add 1/12 DN², which is 0.004 e².
+    """
+    render = np.full((256, 256, 3), 0.6 * white, dtype)
+    keys = {"noise_free": True, "white_dn": white, "black_dn": 0.0}
+    result = vbnfault.inject(render, {"test_half": {}}, camera=CAMERA, seed=3, image_keys=keys)
+    assert result.image.dtype == result.clean.dtype == dtype
+    detector = ThreeColourDetector(full_well_e=13500.0, read_noise_e_rms=13.0)
+    for channel, white_e in enumerate(detector.white_e.tolist()):
+        for image, part in ((result.clean, 0.6), (result.image, 0.3)):
+            electrons = image[..., channel].astype(np.float64) / white * white_e
+            mean, variance = part * white_e, part * white_e + 13.0**2
+            assert electrons.mean() == pytest.approx(mean, abs=4 * np.sqrt(variance / electrons.size))
+            assert electrons.var() == pytest.approx(variance, rel=4 * np.sqrt(2 / electrons.size))
+    colours = result.clean.reshape(-1, 3).astype(np.float64)
+    assert np.abs(np.corrcoef(colours.T) - np.eye(3)).max() < 4 / np.sqrt(len(colours))
+
+
+def test_a_render_saturates_at_white_and_differs_from_its_twin_in_the_masks_only() -> None:
+    render = np.full((96, 128), 0.3, np.float32)
+    render[:8] = 40.0
+    keys = {"noise_free": True}
+    given = {"broken_pixels": {"model": "texture"}}
+    images = [vbnfault.inject(render, given, camera=CAMERA, seed=s, image_keys=keys) for s in (2, 2, 3)]
+    result = images[0]
+    assert (result.clean[:8] == 1).all()
+    assert result.image.max() <= 1
+    assert result.unrecoverable[:8].all()
+    np.testing.assert_array_equal(result.image[~result.masks[0]], result.clean[~result.masks[0]])
+    np.testing.assert_array_equal(images[1].image, result.image)
+    assert (images[2].clean[8:] != result.clean[8:]).mean() > 0.9
+    np.testing.assert_array_equal(vbnfault.inject(render, given, camera=CAMERA).clean, render)
+
+
+def test_layers_and_depth_of_a_render_reach_the_store(tmp_path: Path) -> None:
+    """Blender names channels by layer and pass, and gives 1e10 where no surface is."""
+    depth = np.full((64, 96), 1e10, np.float32)
+    depth[20:, :] = 55.5
+    light = {
+        f"ViewLayer.Combined.{c}": np.full((64, 96), v, np.float32)
+        for c, v in zip("RGB", (0.2, 0.3, 0.4), strict=True)
+    }
+    folder = tmp_path / "in"
+    folder.mkdir()
+    write_exr(folder / "a.exr", {**light, "ViewLayer.Depth.Z": depth, "ViewLayer.Combined.A": depth * 0 + 1})
+    write_png(folder / "b.png", np.full((64, 96, 3), 90, np.uint8))
+    scene = load_scene("quickstart", {**SCENE, "image.noise_free": True})
+    inject_files([folder], scene, tmp_path / "out", labels="zarr", progress=False)
+    assert not vbnfault.verify(tmp_path / "out" / "dataset.zarr").problems
+    data = vbnfault.open_dataset(tmp_path / "out" / "dataset.zarr")
+    np.testing.assert_array_equal(data["depth_m"][0], np.where(depth > 1e9, np.inf, depth))
+    assert np.isnan(data["depth_m"][1]).all()
+    _, written = read_exr(tmp_path / "out" / "a.exr")
+    np.testing.assert_array_equal(written["ViewLayer.Depth.Z"], depth)
+    twin = read_image(tmp_path / "out" / "clean" / "a.exr").numbers
+    np.testing.assert_array_equal(data["clean"][0, ..., :3], np.rint(np.clip(twin * 255, 0, 255)))
+    assert 0 < twin[..., 1].std() < 0.05

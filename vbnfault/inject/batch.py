@@ -47,6 +47,7 @@ from .picture import levels
 Labels = Literal["png", "zarr"]
 
 STORE = "dataset.zarr"
+_LAYERS = ("clean", "mask_effect")
 _EVERY = (*ENDINGS, *FILMS)
 
 
@@ -140,6 +141,11 @@ class Batch:
             target = own(self.out / name)
             target.parent.mkdir(parents=True, exist_ok=True)
             image.write(target, result.image, "faults by vbnfault: " + (", ".join(names) or "none"))
+            if self.scene.image and self.scene.image.noise_free:
+                files.append(f"clean/{name}")
+                path = own(self.out / files[-1])
+                path.parent.mkdir(parents=True, exist_ok=True)
+                image.write(path, result.clean, "taken by the camera of vbnfault")
             masks = {fault: result.masks[result.faults.index(fault)] for fault in names}
             for fault, mask in {**masks, "any": result.mask_any}.items():
                 files.append(f"masks/{name}_{fault}.png")
@@ -229,6 +235,9 @@ def _sample(batch: Batch, index: int, image: ImageFile, result: Injected) -> Sam
         "mask_any": result.mask_any,
         "mask_effect": np.asarray(result.mask_effect),
     }
+    if "depth_m" in batch.scene.dataset.layers:
+        nothing = np.full(result.mask_any.shape, np.nan, np.float32)
+        layers["depth_m"] = nothing if image.depth_m is None else image.depth_m
     sizes = {"fault": len(result.faults), "xyz": 3, "quaternion": 4, "axis_row": 3, "axis_col": 3, "xy": 2}
     scalars: dict[str, Any] = {
         name: np.full([sizes[d] for d in row.dims[1:]], row.fill, row.dtype)[()]
@@ -302,7 +311,11 @@ def inject_files(
 
 def _build(batch: Batch, options: build.BuildOptions) -> None:
     """Make a store of a batch beside its files."""
-    shapes = {read_image(path).numbers.shape[:2] for path in batch.sources}
+    shapes, depths = set(), False
+    for path in batch.sources:
+        image = read_image(path)
+        shapes.add(image.numbers.shape[:2])
+        depths |= image.depth_m is not None
     if len(shapes) > 1:
         sizes = ", ".join(sorted(f"{w} x {h}" for h, w in shapes))
         raise InputError(
@@ -310,7 +323,7 @@ def _build(batch: Batch, options: build.BuildOptions) -> None:
         )
     ((height, width),) = shapes
     camera = batch.scene.camera.model_copy(update={"width_px": width, "height_px": height})
-    dataset = batch.scene.dataset.model_copy(update={"layers": ("clean", "mask_effect")})
+    dataset = batch.scene.dataset.model_copy(update={"layers": (*_LAYERS, *("depth_m",) * depths)})
     scene = batch.scene.model_copy(update={"camera": camera, "dataset": dataset})
     session = Session(scene)
     spec = store_spec(session, (len(batch.names),))
@@ -349,7 +362,7 @@ def _frames(
             names.append(name)
             continue
         name = str(PurePosixPath(name).with_suffix(""))
-        folder = out / "clean" / name
+        folder = out / "frames" / name
         with writing(out, within=True):
             film = films[name] = unpack(path, folder, MOST_VALUES)
         frames = [frame_path(folder, number) for number in range(1, film.frames + 1)]

@@ -22,6 +22,7 @@ from . import planetary
 
 MOST_VALUES = 4 * 10**8  # pixels times channels of one image
 _COLOURS = {1: "grey", 3: "RGB"}
+_SKY_M = 1e9  # Blender gives 1e10 where no surface is
 
 
 class ImageFile(ABC):
@@ -179,7 +180,10 @@ def _astropy_fits() -> Any:
 
 
 class Exr(ImageFile):
-    """OpenEXR with the channels R, G, B or Y; Z, where it is given, is depth along the boresight."""
+    """OpenEXR with the channels R, G, B or Y; Z, where it is given, is depth along the boresight.
+
+    Of a file with layers, such as `ViewLayer.Combined.R` of Blender, the first with these channels counts.
+    """
 
     endings = (".exr",)
 
@@ -187,14 +191,18 @@ class Exr(ImageFile):
         """Read an OpenEXR file."""
         user_files.read_input(path, "image")  # no folder, pipe or device
         self._header, self._channels = images.read_exr(path)
-        names: list[str] = [name for name in ("R", "G", "B") if name in self._channels] or ["Y"]
-        if len(names) not in _COLOURS or names[0] not in self._channels:
+        layers = dict.fromkeys(name[: name.rfind(".") + 1] for name in sorted(self._channels))
+        choices = [[layer + name for name in kind] for kind in ("RGB", "Y") for layer in layers]
+        names = next((choice for choice in choices if self._channels.keys() >= set(choice)), None)
+        if names is None:
             known = ", ".join(self._channels)
             raise InputError(f"is an OpenEXR file with the channels {known}; must have R, G and B, or Y")
         self._names = names
         stack = np.stack([self._channels[name] for name in names], axis=-1)
         self.numbers = stack[..., 0] if len(names) == 1 else stack
-        self.depth_m = self._channels.get("Z")
+        depth = next((self._channels[layer + "Z"] for layer in layers if layer + "Z" in self._channels), None)
+        if depth is not None:
+            self.depth_m = np.where(depth >= _SKY_M, np.inf, depth).astype(np.float32)
 
     def write(self, path: Path, numbers: NDArray[Any], text: str) -> None:
         """Write an OpenEXR file with the other channels and the attributes of this one."""

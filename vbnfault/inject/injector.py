@@ -47,7 +47,7 @@ class Injected:
         The image with faults, in the shape and the data type of the given one; uint8[y, x, 4] for electrons and
         radiance.
     clean
-        The image without faults: the given one.
+        The image without faults: the given one; of a noise-free one what the camera makes of it.
     faults
         The classes of the scene, in the order of the dataset.
     masks
@@ -197,15 +197,17 @@ class Injector:
         """
         given = image if isinstance(image, Electrons | Radiance) else _checked_array(image)
         camera, assumed = self._camera(_shape(given), camera)
-        picture = None
+        picture, table = None, self.scene.image or ImageTable()
+        drawing = _Drawing(faults=self.faults, seed=self.scene.dataset.seed, index=index)
         if isinstance(given, Electrons | Radiance):
             light = given if isinstance(given, Electrons) else camera.expose(given, camera.exposure_s)
         else:
-            picture = Picture.of(given, self.scene.image or ImageTable(), camera, raw=raw)
+            picture = Picture.of(given, table, camera, raw=raw)
+            if table.noise_free:
+                picture = Picture.of(picture.exposed(drawing.rng), table, camera, raw=raw)
             assumed += picture.assumptions
             light = picture.electrons
         known = replace(self._context(camera, sun, depth_m, picture), **(context or {}))
-        drawing = _Drawing(faults=self.faults, seed=self.scene.dataset.seed, index=index)
         of = partial(_development, context=known, drawing=drawing, holds_noise=picture is not None)
         development = of(light)
         draws, left_out = self._drawn(development, drawing, commanded)
