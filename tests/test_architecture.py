@@ -62,6 +62,9 @@ ONLY = {  # distribution → the packages or modules that import it
     "OpenEXR": {"core.files.images"},
     "tifffile": {"core.files.tiff"},
     "astropy": {"inject.files"},
+    "av": {"inject.films"},
+    "pdr": {"inject.planetary"},
+    "pds4_tools": {"inject.planetary"},
 }
 
 
@@ -209,9 +212,12 @@ def test_every_required_package_that_is_imported_is_declared() -> None:
     optional = {
         "SALib",
         "astropy",
+        "av",
         "dask",
         "distributed",
         "obstore",
+        "pdr",
+        "pds4-tools",
         "scikit-learn",
         "spiceypy",
         "torch",

@@ -76,7 +76,10 @@ def passport(
 @app.command(rich_help_panel=_PANEL)
 def inject(
     images: Annotated[
-        list[str], typer.Argument(help="Images, folders and globs: PNG, TIFF, FITS, EXR, NPY.", metavar="IMAGE...")
+        list[str],
+        typer.Argument(
+            help="Images, films, folders and globs: PNG, TIFF, FITS, PDS, EXR, NPY, MP4, MKV, …", metavar="IMAGE..."
+        ),
     ],
     scene: SceneOption,
     out: Annotated[Path, local_path("Folder for the images, masks and parameters, to make or to continue.")],

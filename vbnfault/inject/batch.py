@@ -2,7 +2,8 @@
 
 Each image keeps its name and its kind of file. Beside it lie its masks and a JSON file with the parameters, which
 is written last: an image with a whole JSON file of the same scene and input is finished. With labels in a store,
-the images are also the samples of a dataset, whose image has 8 bits as in any other.
+the images are also the samples of a dataset, whose image has 8 bits as in any other. The frames of a film are
+images, from which the film is put together again.
 """
 
 from __future__ import annotations
@@ -11,17 +12,18 @@ import dataclasses
 import glob
 import hashlib
 import json
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .. import store
-from ..core.errors import InputError
+from ..core.errors import InputError, VbnfaultError
 from ..core.files import user_files
 from ..core.files.images import write_png
 from ..core.files.whole_files import own, write_json, writing
@@ -36,13 +38,17 @@ from ..pipeline.record import proposal
 from ..scene import plan
 from ..scene.config import Scene
 from ..store.schema import SCALARS
-from .files import ENDINGS, ImageFile, read_image
+from .files import ENDINGS, MOST_VALUES, ImageFile, read_image, source_files
+from .films import ENDINGS as FILMS
+from .films import Film, assemble, frame_path, unpack
 from .injector import Injected, Injector
 from .picture import levels
 
 Labels = Literal["png", "zarr"]
 
 STORE = "dataset.zarr"
+_LAYERS = ("clean", "mask_effect")
+_EVERY = (*ENDINGS, *FILMS)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,8 +59,9 @@ class Batch:
     ----------
     scene
         Scene whose `dataset.samples` is the number of images.
-    root, names
-        Folder that holds all images, and their paths below it, in order.
+    sources, names
+        Files of the images, in order, and their paths below the folder that holds all of them. Frames of a film
+        lie below its name without the ending.
     out
         Folder of the results.
     sun
@@ -62,7 +69,7 @@ class Batch:
     """
 
     scene: Scene
-    root: Path
+    sources: tuple[Path, ...]
     names: tuple[str, ...]
     out: Path
     sun: str | tuple[float, ...] | None = None
@@ -81,7 +88,9 @@ class Batch:
 
     def key(self, index: int) -> str:
         """Return a digest of the input of an image: its file, its number, the scene and the Sun."""
-        digest = hashlib.sha256((self.root / self.names[index]).read_bytes())
+        digest = hashlib.sha256()
+        for path in source_files(self.sources[index]):
+            digest.update(path.read_bytes())
         scene = self.scene.model_dump(mode="json")
         digest.update(json.dumps([index, self.sun, len(self.names), scene], sort_keys=True).encode())
         return digest.hexdigest()
@@ -109,7 +118,7 @@ class Batch:
 
     def injected(self, index: int) -> tuple[ImageFile, Injected]:
         """Return an image and its result. Raises InputError, with the name of the file, if it cannot be used."""
-        path = self.root / self.names[index]
+        path = self.sources[index]
         image = read_image(path)
         try:
             return image, self.injector(
@@ -127,11 +136,16 @@ class Batch:
         """Write the files of an image; the JSON file comes last."""
         name = self.names[index]
         names = [fault for fault, has in zip(result.faults, result.injected, strict=True) if has]
-        files = [name]
+        files = [str(PurePosixPath(name).with_name(path.name)) for path in source_files(self.sources[index])]
         with writing(self.out, within=True):
             target = own(self.out / name)
             target.parent.mkdir(parents=True, exist_ok=True)
             image.write(target, result.image, "faults by vbnfault: " + (", ".join(names) or "none"))
+            if self.scene.image and self.scene.image.noise_free:
+                files.append(f"clean/{name}")
+                path = own(self.out / files[-1])
+                path.parent.mkdir(parents=True, exist_ok=True)
+                image.write(path, result.clean, "taken by the camera of vbnfault")
             masks = {fault: result.masks[result.faults.index(fault)] for fault in names}
             for fault, mask in {**masks, "any": result.mask_any}.items():
                 files.append(f"masks/{name}_{fault}.png")
@@ -221,6 +235,9 @@ def _sample(batch: Batch, index: int, image: ImageFile, result: Injected) -> Sam
         "mask_any": result.mask_any,
         "mask_effect": np.asarray(result.mask_effect),
     }
+    if "depth_m" in batch.scene.dataset.layers:
+        nothing = np.full(result.mask_any.shape, np.nan, np.float32)
+        layers["depth_m"] = nothing if image.depth_m is None else image.depth_m
     sizes = {"fault": len(result.faults), "xyz": 3, "quaternion": 4, "axis_row": 3, "axis_col": 3, "xy": 2}
     scalars: dict[str, Any] = {
         name: np.full([sizes[d] for d in row.dims[1:]], row.fill, row.dtype)[()]
@@ -270,24 +287,35 @@ def inject_files(
     VbnfaultError
         Some images failed; all others are made, and the same call tries the failed ones again.
     """
-    root, names = _found(images, out)
+    sources, names, films = _frames(*_found(images, out), out)
     dataset = scene.dataset.model_copy(update={"samples": len(names)})
-    batch = Batch(scene=scene.model_copy(update={"dataset": dataset}), root=root, names=names, out=out, sun=sun)
+    scene = scene.model_copy(update={"dataset": dataset})
+    batch = Batch(scene=scene, sources=sources, names=names, out=out, sun=sun)
     options = build.BuildOptions(workers=workers, progress=progress)
     batch.injector  # noqa: B018  an unusable scene is reported before any image
     if labels == "zarr":
         _build(batch, options)
-        return batch
-    job = _Images(out, Progress(len(names), shown=progress, noun="images"), dict.fromkeys(range(len(names)), 0))
-    with job.progress:
-        build.do_tasks(partial(_Worker, batch), job, options)
-    job.raise_failures(of=f" of {len(names)}")
+    else:
+        job = _Images(out, Progress(len(names), shown=progress, noun="images"), dict.fromkeys(range(len(names)), 0))
+        with job.progress:
+            build.do_tasks(partial(_Worker, batch), job, options)
+        job.raise_failures(of=f" of {len(names)}")
+    for name, film in films.items():
+        with writing(out, within=True):
+            assemble(out / name, own(out / f"{name}.mkv"), film)
+    ended = [film.ended for film in films.values() if film.ended]
+    if ended:
+        raise VbnfaultError("; ".join(ended))
     return batch
 
 
 def _build(batch: Batch, options: build.BuildOptions) -> None:
     """Make a store of a batch beside its files."""
-    shapes = {read_image(batch.root / name).numbers.shape[:2] for name in batch.names}
+    shapes, depths = set(), False
+    for path in batch.sources:
+        image = read_image(path)
+        shapes.add(image.numbers.shape[:2])
+        depths |= image.depth_m is not None
     if len(shapes) > 1:
         sizes = ", ".join(sorted(f"{w} x {h}" for h, w in shapes))
         raise InputError(
@@ -295,11 +323,13 @@ def _build(batch: Batch, options: build.BuildOptions) -> None:
         )
     ((height, width),) = shapes
     camera = batch.scene.camera.model_copy(update={"width_px": width, "height_px": height})
-    dataset = batch.scene.dataset.model_copy(update={"layers": ("clean", "mask_effect")})
+    dataset = batch.scene.dataset.model_copy(update={"layers": (*_LAYERS, *("depth_m",) * depths)})
     scene = batch.scene.model_copy(update={"camera": camera, "dataset": dataset})
     session = Session(scene)
     spec = store_spec(session, (len(batch.names),))
-    digests = {name: user_files.sha256((batch.root / name).read_bytes()) for name in batch.names}
+    digests = {
+        name: user_files.sha256(path.read_bytes()) for name, path in zip(batch.names, batch.sources, strict=True)
+    }
     spec = dataclasses.replace(
         spec,
         sample_names=batch.names,
@@ -318,18 +348,46 @@ def _build(batch: Batch, options: build.BuildOptions) -> None:
     with_card(out, build.build(partial(_Samples, batch), made, out, options))
 
 
-def _found(images: Sequence[str | Path], out: Path) -> tuple[Path, tuple[str, ...]]:
-    """Return the folder that holds all images, and their paths below it, sorted."""
+def _frames(
+    root: Path, paths: Sequence[Path], out: Path
+) -> tuple[tuple[Path, ...], tuple[str, ...], dict[str, Film]]:
+    """Return images with their names below the folder `root`, films as their frames, and the films by name."""
+    sources: list[Path] = []
+    names: list[str] = []
+    films = {}
+    for path in paths:
+        name = path.relative_to(root).as_posix()
+        if path.suffix.lower() not in FILMS:
+            sources.append(path)
+            names.append(name)
+            continue
+        name = str(PurePosixPath(name).with_suffix(""))
+        folder = out / "frames" / name
+        with writing(out, within=True):
+            film = films[name] = unpack(path, folder, MOST_VALUES)
+        frames = [frame_path(folder, number) for number in range(1, film.frames + 1)]
+        sources += frames
+        names += [f"{name}/{frame.name}" for frame in frames]
+    twice = next((name for name, count in Counter(names).items() if count > 1), None)
+    if twice:
+        raise InputError(f"{root / twice}: is named twice")
+    if not names:
+        raise InputError("; ".join(film.ended for film in films.values()))
+    return tuple(sources), tuple(names), films
+
+
+def _found(images: Sequence[str | Path], out: Path) -> tuple[Path, list[Path]]:
+    """Return the folder that holds all images and films, and their paths; those of a folder or glob are sorted."""
     paths: list[Path] = []
     results = out.absolute()
     for given in map(str, images):
         path = Path(given)
         if path.is_dir():
             _check_apart(path, out)
-            every = sorted(p for p in path.rglob("*") if p.suffix.lower() in ENDINGS and p.is_file())
+            every = sorted(p for p in path.rglob("*") if p.suffix.lower() in _EVERY and p.is_file())
             inside = [p for p in every if not p.absolute().is_relative_to(results)]  # results of an earlier run
             if not inside:
-                raise InputError(f"{path}: holds no image; they end with one of {', '.join(ENDINGS)}")
+                raise InputError(f"{path}: holds no image; they end with one of {', '.join(_EVERY)}")
             paths += inside
         elif path.exists() or not glob.has_magic(given):
             paths.append(path)
@@ -344,12 +402,8 @@ def _found(images: Sequence[str | Path], out: Path) -> tuple[Path, tuple[str, ..
     root = paths[0].parent
     while not all(path.is_relative_to(root) for path in paths):
         root = root.parent
-    names = [path.relative_to(root).as_posix() for path in paths]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise InputError(f"{root / twice[0]}: is named twice")
     _check_apart(root, out)
-    return root, tuple(names)
+    return root, paths
 
 
 def _check_apart(folder: Path, out: Path) -> None:

@@ -40,13 +40,14 @@ _NEARBY_PX, _MIXED = 15, 0.01
 
 
 def struck(
-    picture: Picture, development: Development, draws: Draws, of: Callable[[Electrons], Development], rng: Rng
+    picture: Picture, development: Development, draws: Draws, of: Callable[[Electrons], Development]
 ) -> tuple[NDArray[Any], F32 | None]:
     """Return the numbers of an image with the drawn faults, and its electrons, float32[y, x, channel].
 
     The electrons are None where a fault acts inside the sensor or on the finished image. `of` returns the same
-    development of other electrons, and `rng` the generator for (stage, name).
+    development of other electrons.
     """
+    rng = development.rng
     before, optical = picture.electrons, acting_at(draws, "electrons")
     after, change = before.array, np.zeros_like(picture.light)
     if optical:

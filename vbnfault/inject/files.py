@@ -1,7 +1,8 @@
 """Read images of users' files, and write them back with other numbers: size, depth and metadata stay.
 
 PNG and TIFF of 8 and 16 bits (TIFF of 32 bits, too), FITS of any BITPIX with its BZERO, BSCALE and BLANK,
-OpenEXR, and numpy's NPY. Each kind says how it is read and how it is written in one class.
+OpenEXR, images of planetary archives (PDS3, PDS4), and numpy's NPY. Each kind says how it is read and how it is
+written in one class.
 """
 
 from __future__ import annotations
@@ -17,9 +18,11 @@ from numpy.typing import NDArray
 from ..core.errors import InputError
 from ..core.files import images, tiff, user_files
 from ..core.files.whole_files import write_whole
+from . import planetary
 
 MOST_VALUES = 4 * 10**8  # pixels times channels of one image
 _COLOURS = {1: "grey", 3: "RGB"}
+_SKY_M = 1e9  # Blender gives 1e10 where no surface is
 
 
 class ImageFile(ABC):
@@ -177,7 +180,10 @@ def _astropy_fits() -> Any:
 
 
 class Exr(ImageFile):
-    """OpenEXR with the channels R, G, B or Y; Z, where it is given, is depth along the boresight."""
+    """OpenEXR with the channels R, G, B or Y; Z, where it is given, is depth along the boresight.
+
+    Of a file with layers, such as `ViewLayer.Combined.R` of Blender, the first with these channels counts.
+    """
 
     endings = (".exr",)
 
@@ -185,14 +191,18 @@ class Exr(ImageFile):
         """Read an OpenEXR file."""
         user_files.read_input(path, "image")  # no folder, pipe or device
         self._header, self._channels = images.read_exr(path)
-        names: list[str] = [name for name in ("R", "G", "B") if name in self._channels] or ["Y"]
-        if len(names) not in _COLOURS or names[0] not in self._channels:
+        layers = dict.fromkeys(name[: name.rfind(".") + 1] for name in sorted(self._channels))
+        choices = [[layer + name for name in kind] for kind in ("RGB", "Y") for layer in layers]
+        names = next((choice for choice in choices if self._channels.keys() >= set(choice)), None)
+        if names is None:
             known = ", ".join(self._channels)
             raise InputError(f"is an OpenEXR file with the channels {known}; must have R, G and B, or Y")
         self._names = names
         stack = np.stack([self._channels[name] for name in names], axis=-1)
         self.numbers = stack[..., 0] if len(names) == 1 else stack
-        self.depth_m = self._channels.get("Z")
+        depth = next((self._channels[layer + "Z"] for layer in layers if layer + "Z" in self._channels), None)
+        if depth is not None:
+            self.depth_m = np.where(depth >= _SKY_M, np.inf, depth).astype(np.float32)
 
     def write(self, path: Path, numbers: NDArray[Any], text: str) -> None:
         """Write an OpenEXR file with the other channels and the attributes of this one."""
@@ -201,13 +211,50 @@ class Exr(ImageFile):
         images.write_exr_like(path, {**self._header, "vbnfault": text}, {**self._channels, **changed})
 
 
-_KINDS = {ending: kind for kind in (Png, Tiff, Npy, Fits, Exr) for ending in kind.endings}
+class Pds(ImageFile):
+    """Image of PDS3 or PDS4; the label stays byte for byte, and pixels that it calls missing stay so.
+
+    The data may have any ending if a label of the same name lies beside them.
+    """
+
+    endings = (".img",)
+
+    def __init__(self, path: Path) -> None:
+        """Read the image of a data file and its label."""
+        self._path, self._data = path, user_files.read_input(path, "image")
+        self._block = planetary.find_block(path, self._data, MOST_VALUES)
+        stored = self._block.view(self._data)
+        self._missing = np.isin(stored, np.array(self._block.missing)) | ~np.isfinite(stored)
+        self.numbers = np.where(self._missing, 0, stored).astype(stored.dtype.newbyteorder("="))
+
+    def write(self, path: Path, numbers: NDArray[Any], text: str) -> None:
+        """Write the data with other numbers, and a label beside them as it was."""
+        data = bytearray(self._data)
+        np.copyto(self._block.view(data), numbers, casting="same_kind", where=~self._missing)
+        label = planetary.label_of(self._path)
+        if label is not None:
+            write_whole(path.with_name(label.name), label.read_bytes())
+        write_whole(path, bytes(data))
+
+
+_KINDS = {ending: kind for kind in (Png, Tiff, Npy, Fits, Exr, Pds) for ending in kind.endings}
 ENDINGS = tuple(_KINDS)
+
+
+def source_files(path: Path) -> tuple[Path, ...]:
+    """Return the file of an image, and its label where that lies beside."""
+    label = planetary.label_of(path) if _kind(path) is Pds else None
+    return (path,) if label is None else (path, label)
+
+
+def _kind(path: Path) -> type[ImageFile] | None:
+    """Return how a file is read."""
+    return _KINDS.get(path.suffix.lower(), Pds if planetary.label_of(path) else None)
 
 
 def read_image(path: Path) -> ImageFile:
     """Return the image of a file. Raises InputError, which names the file, if it cannot be used."""
-    kind = _KINDS.get(path.suffix.lower())
+    kind = _kind(path)
     if kind is None:
         raise InputError(f"{path}: must end with one of {', '.join(ENDINGS)}")
     try:

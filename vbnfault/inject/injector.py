@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -22,7 +22,7 @@ from ..pipeline.development import Development, Draws, without
 from ..pipeline.exposure import reference_exposure_s
 from ..pipeline.injection import draw_faults, visible_draws
 from ..pipeline.labels import labels_of
-from ..pipeline.spec import Draw, Injection, SceneExposure, SceneLight, mask_any_faults
+from ..pipeline.spec import Draw, Injection, Labels, SceneExposure, SceneLight, mask_any_faults
 from ..scene import keyed_random
 from ..scene.config import Scene, configure_faults, load_scene
 from ..scene.instrument import CameraTable, ImageTable
@@ -49,7 +49,7 @@ class Injected:
         The image with faults, in the shape and the data type of the given one; uint8[y, x, 4] for electrons and
         radiance.
     clean
-        The image without faults: the given one.
+        The image without faults: the given one; of a noise-free one what the camera makes of it.
     faults
         The classes of the scene, in the order of the dataset.
     masks
@@ -199,49 +199,34 @@ class Injector:
             The image cannot be used with this camera.
         """
         given = image if isinstance(image, Electrons | Radiance) else _checked_array(image)
-        camera, assumed = self._camera(
-            _shape(given), camera, grey=isinstance(given, np.ndarray) and given.ndim == 2
-        )
+        grey = isinstance(given, np.ndarray) and given.ndim == 2
+        camera, assumed = self._camera(_shape(given), camera, grey=grey)
+        drawing = _Drawing(faults=self.faults, seed=self.scene.dataset.seed, index=index)
         picture = None
         if isinstance(given, Electrons | Radiance):
             light = given if isinstance(given, Electrons) else camera.expose(given, camera.exposure_s)
         else:
-            picture = Picture.of(given, self.scene.image or ImageTable(), camera, raw=raw)
+            picture = self._picture(given, camera, drawing, raw=raw)
             assumed += picture.assumptions
             light = picture.electrons
         known = replace(self._context(camera, sun, depth_m, picture), **(context or {}))
-        drawing = _Drawing(faults=self.faults, seed=self.scene.dataset.seed, index=index)
         of = partial(_development, context=known, drawing=drawing, holds_noise=picture is not None)
         development = of(light)
-        draws, left_out = self._drawn(development, drawing, commanded)
-        result, electrons = None, None
+        drawn, left_out = self._drawn(development, drawing, commanded)
+        draws, result, electrons = drawn, None, None
         if picture is not None:
-            drawn, (result, electrons) = draws, struck(picture, development, draws, of, drawing.rng)
-            doubtful = drawn if self.effects else ()
-            for name in [name for name in doubtful if not development.effect(drawn, name, _ROUNDING_DN).any()]:
-                # a change below the rounding of the model's image may be one below that of this image, too
-                others = without(draws, name)
-                lacking = struck(picture, development, others, of, drawing.rng)
-                if np.array_equal(lacking[0], result):
-                    draws, (result, electrons) = others, lacking
-                    left_out[name] = "changes no number of the image"
-        injection = Injection(draws=draws, development=development)
-        members = mask_any_faults(self.scene, self.faults)
-        effects, nothing = None, np.zeros(development.context.shape, dtype=bool)
-        if self.effects:
-            labels = labels_of(self.faults, injection, members, ("mask_effect",))
-            effects = np.array([labels.effects.get(name, nothing) for name in self.faults], dtype=bool)
-        else:
-            labels = labels_of(self.faults, injection, (), ())
-            united = [mask for name, mask in zip(self.faults, labels.masks, strict=True) if name in members]
-            labels = replace(labels, mask_any=np.any([nothing, *united], axis=0))
+            draws, (result, electrons) = self._struck(picture, development, drawn, of)
+            left_out |= {name: "changes no number of the image" for name in drawn if name not in draws}
+        labels = self._labels(Injection(draws=draws, development=development))
+        nothing = np.zeros(known.shape, dtype=bool)
+        effects = np.array([labels.effects.get(name, nothing) for name in self.faults], dtype=bool)
         return Injected(
             image=development.image(draws).array if result is None else result,
             clean=development.image({}).array if picture is None else picture.numbers,
             faults=tuple(self.faults),
             masks=labels.masks,
             mask_any=labels.mask_any,
-            mask_effect=None if effects is None else effects.reshape(-1, *nothing.shape),
+            mask_effect=effects.reshape(-1, *known.shape) if self.effects else None,
             injected=np.array([name in draws for name in self.faults], dtype=bool),
             parameters={name: {"model": draw.fault.model, **draw.params} for name, draw in sorted(draws.items())},
             left_out=left_out,
@@ -252,6 +237,40 @@ class Injector:
             sun_xy_px=known.sun_xy_px,
             assumptions=tuple(assumed),
         )
+
+    def _picture(self, numbers: NDArray[Any], camera: Camera, drawing: _Drawing, *, raw: bool) -> Picture:
+        """Return an image as the camera sees it; one without noise is first taken by the camera."""
+        table = self.scene.image or ImageTable()
+        picture = Picture.of(numbers, table, camera, raw=raw)
+        return Picture.of(picture.exposed(drawing.rng), table, camera, raw=raw) if table.noise_free else picture
+
+    def _struck(
+        self,
+        picture: Picture,
+        development: Development,
+        drawn: dict[str, Draw],
+        of: Callable[[Electrons], Development],
+    ) -> tuple[dict[str, Draw], tuple[NDArray[Any], F32 | None]]:
+        """Return the draws that change numbers of an image, and `change.struck` with these."""
+        draws, result = drawn, struck(picture, development, drawn, of)
+        doubtful = drawn if self.effects else ()
+        for name in [name for name in doubtful if not development.effect(drawn, name, _ROUNDING_DN).any()]:
+            # a change below the rounding of the model's image may be one below that of this image, too
+            others = without(draws, name)
+            lacking = struck(picture, development, others, of)
+            if np.array_equal(lacking[0], result[0]):
+                draws, result = others, lacking
+        return draws, result
+
+    def _labels(self, injection: Injection) -> Labels:
+        """Return the labels of an image; those without effects have the union of masks as `mask_any`."""
+        members = mask_any_faults(self.scene, self.faults)
+        if self.effects:
+            return labels_of(self.faults, injection, members, ("mask_effect",))
+        labels = labels_of(self.faults, injection, (), ())
+        united = [mask for name, mask in zip(self.faults, labels.masks, strict=True) if name in members]
+        nothing = np.zeros(injection.development.context.shape, dtype=bool)
+        return replace(labels, mask_any=np.any([nothing, *united], axis=0))
 
     def _drawn(
         self, development: Development, drawing: _Drawing, commanded: Sequence[str] | None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, reduce
 from typing import Any
@@ -17,6 +18,7 @@ from ..core.quantities import LUMINANCE, RGBI, Electrons
 from ..detector.demosaic import interpolate
 from ..detector.interface import with_luminance
 from ..detector.mosaic import channel_of, sample
+from ..detector.noise import draw_normals, normal_field, poisson
 from ..scene.instrument import ImageTable
 from .response import Response, read_table
 
@@ -125,6 +127,18 @@ class Picture:
         out = numbers.copy()
         out[changed] = self._rounded(response.numbers(response.light(numbers[changed]) + change[changed]))
         return out
+
+    def exposed(self, rng: Callable[[str, str], np.random.Generator]) -> NDArray[Any]:
+        """Return the numbers of a noise-free image as the camera takes it, saturated at white.
+
+        The light has the noise of its electrons, and the readout adds its own; `rng` returns the generator for
+        (stage, name).
+        """
+        shape = self.light.shape
+        electrons = poisson(self.light * self.white_e, draw_normals(shape, rng("inject", "shot")))
+        electrons += self.camera.detector.read_noise_e_rms * normal_field(shape, rng("inject", "readout"))
+        light = np.minimum(electrons / self.white_e, 1).reshape(self.numbers.shape)
+        return self._rounded(self.response.numbers(light))
 
     def spread(self, mosaic_e: F32) -> F32:
         """Return electrons of the mosaic, float32[y, x], in all channels, [y, x, channel]; their own stay exact."""

@@ -66,7 +66,7 @@ class Development:
     ) -> None:
         self.exposure = exposure
         self.context = context
-        self._rng, self._twins = rng, twins
+        self.rng, self._twins = rng, twins
         self._cameras: dict[Keys, Camera] = {(): exposure.camera}
         self._contexts: dict[Keys, FaultContext] = {(): context}
         self._signals: dict[Any, Electrons] = {}
@@ -77,9 +77,7 @@ class Development:
     @cached_property
     def noise(self) -> Any:
         """Return the variates of the exposure, which all its images share."""
-        return self.exposure.camera.detector.draw_noise(
-            self.context.shape, lambda name: self._rng("detector", name)
-        )
+        return self.exposure.camera.detector.draw_noise(self.context.shape, lambda name: self.rng("detector", name))
 
     # --- camera and context ----------------------------------------------------------------------------------
 

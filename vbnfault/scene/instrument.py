@@ -397,3 +397,8 @@ class ImageTable(Table):
         "pixels, also beyond the frame, three a direction in the camera's axes",
     )
     raw: bool = Field(False, description="whether grey images are the raw mosaic of camera.detector")
+    noise_free: bool = Field(
+        False,
+        description="whether the images are renders without noise: the camera adds the noise of the light and of "
+        "its readout before the faults, and light above white saturates",
+    )

@@ -33,6 +33,7 @@ LIMIT_BYTES: dict[str, int] = {
     "spacecraft": 512 * MIB,
     "texture": 256 * MIB,
     "image": 4096 * MIB,
+    "film": 65536 * MIB,
     "response": 4 * MIB,
     "data": 1024 * MIB,
     "trajectory": 256 * MIB,
