@@ -533,9 +533,19 @@ def test_unusable_batches(tmp_path: Path) -> None:
     ):
         with pytest.raises(InputError, match=sentence):
             inject_files(images, scene, tmp_path / out, labels=labels, progress=False)
+
+
+def test_a_store_keeps_what_fits_and_names_the_rest(tmp_path: Path) -> None:
+    """The first image that can be read sets the size; damaged ones and others are named, and the rest is made."""
+    pictures, scene = _pictures(tmp_path / "in", 3), load_scene("quickstart", BATCH)
+    (pictures / "00.png").write_bytes(b"no image")
     write_png(pictures / "large.png", np.zeros((80, 96), np.uint8))
-    with pytest.raises(InputError, match="a store holds images of one size, and these have 96 x 64, 96 x 80"):
+    with pytest.raises(
+        VbnfaultError, match=r"2 samples \(0, 3\) failed, the first with: .*00.png: is a damaged PNG"
+    ) as failed:
         inject_files([pictures], scene, tmp_path / "out", labels="zarr", progress=False)
+    assert failed.value.exit_code == 1
+    assert sorted(path.name for path in (tmp_path / "out/labels").iterdir()) == ["01.png.json", "02.png.json"]
 
 
 def test_images_with_one_sun_share_its_straylight_and_have_the_bits_of_their_own() -> None:

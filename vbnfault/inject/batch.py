@@ -88,11 +88,15 @@ class Batch:
 
     def key(self, index: int) -> str:
         """Return a digest of the input of an image: its file, its number, the scene and the Sun."""
+        content, scene = self.content(index), self.scene.model_dump(mode="json")
+        told = json.dumps([content, index, self.sun, len(self.names), scene], sort_keys=True)
+        return user_files.sha256(told.encode())
+
+    def content(self, index: int) -> str:
+        """Return a digest of the files of an image."""
         digest = hashlib.sha256()
         for path in source_files(self.sources[index]):
             digest.update(path.read_bytes())
-        scene = self.scene.model_dump(mode="json")
-        digest.update(json.dumps([index, self.sun, len(self.names), scene], sort_keys=True).encode())
         return digest.hexdigest()
 
     @property
@@ -217,8 +221,14 @@ class _Samples:
         self._batch = batch
 
     def simulate(self, index: int) -> Sample:
-        """Return the sample of an image."""
+        """Return the sample of an image. Raises InputError if it has another size than the store's images."""
         image, result = self._batch.injected(index)
+        (height, width), camera = image.numbers.shape[:2], self._batch.scene.camera
+        if (width, height) != (camera.width_px, camera.height_px):
+            raise InputError(
+                f"{self._batch.sources[index]}: has {width} x {height} pixels, and the store's images have "
+                f"{camera.width_px} x {camera.height_px}, as the first; use --labels png"
+            )
         self._batch.write(index, image, result)
         return _sample(self._batch, index, image, result)
 
@@ -311,25 +321,15 @@ def inject_files(
 
 def _build(batch: Batch, options: build.BuildOptions) -> None:
     """Make a store of a batch beside its files."""
-    shapes, depths = set(), False
-    for path in batch.sources:
-        image = read_image(path)
-        shapes.add(image.numbers.shape[:2])
-        depths |= image.depth_m is not None
-    if len(shapes) > 1:
-        sizes = ", ".join(sorted(f"{w} x {h}" for h, w in shapes))
-        raise InputError(
-            f"--labels zarr: a store holds images of one size, and these have {sizes}; use --labels png"
-        )
-    ((height, width),) = shapes
+    first = _first_image(batch)
+    height, width = first.numbers.shape[:2]
     camera = batch.scene.camera.model_copy(update={"width_px": width, "height_px": height})
-    dataset = batch.scene.dataset.model_copy(update={"layers": (*_LAYERS, *("depth_m",) * depths)})
+    layers = _LAYERS if first.depth_m is None else (*_LAYERS, "depth_m")
+    dataset = batch.scene.dataset.model_copy(update={"layers": layers})
     scene = batch.scene.model_copy(update={"camera": camera, "dataset": dataset})
     session = Session(scene)
     spec = store_spec(session, (len(batch.names),))
-    digests = {
-        name: user_files.sha256(path.read_bytes()) for name, path in zip(batch.names, batch.sources, strict=True)
-    }
+    digests = {name: batch.content(index) for index, name in enumerate(batch.names)}
     spec = dataclasses.replace(
         spec,
         sample_names=batch.names,
@@ -346,6 +346,17 @@ def _build(batch: Batch, options: build.BuildOptions) -> None:
     out = store.located(batch.out / STORE)
     batch.out.mkdir(parents=True, exist_ok=True)
     with_card(out, build.build(partial(_Samples, batch), made, out, options))
+
+
+def _first_image(batch: Batch) -> ImageFile:
+    """Return the first image that can be read, which sets the size of a store. Raises InputError if there is none."""
+    problems = []
+    for path in batch.sources:
+        try:
+            return read_image(path)
+        except InputError as error:
+            problems.append(str(error))
+    raise InputError(problems[0])
 
 
 def _frames(
