@@ -349,7 +349,7 @@ def _build(batch: Batch, options: build.BuildOptions) -> None:
 
 
 def _first_image(batch: Batch) -> ImageFile:
-    """Return the first image that can be read, which sets the size of a store. Raises InputError if there is none."""
+    """Return the first image that can be read, which sets the size of a store; InputError if there is none."""
     problems = []
     for path in batch.sources:
         try:
