@@ -11,11 +11,12 @@ face. E and F are dyads of normals. L_e is the logarithmic term of an edge. ω_f
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..core.process.llvm import backend, flat
 from .geometry import Float64, face_normals_areas, signed_volume
 
 GRAVITATIONAL_CONSTANT = 6.67430e-11  # m³ kg⁻¹ s⁻², CODATA 2018
@@ -54,30 +55,30 @@ class PolyhedronGravity:
         # Coordinates start at the centre of the bounding box. The terms of the sums nearly cancel, and with small
         # coordinates they lose fewer digits.
         self._centre_m: Float64 = 0.5 * (vertices_m.max(axis=0) + vertices_m.min(axis=0)).astype(np.float64)
-        self._vertices_m: Float64 = np.asarray(vertices_m, dtype=np.float64) - self._centre_m
-        self._faces = np.asarray(faces, dtype=np.int64)
-        self.mass_kg = self.density_kg_m3 * signed_volume(self._vertices_m, self._faces)
+        vertices: Float64 = np.asarray(vertices_m, dtype=np.float64) - self._centre_m
+        corner = np.asarray(faces, dtype=np.int64)
+        self.mass_kg = self.density_kg_m3 * signed_volume(vertices, corner)
 
-        normals, _ = face_normals_areas(self._vertices_m, self._faces)
-        self._face_normal = normals
-        self._face_offset_m: Float64 = np.einsum("fi,fi->f", normals, self._vertices_m[self._faces[:, 0]])
+        normals, _ = face_normals_areas(vertices, corner)
+        offset = np.einsum("fi,fi->f", normals, vertices[corner[:, 0]])
 
-        directed = np.concatenate([self._faces[:, [k, (k + 1) % 3]] for k in range(3)])
-        owner = np.tile(np.arange(len(self._faces)), 3)
-        along = self._vertices_m[directed[:, 1]] - self._vertices_m[directed[:, 0]]
+        directed = np.concatenate([corner[:, [k, (k + 1) % 3]] for k in range(3)])
+        owner = np.tile(np.arange(len(corner)), 3)
+        along = vertices[directed[:, 1]] - vertices[directed[:, 0]]
         length = np.linalg.norm(along, axis=1)
         # Unit vectors in the plane of the face, perpendicular to the edge. They point out of the face, because the
         # winding is counter-clockwise.
         outward = np.cross(along / length[:, None], normals[owner])
         half_dyad = np.einsum("ei,ej->eij", normals[owner], outward)
-        key = directed.min(axis=1) * len(self._vertices_m) + directed.max(axis=1)
+        key = directed.min(axis=1) * len(vertices) + directed.max(axis=1)
         _, first, inverse = np.unique(key, return_index=True, return_inverse=True)
         dyad = np.zeros((len(first), 9))
         np.add.at(dyad, inverse.ravel(), half_dyad.reshape(-1, 9))
-        self._edges = directed[first]
-        self._edge_length_m: Float64 = length[first]
-        self._edge_dyad: Float64 = dyad.reshape(-1, 3, 3)
-        self._edge_start_m: Float64 = self._vertices_m[self._edges[:, 0]]
+        start, end = (vertices[directed[first, k]] for k in (0, 1))
+        corners = vertices[corner].reshape(-1, 9)
+        # columns of a table of all edges and of one of all faces, as `_edge_terms` and `_face_terms` take them
+        self._edge_table = [flat(column) for column in (*start.T, *end.T, length[first], *dyad.T)]
+        self._face_table = [flat(column) for column in (*corners.T, *normals.T, offset)]
 
     def evaluate(self, points_m: ArrayLike) -> GravityField:
         """Return the potential and the acceleration of gravity, without the centrifugal term.
@@ -96,40 +97,26 @@ class PolyhedronGravity:
         potential = np.empty(len(points))
         acceleration = np.empty((len(points), 3))
         # A loop over points is fast enough, because tens of thousands of edges fill the vector units. The loop
-        # needs memory for only one array over the mesh.
+        # needs memory for only a few arrays over the mesh.
+        be = backend()
+        edges, faces = ([be.Float64(column) for column in table] for table in (self._edge_table, self._face_table))
         for k, point in enumerate(points):
-            potential[k], acceleration[k] = self._at(point)
+            potential[k], acceleration[k] = self._at(point, edges, faces)
         return GravityField(potential, acceleration)
 
-    def _at(self, point: Float64) -> tuple[float, Float64]:
-        """Return potential and acceleration at a point, whose coordinates start at the centre of the box."""
-        to_vertex = self._vertices_m - point
-        distance = np.sqrt(np.einsum("vi,vi->v", to_vertex, to_vertex))
+    def _at(self, point: Float64, edges: list[Any], faces: list[Any]) -> tuple[float, Float64]:
+        """Return potential and acceleration at a point, whose coordinates start at the centre of the box.
 
-        to_edge = self._edge_start_m - point
-        ends = distance[self._edges[:, 0]] + distance[self._edges[:, 1]]
-        # Far away, ln((a+b+e)/(a+b−e)) loses digits, but 2 artanh(e/(a+b)), which is equal, does not.
-        ratio = np.minimum(self._edge_length_m / np.maximum(ends, 1e-300), 1.0 - 1e-16)
-        log_term = 2.0 * np.arctanh(ratio)
-        edge_vector = np.einsum("eij,ej->ei", self._edge_dyad, to_edge) * log_term[:, None]
-
-        a, b, c = (to_vertex[self._faces[:, k]] for k in range(3))
-        ra, rb, rc = (distance[self._faces[:, k]] for k in range(3))
-        triple = np.einsum("fi,fi->f", a, np.cross(b, c))
-        cosine = (
-            ra * rb * rc
-            + ra * np.einsum("fi,fi->f", b, c)
-            + rb * np.einsum("fi,fi->f", c, a)
-            + rc * np.einsum("fi,fi->f", a, b)
-        )
-        solid_angle = 2.0 * np.arctan2(triple, cosine)
-        height = self._face_offset_m - np.einsum("fi,i->f", self._face_normal, point)
-        weighted = height * solid_angle
-
+        The terms are computed on the device, and summed by numpy, whose order does not depend on threads.
+        """
+        be = backend()
+        here = [be.dr.opaque(be.Float64, float(x)) for x in point]
+        terms = [*_edge_terms(be, edges, here), *_face_terms(be, faces, here)]
+        be.dr.eval(*terms)
+        be.dr.sync_thread()
+        of_edges, of_faces = np.split(np.array([np.array(term, copy=False).sum() for term in terms]), 2)
         gravity = GRAVITATIONAL_CONSTANT * self.density_kg_m3
-        potential = 0.5 * gravity * (np.sum(to_edge * edge_vector) - np.sum(weighted * height))
-        acceleration = gravity * (-edge_vector.sum(axis=0) + (self._face_normal * weighted[:, None]).sum(axis=0))
-        return float(potential), acceleration
+        return 0.5 * gravity * float(of_edges[0] - of_faces[0]), gravity * (of_faces[1:] - of_edges[1:])
 
     def effective(self, points_m: ArrayLike, omega_rad_s: float) -> Float64:
         """Return gravity plus the centrifugal term of a rotation about +z, float64[k, 3] in m/s²."""
@@ -137,3 +124,35 @@ class PolyhedronGravity:
         acceleration = self.evaluate(points).acceleration_m_s2
         acceleration[:, :2] += omega_rad_s**2 * points[:, :2]
         return acceleration
+
+
+def _edge_terms(be: Any, table: list[Any], point: list[Any]) -> list[Any]:
+    """Return L r·E·r and L E·r of the edges, four device arrays."""
+    dr, start, end, length, dyad = be.dr, table[0:3], table[3:6], table[6], table[7:]
+    r = [x - p for x, p in zip(start, point, strict=True)]
+    ends = _norm(dr, r) + _norm(dr, [x - p for x, p in zip(end, point, strict=True)])
+    # Far away, ln((a+b+e)/(a+b-e)) loses digits, but 2 artanh(e/(a+b)), which is equal, does not.
+    ratio = dr.minimum(length / dr.maximum(ends, 1e-300), 1.0 - 1e-16)
+    log_term = 2 * dr.atanh(ratio)
+    vector = [_dot(dyad[3 * k : 3 * k + 3], r) * log_term for k in range(3)]
+    return [_dot(r, vector), *vector]
+
+
+def _face_terms(be: Any, table: list[Any], point: list[Any]) -> list[Any]:
+    """Return ω r·F·r and ω F·r of the faces, four device arrays."""
+    dr, normal, offset = be.dr, table[9:12], table[12]
+    a, b, c = ([x - p for x, p in zip(table[k : k + 3], point, strict=True)] for k in (0, 3, 6))
+    across = [b[1] * c[2] - b[2] * c[1], b[2] * c[0] - b[0] * c[2], b[0] * c[1] - b[1] * c[0]]
+    ra, rb, rc = (_norm(dr, x) for x in (a, b, c))
+    cosine = ra * rb * rc + ra * _dot(b, c) + rb * _dot(c, a) + rc * _dot(a, b)
+    height = offset - _dot(normal, point)
+    weighted = height * 2 * dr.atan2(_dot(a, across), cosine)
+    return [weighted * height, *(n * weighted for n in normal)]
+
+
+def _dot(a: list[Any], b: list[Any]) -> Any:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _norm(dr: Any, a: list[Any]) -> Any:
+    return dr.sqrt(_dot(a, a))
