@@ -8,9 +8,8 @@ together and each alone, traced straylight with a new Sun and with the same one,
 batches of 256×256 pixels. The arms take turns, round by round; the table gives medians. A line says how much of the
 machine's processor time other programs took meanwhile: wall times count only where that is little.
 
-The second table needs `pip install imagecorruptions 'albumentations<2.1'` and is left out without them. Each of
-their corruptions and the fault that is like it act on the same image; beside the times stands a figure that physics
-fixes, measured on both.
+The second table (`benchmarks/inject_beside.py`) needs `pip install imagecorruptions 'albumentations<2.1'` and is
+left out without them. `--only beside` measures it alone.
 """
 
 from __future__ import annotations
@@ -19,24 +18,12 @@ import argparse
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-import cv2
-import numpy as np
+import inject_beside
+from inject_beside import PAPER, Arm, injector, textured
 from turns import Turns, in_turns
 
-from vbnfault import Injector
 from vbnfault.core.errors import VbnfaultError
-from vbnfault.scene.config import Scene
 
-Arm = Callable[[int], Any]
-
-PAPER: dict[str, dict[str, Any]] = {
-    "dust_on_optics": {"model": "gaussian"},
-    "broken_pixels": {"model": "texture"},
-    "broken_lines": {"model": "texture"},
-    "straylight": {"model": "texture"},
-    "vignetting": {"model": "cos4"},
-    "optics_degradation": {"model": "gaussian"},
-}
 SENSOR: dict[str, dict[str, Any]] = {
     "smear": {},
     "blooming": {},
@@ -57,20 +44,6 @@ TARGETS_MS = {
     "traced, a new Sun": 400,
     "traced, the same Sun": 60,
 }
-
-
-def injector(faults: Mapping[str, Any], **camera: Any) -> Injector:
-    """Return what injects faults into images of a camera; masks alone, without what each fault changes."""
-    tables = {"title": "benchmark", "dataset": {"seed": 1}, "faults": dict(faults)}
-    return Injector(Scene.model_validate({**tables, "camera": {"exposure_s": 0.01, **camera}}), effects=False)
-
-
-def textured(size_px: int, channels: int = 1) -> np.ndarray:
-    """Return an image of soft texture with black and white in it, uint8[y, x] or [y, x, channel]."""
-    noise = np.random.default_rng(0).normal(90, 60, (size_px, size_px, channels))
-    smooth = cv2.GaussianBlur(noise, (0, 0), 9).reshape(noise.shape) - 90
-    image = np.clip(90 + smooth * 20, 0, 255).astype(np.uint8)
-    return image[..., 0] if channels == 1 else image
 
 
 def arms(size_px: int) -> Iterator[tuple[str, Callable[[], Arm]]]:
@@ -142,6 +115,8 @@ def main() -> None:
         turns = in_turns(ready, options.rounds, warm_up=2)
         print(table(turns, TARGETS_MS if options.size == 1024 else {}))
         print(turns)
+    if options.only in (None, "beside"):
+        print(inject_beside.table(options.size, options.rounds))
 
 
 if __name__ == "__main__":
