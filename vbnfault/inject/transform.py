@@ -8,8 +8,10 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch.utils.data import get_worker_info
 
 from ..core.errors import InputError
+from ..core.process import llvm
 from ..scene import keyed_random
 from ..scene.config import Scene
 from .injector import Injector
@@ -93,6 +95,8 @@ class Inject:
                 f"images: {images.dtype} of shape {list(images.shape)}: must be uint8 or float32 of "
                 "[image, channel, y, x] with 1 or 3 channels"
             )
+        if get_worker_info() is not None:
+            llvm.use_one_thread()
         out, masks = [], []
         for image, number in zip(images.permute(0, 2, 3, 1).contiguous().numpy(), numbers, strict=True):
             chance = keyed_random.rng(self.seed, int(number), "inject", "classes").random(len(self.classes))
