@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import pickle
+import shutil
 import signal
 import subprocess
 import sys
@@ -19,6 +20,7 @@ import numpy as np
 import pytest
 import tifffile
 from astropy.io import fits
+from PIL import ImageCms
 from typer.testing import CliRunner
 
 import vbnfault
@@ -286,6 +288,7 @@ def _image_files(folder: Path) -> dict[str, Path]:
     folder.mkdir(parents=True, exist_ok=True)
     tag = [(65000, "s", 0, "own tag", True)]
     tifffile.imwrite(folder / "strips.tif", GREY, description="mine", resolution=(72, 72), extratags=tag)
+    tifffile.imwrite(folder / "none.tif", GREY, description=None, metadata=None, bigtiff=True, extratags=tag)
     tifffile.imwrite(folder / "tiles.tif", GREY, tile=(32, 32), compression="zlib", predictor=True, extratags=tag)
     tifffile.imwrite(folder / "big.tif", COLOURS, bigtiff=True, photometric="rgb", byteorder=">", extratags=tag)
     planes = np.moveaxis(COLOURS, -1, 0)
@@ -316,13 +319,15 @@ def test_files_keep_their_kind_and_what_is_written_is_read_back(tmp_path: Path) 
 
 def test_other_programs_read_the_files_with_their_metadata(tmp_path: Path) -> None:
     files = _image_files(tmp_path / "in")
-    for name in ("strips.tif", "tiles.tif", "big.tif", "planes.tif"):
+    for name in ("strips.tif", "none.tif", "tiles.tif", "big.tif", "planes.tif"):
         image = read_image(files[name])
         image.write(tmp_path / name, image.numbers, "faults")
         with tifffile.TiffFile(tmp_path / name) as before, tifffile.TiffFile(files[name]) as after:
             np.testing.assert_array_equal(before.asarray(), after.asarray())
             tags = [{t.code: t.value for t in f.pages[0].tags} for f in (before, after)]
-        where = {259, 273, 279, 317, 324, 325}  # compression and the places of the blocks
+        assert tags[0][270] == {"none.tif": "faults"}.get(name, tags[0][270])
+        # compression, the offsets of the blocks, and a description where there was none
+        where = {259, 273, 279, 317, 324, 325} | ({270} - tags[1].keys())
         assert {k: v for k, v in tags[0].items() if k not in where} == {
             k: v for k, v in tags[1].items() if k not in where
         }
@@ -346,6 +351,61 @@ def test_other_programs_read_the_files_with_their_metadata(tmp_path: Path) -> No
     image.write(tmp_path / "grey.png", image.numbers, "faults")
     assert profile in (tmp_path / "grey.png").read_bytes()
     assert b"vbnfault\0faults" in (tmp_path / "grey.png").read_bytes()
+
+
+def _told_by_exiftool(path: Path) -> dict[str, Any]:
+    """Return what exiftool reads in a file, by group and tag, without what belongs to the file and the blocks."""
+    run = subprocess.run(
+        ["exiftool", "-j", "-n", "-a", "-G1", "-b", "-all", "-validate", "-warning", str(path)],
+        capture_output=True,
+        check=True,
+        text=True,
+    )
+    groups = ("SourceFile", "ExifTool", "System", "File", "Composite")
+    blocks = ("StripOffsets", "StripByteCounts", "Compression", "Predictor")
+    tags = json.loads(run.stdout)[0]
+    return {k: v for k, v in tags.items() if k.split(":")[0] not in groups and k.split(":")[-1] not in blocks}
+
+
+@pytest.mark.skipif(shutil.which("exiftool") is None, reason="exiftool is not installed")
+@pytest.mark.parametrize("name", ["a.png", "a.tif"])
+def test_metadata_that_exiftool_wrote_is_read_by_exiftool(name: str, tmp_path: Path) -> None:
+    (tmp_path / "in").mkdir()
+    path = tmp_path / "in" / name
+    image = np.random.default_rng(5).integers(40, 200, (64, 96, 3), np.uint8)
+    if name.endswith("png"):
+        write_png(path, image)
+    else:
+        tifffile.imwrite(path, image, photometric="rgb", rowsperstrip=10, metadata=None)
+    (tmp_path / "a.icc").write_bytes(ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes())
+    tags = {
+        "EXIF:Make": "Maker",
+        "EXIF:Model": "Camera",
+        "EXIF:ExposureTime": 0.0125,
+        "EXIF:FNumber": 5.6,
+        "EXIF:DateTimeOriginal": "2026:01:02 03:04:05",
+        "EXIF:GPSLatitude": 48.5,
+        "EXIF:GPSLatitudeRef": "N",
+        "XMP-dc:Title": "Größe",
+        "XMP-xmp:Rating": 4,
+    }
+    words = [f"-{key}={value}" for key, value in tags.items()]
+    subprocess.run(
+        ["exiftool", "-q", "-n", "-overwrite_original", *words, f"-ICC_Profile<={tmp_path / 'a.icc'}", str(path)],
+        check=True,
+    )
+    before = _told_by_exiftool(path)
+    assert {"IFD0:Make", "ExifIFD:ExposureTime", "GPS:GPSLatitude", "XMP-dc:Title"} <= before.keys()
+    assert any(key.startswith("ICC") for key in before)
+    dust = {"title": "dust", "faults": {"dust_on_optics": {}}, "plan": {"faulty_fraction": 1.0}, "camera": CAMERA}
+    inject_files([path], Scene.model_validate(dust), tmp_path / "out", progress=False)
+    after = _told_by_exiftool(tmp_path / "out" / name)
+    assert {key: after.get(key) for key in before} == before
+    assert (
+        after["PNG:Vbnfault" if name == "a.png" else "IFD0:ImageDescription"]
+        == "faults by vbnfault: dust_on_optics"
+    )
+    assert (read_image(tmp_path / "out" / name).numbers != image).any()
 
 
 # --- batches ------------------------------------------------------------------------------------------------------
