@@ -529,6 +529,51 @@ def test_batches_of_a_training_loop_have_the_draws_of_their_numbers() -> None:
         Inject(faults, probability=2)
 
 
+@pytest.mark.parametrize("name", MODELS)
+def test_every_model_acts_in_a_batch_or_says_why_it_cannot(name: str) -> None:
+    torch = pytest.importorskip("torch", reason="PyTorch is an extra")
+    from vbnfault.torch import Inject
+
+    fault, _, model = name.partition("/")
+    faults = only(load_scene("quickstart"), name).faults
+    batch = torch.randint(40, 200, (2, 3, 96, 128), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+    batch[:, :, 40:50, 60:70] = 255  # charge that overflows
+    if registry()[fault][model].needs_mosaic:
+        with pytest.raises(InputError, match=rf"faults\.{fault}\.model = '{model}': .*; name a camera\.detector"):
+            Inject(faults, camera=CAMERA)
+    camera = {"fov_deg": 20.0, "exposure_s": 0.01, "detector": "generic_ccd"}
+    transform = Inject(faults, camera=camera, probability=1, seed=2)
+    for images in (batch, batch.float() / 255):
+        struck, masks = transform(images, range(2), suns=[(100.0, 20.0), None])
+        assert (struck.shape, struck.dtype) == (images.shape, images.dtype)
+        assert (masks.shape, masks.dtype) == ((2, 1, 96, 128), torch.bool)
+        assert struck.min() >= 0
+        assert struck.max() <= images.max()  # white
+        if registry()[fault][model].needs_sun:
+            assert transform.left_out == {fault: "needs the Sun before the camera; give it by image.sun or --sun"}
+            assert torch.equal(struck[1], images[1])
+            assert not masks[1].any()
+        else:
+            assert transform.left_out == {}
+    # of the faint motes, those that 8 bits show are few
+    assert fault == "particles" or (masks[0].any() and not torch.equal(struck[0], images[0]))
+
+
+def test_a_batch_whose_images_show_no_sun_goes_on_without() -> None:
+    torch = pytest.importorskip("torch", reason="PyTorch is an extra")
+    from vbnfault.torch import Inject
+
+    transform = Inject({"straylight": {}}, camera=CAMERA, probability=1, sun="auto")
+    batch = torch.full((2, 1, 64, 64), 40, dtype=torch.uint8)
+    batch[1, 0, 20:26, 40:46] = 255
+    struck, _ = transform(batch, range(2))
+    assert torch.equal(struck[0], batch[0])
+    assert not torch.equal(struck[1], batch[1])
+    assert list(transform.left_out) == ["straylight"]
+    with pytest.raises(InputError, match=r"image\.sun"):
+        transform(batch, range(2), suns=[(0.0, 0.0, 0.0)] * 2)
+
+
 # --- bad input ----------------------------------------------------------------------------------------------------
 
 

@@ -8,13 +8,14 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch.utils.data import get_worker_info
 
 from ..core.errors import InputError
 from ..core.process import llvm
 from ..scene import keyed_random
 from ..scene.config import Scene
-from .injector import Injector
+from .injector import Injected, Injector
 
 
 class Inject:
@@ -33,7 +34,14 @@ class Inject:
     seed
         Seed of all random numbers.
     sun
-        Position of the Sun, as for `Injector`; it must not be None for straylight.
+        Position of the Sun, as for `Injector`; straylight is left out without one. Default: that of `image`.
+
+    Attributes
+    ----------
+    classes
+        The classes of the faults, in the order of the masks.
+    left_out
+        Why a class that was drawn is not in an image of the last batch of this process, by class.
 
     Raises
     ------
@@ -56,8 +64,10 @@ class Inject:
         tables: dict[str, Any] = {"title": "inject", "dataset": {"seed": seed}, "faults": dict(faults)}
         tables |= {key: dict(table) for key, table in (("camera", camera), ("image", image)) if table}
         self._scene = Scene.model_validate(tables)
-        self._probability, self._sun, self.seed = probability, sun, seed
+        self._probability, self.seed = probability, seed
+        self._sun = self._scene.image.sun if sun is None and self._scene.image else sun
         self.classes = tuple(self.injector.faults)
+        self.left_out: dict[str, str] = {}
 
     @cached_property
     def injector(self) -> Injector:
@@ -69,16 +79,22 @@ class Inject:
         return {key: value for key, value in vars(self).items() if key != "injector"}
 
     def __call__(
-        self, images: torch.Tensor, numbers: Sequence[int] | torch.Tensor
+        self,
+        images: torch.Tensor,
+        numbers: Sequence[int] | torch.Tensor,
+        suns: Sequence[str | Sequence[float] | None] | None = None,
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return images with faults, in the data type of the given ones, and masks.
 
         Parameters
         ----------
         images
-            uint8 or float32 (white is 1) [image, channel, y, x] on the CPU, with 1 channel or R, G, B.
+            uint8 or float32 [image, channel, y, x] on the CPU, with 1 channel or R, G, B. White of floats is 1,
+            which no fault exceeds.
         numbers
             Number of each image, such as its index in the data set plus the epoch times its length.
+        suns
+            Position of the Sun for each image; None: `sun`. Where "auto" finds none, there is none.
 
         Returns
         -------
@@ -97,12 +113,27 @@ class Inject:
             )
         if get_worker_info() is not None:
             llvm.use_one_thread()
-        out, masks = [], []
-        for image, number in zip(images.permute(0, 2, 3, 1).contiguous().numpy(), numbers, strict=True):
-            chance = keyed_random.rng(self.seed, int(number), "inject", "classes").random(len(self.classes))
-            chosen = [name for name, p in zip(self.classes, chance, strict=True) if p < self._probability]
-            result = self.injector(image, int(number), sun=self._sun, commanded=chosen)
-            out.append(result.image.reshape(image.shape))
+        out, masks, self.left_out = [], [], {}
+        pixels = images.permute(0, 2, 3, 1).contiguous().numpy()
+        places = [self._sun] * len(pixels) if suns is None else [self._sun if s is None else s for s in suns]
+        for image, number, sun in zip(pixels, numbers, places, strict=True):
+            result = self._injected(image, int(number), sun)
+            faulty = result.image.reshape(image.shape)
+            if faulty.dtype.kind == "f":
+                faulty = np.clip(faulty, np.minimum(image, 0), np.maximum(image, 1))
+            out.append(faulty)
             masks.append(result.masks)
+            self.left_out |= result.left_out
         changed = torch.from_numpy(np.stack(out)).permute(0, 3, 1, 2).contiguous()
         return changed, torch.from_numpy(np.stack(masks))
+
+    def _injected(self, image: NDArray[Any], number: int, sun: str | Sequence[float] | None) -> Injected:
+        """Return an image with the classes that its number draws."""
+        chance = keyed_random.rng(self.seed, number, "inject", "classes").random(len(self.classes))
+        chosen = [name for name, p in zip(self.classes, chance, strict=True) if p < self._probability]
+        try:
+            return self.injector(image, number, sun=sun, commanded=chosen)
+        except InputError:
+            if sun != "auto":
+                raise
+            return self.injector(image, number, sun="none", commanded=chosen)
