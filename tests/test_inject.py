@@ -563,7 +563,7 @@ def test_a_batch_whose_images_show_no_sun_goes_on_without() -> None:
     torch = pytest.importorskip("torch", reason="PyTorch is an extra")
     from vbnfault.torch import Inject
 
-    transform = Inject({"straylight": {}}, camera=CAMERA, probability=1, sun="auto")
+    transform = Inject({"straylight": {}}, camera=CAMERA, image={"sun": "auto"}, probability=1)
     batch = torch.full((2, 1, 64, 64), 40, dtype=torch.uint8)
     batch[1, 0, 20:26, 40:46] = 255
     struck, _ = transform(batch, range(2))
