@@ -1,7 +1,7 @@
 """Compare faults in images with the corruptions of imagecorruptions and Albumentations that are like them.
 
 `inject_speed.py` prints the table. Each corruption and the fault that is like it act on the same image of 8 bits in
-turns. Beside the times stands a figure that physics fixes, measured on both. The other packages have their mildest
+turns. Beside the processor times stands a figure that physics fixes, measured on both. The other packages have their mildest
 settings, and where they leave the strength open, that of the fault.
 """
 
@@ -265,12 +265,14 @@ def table(size_px: int, rounds: int) -> str:
         for side, act in zip(("there", "here"), row.acts(size_px), strict=True):
             arms[f"{side} {number}"] = lambda k, act=act: act(image, k)
     turns = in_turns(arms, rounds)
-    lines = [f"{'there':<18}{'ms':>6}  {'here':<30}{'ms':>6}  {'there':>7}{'here':>7}{'physics':>9}  figure"]
+    lines = [
+        f"{'there':<18}{'CPU ms':>6}  {'here':<30}{'CPU ms':>6}  {'there':>8}{'here':>8}{'physics':>9}  figure"
+    ]
     for number, row in enumerate(compared):
-        wall = [turns.wall_ms[f"{side} {number}"] for side in ("there", "here")]
+        used = [turns.processor_ms[f"{side} {number}"] for side in ("there", "here")]
         figures = [row.figure(act) for act in (row.there, row.here)]
         lines.append(
-            f"{row.name:<18}{wall[0]:6.0f}  {row.fault:<30}{wall[1]:6.0f}  "
-            f"{figures[0]:7.3g}{figures[1]:7.3g}{row.physics:9.3g}  {row.meaning}"
+            f"{row.name:<18}{used[0]:6.0f}  {row.fault:<30}{used[1]:6.0f}  "
+            f"{figures[0]:8.3g}{figures[1]:8.3g}{row.physics:9.3g}  {row.meaning}"
         )
     return "\n".join([*lines, str(turns)])
