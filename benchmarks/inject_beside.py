@@ -1,8 +1,8 @@
 """Compare faults in images with the corruptions of imagecorruptions and Albumentations that are like them.
 
 `inject_speed.py` prints the table. Each corruption and the fault that is like it act on the same image of 8 bits in
-turns. Beside the processor times stands a figure that physics fixes, measured on both. The other packages have their mildest
-settings, and where they leave the strength open, that of the fault.
+turns. Beside the processor times stands a figure that physics fixes, measured on both. The other packages have
+their mildest settings, and where they leave the strength open, that of the fault.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import cv2
@@ -17,6 +18,7 @@ import numpy as np
 from turns import in_turns
 
 from vbnfault import Injector
+from vbnfault.camera import Camera
 from vbnfault.core.quantities import Electrons
 from vbnfault.scene.config import Scene
 
@@ -161,9 +163,15 @@ class Row:
         return self.there(sun_px), self.here(sun_px)
 
 
+@cache
+def camera_of(run: Injector, shape: tuple[int, ...]) -> Camera:
+    """Return the camera of images of a shape."""
+    return run(np.zeros(shape, np.uint8)).camera
+
+
 def camera_noise(image: np.ndarray, number: int) -> np.ndarray:
     """Take light without noise by a camera, which draws its own noise."""
-    camera = CAMERA._camera(image.shape[:2], None)[0]
+    camera = camera_of(CAMERA, image.shape)
     white = camera.detector.white_e
     light = Electrons(array=(image / np.float32(255) * white).astype(np.float32), white_e=white)
     return CAMERA(light, number, camera=camera).image[..., :3]
@@ -181,7 +189,7 @@ def flare(**table: Any) -> Callable[[tuple[float, float]], Act]:
 def blurred_sun(image: np.ndarray, number: int) -> np.ndarray:
     """Blur the Sun before it saturates, of which an image of 8 bits no longer has the light."""
     if (image == 255).all(axis=2).any() and image.shape == sun().shape:
-        camera = BLUR._camera(image.shape[:2], None)[0]
+        camera = camera_of(BLUR, image.shape)
         light = Electrons(array=sun() * camera.detector.white_e, white_e=camera.detector.white_e)
         return BLUR(light, number, camera=camera).image[..., :3]
     return BLUR(image, number).image
@@ -265,12 +273,11 @@ def table(size_px: int, rounds: int) -> str:
         for side, act in zip(("there", "here"), row.acts(size_px), strict=True):
             arms[f"{side} {number}"] = lambda k, act=act: act(image, k)
     turns = in_turns(arms, rounds)
-    lines = [
-        f"{'there':<18}{'CPU ms':>6}  {'here':<30}{'CPU ms':>6}  {'there':>8}{'here':>8}{'physics':>9}  figure"
-    ]
+    head = ("there", "CPU ms", "here", "CPU ms", "there", "here", "physics")
+    lines = ["{:<18}{:>6}  {:<30}{:>6}  {:>8}{:>8}{:>9}  figure".format(*head)]
     for number, row in enumerate(compared):
         used = [turns.processor_ms[f"{side} {number}"] for side in ("there", "here")]
-        figures = [row.figure(act) for act in (row.there, row.here)]
+        figures = [round(row.figure(act), 3) for act in (row.there, row.here)]
         lines.append(
             f"{row.name:<18}{used[0]:6.0f}  {row.fault:<30}{used[1]:6.0f}  "
             f"{figures[0]:8.3g}{figures[1]:8.3g}{row.physics:9.3g}  {row.meaning}"
