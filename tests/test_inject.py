@@ -525,6 +525,9 @@ def test_batches_of_a_training_loop_have_the_draws_of_their_numbers() -> None:
     assert (floats * 255 - images.float()).abs().max() <= 0.5 + 2 * 255 / CAMERA["full_well_e"]
     with pytest.raises(InputError, match="must be uint8 or float32"):
         transform(batch[0], [0])
+    assert transform(batch[:0], [])[1].shape == (0, 3, 48, 64)
+    with pytest.raises(InputError, match="5 images: 2 numbers and 5 Suns; must be as many"):
+        transform(batch, [0, 1])
     with pytest.raises(InputError, match="probability = 2: must be from 0 to 1"):
         Inject(faults, probability=2)
 

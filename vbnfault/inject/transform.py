@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -104,7 +105,7 @@ class Inject:
         Raises
         ------
         InputError
-            The tensor has another shape or data type.
+            The tensor has another shape or data type, or the numbers are not one for each image.
         """
         if images.ndim != 4 or images.shape[1] not in (1, 3) or images.dtype not in (torch.uint8, torch.float32):
             raise InputError(
@@ -113,19 +114,20 @@ class Inject:
             )
         if get_worker_info() is not None:
             llvm.use_one_thread()
-        out, masks, self.left_out = [], [], {}
-        pixels = images.permute(0, 2, 3, 1).contiguous().numpy()
-        places = [self._sun] * len(pixels) if suns is None else [self._sun if s is None else s for s in suns]
-        for image, number, sun in zip(pixels, numbers, places, strict=True):
-            result = self._injected(image, int(number), sun)
-            faulty = result.image.reshape(image.shape)
-            if faulty.dtype.kind == "f":
-                faulty = np.clip(faulty, np.minimum(image, 0), np.maximum(image, 1))
-            out.append(faulty)
-            masks.append(result.masks)
+        given = images.contiguous().numpy()
+        changed, masks = np.empty_like(given), np.empty((len(given), len(self.classes), *given.shape[2:]), bool)
+        places = [self._sun] * len(given) if suns is None else [self._sun if s is None else s for s in suns]
+        if not len(given) == len(numbers) == len(places):
+            raise InputError(f"{len(given)} images: {len(numbers)} numbers and {len(places)} Suns; must be as many")
+        self.left_out = {}
+        for planes, out, mask, number, sun in zip(given, changed, masks, numbers, places, strict=True):
+            result = self._injected(cv2.merge(list(planes)), int(number), sun)
+            cv2.split(result.image, list(out))
+            if given.dtype.kind == "f":
+                np.clip(out, np.minimum(planes, 0), np.maximum(planes, 1), out=out)
+            mask[...] = result.masks
             self.left_out |= result.left_out
-        changed = torch.from_numpy(np.stack(out)).permute(0, 3, 1, 2).contiguous()
-        return changed, torch.from_numpy(np.stack(masks))
+        return torch.from_numpy(changed), torch.from_numpy(masks)
 
     def _injected(self, image: NDArray[Any], number: int, sun: str | Sequence[float] | None) -> Injected:
         """Return an image with the classes that its number draws."""
