@@ -528,6 +528,10 @@ def test_batches_of_a_training_loop_have_the_draws_of_their_numbers() -> None:
     assert transform(batch[:0], [])[1].shape == (0, 3, 48, 64)
     with pytest.raises(InputError, match="5 images: 2 numbers and 5 Suns; must be as many"):
         transform(batch, [0, 1])
+    with pytest.raises(InputError, match=r"^Inject: camera\.fov_degrees: unknown key \(did you mean fov_deg"):
+        Inject(faults, camera={"fov_degrees": 3})
+    with pytest.raises(InputError, match=r"^Inject: faults\.dust_on_optics = 5: must be a table"):
+        Inject({"dust_on_optics": 5})
     with pytest.raises(InputError, match="probability = 2: must be from 0 to 1"):
         Inject(faults, probability=2)
 

@@ -15,7 +15,7 @@ from torch.utils.data import get_worker_info
 from ..core.errors import InputError
 from ..core.process import llvm
 from ..scene import keyed_random
-from ..scene.config import Scene
+from ..scene.config import parse_scene
 from .injector import Injected, Injector
 
 
@@ -62,9 +62,9 @@ class Inject:
     ) -> None:
         if not 0 <= probability <= 1:
             raise InputError(f"probability = {probability:g}: must be from 0 to 1")
-        tables: dict[str, Any] = {"title": "inject", "dataset": {"seed": seed}, "faults": dict(faults)}
-        tables |= {key: dict(table) for key, table in (("camera", camera), ("image", image)) if table}
-        self._scene = Scene.model_validate(tables)
+        tables: dict[str, Any] = {"title": "inject", "dataset": {"seed": seed}, "faults": faults}
+        tables |= {key: table for key, table in (("camera", camera), ("image", image)) if table}
+        self._scene = parse_scene(tables, source="Inject")
         self._probability, self.seed = probability, seed
         self._sun = self._scene.image.sun if sun is None and self._scene.image else sun
         self.classes = tuple(self.injector.faults)
@@ -73,7 +73,7 @@ class Inject:
     @cached_property
     def injector(self) -> Injector:
         """Return what injects the faults; each process makes its own."""
-        return Injector(self._scene, effects=False)
+        return Injector(self._scene, source="Inject", effects=False)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what another process needs."""
