@@ -36,9 +36,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-import psutil
 import xarray
 from torch.utils.data import DataLoader
+from turns import of_machine_s, processor_s
 
 import vbnfault
 from vbnfault.torch import BatchDataset, Loader, SampleDataset
@@ -84,23 +84,6 @@ class Folder:
         for k, mask in enumerate(self.masks[i]):
             masks[k] = cv2.imread(str(mask), cv2.IMREAD_UNCHANGED) > 0
         return image, masks
-
-
-def processor_s() -> float:
-    """Return the processor time that this process and its children have used, in s."""
-    own = psutil.Process()
-    total = 0.0
-    for process in [own, *own.children(recursive=True)]:
-        times = process.cpu_times()
-        total += times.user + times.system
-    return total
-
-
-def of_machine_s() -> tuple[float, float]:
-    """Return the processor time that all programs have used, and all that there was, in s."""
-    times = psutil.cpu_times()
-    whole = sum(times) - getattr(times, "guest", 0.0) - getattr(times, "guest_nice", 0.0)
-    return whole - times.idle - getattr(times, "iowait", 0.0), whole
 
 
 def one_by_one(data: Naive) -> Iterator[Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import vbnfault
@@ -67,6 +68,25 @@ def test_the_cost_of_variants_is_measured_on_equal_faults(tmp_path: Path) -> Non
     assert alone.calls["faulty"] == shared.calls["faulty"] == 2
     assert shared.calls["render_view"] < alone.calls["render_view"]
     assert "K=2 over K=1: " in table(alone, shared)
+
+
+def test_faults_in_images_are_timed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    import inject_speed
+
+    monkeypatch.setattr(sys, "argv", ["inject_speed.py", "--size", "64", "--rounds", "1", "--only", "detector: b"])
+    inject_speed.main()
+    printed = capsys.readouterr().out
+    for name in ("blooming", "banding", "broken_pixels", "broken_lines", "other programs took"):
+        assert name in printed
+
+
+def test_what_a_blur_does_to_light_is_a_figure_of_the_comparison() -> None:
+    import inject_beside
+
+    assert inject_beside.light_kept(lambda image, _: image) == 1
+    assert inject_beside.white_around_sun(inject_beside.blurred_sun) == pytest.approx(1, abs=0.02)
+    assert inject_beside.off_the_line(inject_beside.flare(model="texture")) < 1
+    assert inject_beside.shine_in_the_dark(lambda image, _: image + np.uint8(3)) == 3
 
 
 def test_a_scene_is_drawn_beside_its_twin_and_its_masks(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import pickle
+import shutil
 import signal
 import subprocess
 import sys
@@ -19,6 +20,7 @@ import numpy as np
 import pytest
 import tifffile
 from astropy.io import fits
+from PIL import ImageCms
 from typer.testing import CliRunner
 
 import vbnfault
@@ -282,6 +284,7 @@ def _image_files(folder: Path) -> dict[str, Path]:
     folder.mkdir(parents=True, exist_ok=True)
     tag = [(65000, "s", 0, "own tag", True)]
     tifffile.imwrite(folder / "strips.tif", GREY, description="mine", resolution=(72, 72), extratags=tag)
+    tifffile.imwrite(folder / "none.tif", GREY, description=None, metadata=None, bigtiff=True, extratags=tag)
     tifffile.imwrite(folder / "tiles.tif", GREY, tile=(32, 32), compression="zlib", predictor=True, extratags=tag)
     tifffile.imwrite(folder / "big.tif", COLOURS, bigtiff=True, photometric="rgb", byteorder=">", extratags=tag)
     planes = np.moveaxis(COLOURS, -1, 0)
@@ -312,13 +315,15 @@ def test_files_keep_their_kind_and_what_is_written_is_read_back(tmp_path: Path) 
 
 def test_other_programs_read_the_files_with_their_metadata(tmp_path: Path) -> None:
     files = _image_files(tmp_path / "in")
-    for name in ("strips.tif", "tiles.tif", "big.tif", "planes.tif"):
+    for name in ("strips.tif", "none.tif", "tiles.tif", "big.tif", "planes.tif"):
         image = read_image(files[name])
         image.write(tmp_path / name, image.numbers, "faults")
         with tifffile.TiffFile(tmp_path / name) as before, tifffile.TiffFile(files[name]) as after:
             np.testing.assert_array_equal(before.asarray(), after.asarray())
             tags = [{t.code: t.value for t in f.pages[0].tags} for f in (before, after)]
-        where = {259, 273, 279, 317, 324, 325}  # compression and the places of the blocks
+        assert tags[0][270] == {"none.tif": "faults"}.get(name, tags[0][270])
+        # compression, the offsets of the blocks, and a description where there was none
+        where = {259, 273, 279, 317, 324, 325} | ({270} - tags[1].keys())
         assert {k: v for k, v in tags[0].items() if k not in where} == {
             k: v for k, v in tags[1].items() if k not in where
         }
@@ -342,6 +347,61 @@ def test_other_programs_read_the_files_with_their_metadata(tmp_path: Path) -> No
     image.write(tmp_path / "grey.png", image.numbers, "faults")
     assert profile in (tmp_path / "grey.png").read_bytes()
     assert b"vbnfault\0faults" in (tmp_path / "grey.png").read_bytes()
+
+
+def _told_by_exiftool(path: Path) -> dict[str, Any]:
+    """Return what exiftool reads in a file, by group and tag, without what belongs to the file and the blocks."""
+    run = subprocess.run(
+        ["exiftool", "-j", "-n", "-a", "-G1", "-b", "-all", "-validate", "-warning", str(path)],
+        capture_output=True,
+        check=True,
+        text=True,
+    )
+    groups = ("SourceFile", "ExifTool", "System", "File", "Composite")
+    blocks = ("StripOffsets", "StripByteCounts", "Compression", "Predictor")
+    tags = json.loads(run.stdout)[0]
+    return {k: v for k, v in tags.items() if k.split(":")[0] not in groups and k.split(":")[-1] not in blocks}
+
+
+@pytest.mark.skipif(shutil.which("exiftool") is None, reason="exiftool is not installed")
+@pytest.mark.parametrize("name", ["a.png", "a.tif"])
+def test_metadata_that_exiftool_wrote_is_read_by_exiftool(name: str, tmp_path: Path) -> None:
+    (tmp_path / "in").mkdir()
+    path = tmp_path / "in" / name
+    image = np.random.default_rng(5).integers(40, 200, (64, 96, 3), np.uint8)
+    if name.endswith("png"):
+        write_png(path, image)
+    else:
+        tifffile.imwrite(path, image, photometric="rgb", rowsperstrip=10, metadata=None)
+    (tmp_path / "a.icc").write_bytes(ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes())
+    tags = {
+        "EXIF:Make": "Maker",
+        "EXIF:Model": "Camera",
+        "EXIF:ExposureTime": 0.0125,
+        "EXIF:FNumber": 5.6,
+        "EXIF:DateTimeOriginal": "2026:01:02 03:04:05",
+        "EXIF:GPSLatitude": 48.5,
+        "EXIF:GPSLatitudeRef": "N",
+        "XMP-dc:Title": "Größe",
+        "XMP-xmp:Rating": 4,
+    }
+    words = [f"-{key}={value}" for key, value in tags.items()]
+    subprocess.run(
+        ["exiftool", "-q", "-n", "-overwrite_original", *words, f"-ICC_Profile<={tmp_path / 'a.icc'}", str(path)],
+        check=True,
+    )
+    before = _told_by_exiftool(path)
+    assert {"IFD0:Make", "ExifIFD:ExposureTime", "GPS:GPSLatitude", "XMP-dc:Title"} <= before.keys()
+    assert any(key.startswith("ICC") for key in before)
+    dust = {"title": "dust", "faults": {"dust_on_optics": {}}, "plan": {"faulty_fraction": 1.0}, "camera": CAMERA}
+    inject_files([path], Scene.model_validate(dust), tmp_path / "out", progress=False)
+    after = _told_by_exiftool(tmp_path / "out" / name)
+    assert {key: after.get(key) for key in before} == before
+    assert (
+        after["PNG:Vbnfault" if name == "a.png" else "IFD0:ImageDescription"]
+        == "faults by vbnfault: dust_on_optics"
+    )
+    assert (read_image(tmp_path / "out" / name).numbers != image).any()
 
 
 # --- batches ------------------------------------------------------------------------------------------------------
@@ -461,8 +521,60 @@ def test_batches_of_a_training_loop_have_the_draws_of_their_numbers() -> None:
     assert (floats * 255 - images.float()).abs().max() <= 0.5 + 2 * 255 / CAMERA["full_well_e"]
     with pytest.raises(InputError, match="must be uint8 or float32"):
         transform(batch[0], [0])
+    assert transform(batch[:0], [])[1].shape == (0, 3, 48, 64)
+    with pytest.raises(InputError, match="5 images: 2 numbers and 5 Suns; must be as many"):
+        transform(batch, [0, 1])
+    with pytest.raises(InputError, match=r"^Inject: camera\.fov_degrees: unknown key \(did you mean fov_deg"):
+        Inject(faults, camera={"fov_degrees": 3})
+    with pytest.raises(InputError, match=r"^Inject: faults\.dust_on_optics = 5: must be a table"):
+        Inject({"dust_on_optics": 5})
     with pytest.raises(InputError, match="probability = 2: must be from 0 to 1"):
         Inject(faults, probability=2)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_every_model_acts_in_a_batch_or_says_why_it_cannot(name: str) -> None:
+    torch = pytest.importorskip("torch", reason="PyTorch is an extra")
+    from vbnfault.torch import Inject
+
+    fault, _, model = name.partition("/")
+    faults = only(load_scene("quickstart"), name).faults
+    batch = torch.randint(40, 200, (2, 3, 96, 128), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+    batch[:, :, 40:50, 60:70] = 255  # charge that overflows
+    if registry()[fault][model].needs_mosaic:
+        with pytest.raises(InputError, match=rf"faults\.{fault}\.model = '{model}': .*; name a camera\.detector"):
+            Inject(faults, camera=CAMERA)
+    camera = {"fov_deg": 20.0, "exposure_s": 0.01, "detector": "generic_ccd"}
+    transform = Inject(faults, camera=camera, probability=1, seed=2)
+    for images in (batch, batch.float() / 255):
+        struck, masks = transform(images, range(2), suns=[(100.0, 20.0), None])
+        assert (struck.shape, struck.dtype) == (images.shape, images.dtype)
+        assert (masks.shape, masks.dtype) == ((2, 1, 96, 128), torch.bool)
+        assert struck.min() >= 0
+        assert struck.max() <= images.max()  # white
+        if registry()[fault][model].needs_sun:
+            assert transform.left_out == {fault: "needs the Sun before the camera; give it by image.sun or --sun"}
+            assert torch.equal(struck[1], images[1])
+            assert not masks[1].any()
+        else:
+            assert transform.left_out == {}
+    # of the faint motes, those that 8 bits show are few
+    assert fault == "particles" or (masks[0].any() and not torch.equal(struck[0], images[0]))
+
+
+def test_a_batch_whose_images_show_no_sun_goes_on_without() -> None:
+    torch = pytest.importorskip("torch", reason="PyTorch is an extra")
+    from vbnfault.torch import Inject
+
+    transform = Inject({"straylight": {}}, camera=CAMERA, image={"sun": "auto"}, probability=1)
+    batch = torch.full((2, 1, 64, 64), 40, dtype=torch.uint8)
+    batch[1, 0, 20:26, 40:46] = 255
+    struck, _ = transform(batch, range(2))
+    assert torch.equal(struck[0], batch[0])
+    assert not torch.equal(struck[1], batch[1])
+    assert list(transform.left_out) == ["straylight"]
+    with pytest.raises(InputError, match=r"image\.sun"):
+        transform(batch, range(2), suns=[(0.0, 0.0, 0.0)] * 2)
 
 
 # --- bad input ----------------------------------------------------------------------------------------------------

@@ -6,13 +6,17 @@ from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
+from numpy.typing import NDArray
+from torch.utils.data import get_worker_info
 
 from ..core.errors import InputError
+from ..core.process import llvm
 from ..scene import keyed_random
-from ..scene.config import Scene
-from .injector import Injector
+from ..scene.config import parse_scene
+from .injector import Injected, Injector
 
 
 class Inject:
@@ -31,7 +35,14 @@ class Inject:
     seed
         Seed of all random numbers.
     sun
-        Position of the Sun, as for `Injector`; it must not be None for straylight.
+        Position of the Sun, as for `Injector`; straylight is left out without one. Default: that of `image`.
+
+    Attributes
+    ----------
+    classes
+        The classes of the faults, in the order of the masks.
+    left_out
+        Why a class that was drawn is not in an image of the last batch of this process, by class.
 
     Raises
     ------
@@ -51,32 +62,40 @@ class Inject:
     ) -> None:
         if not 0 <= probability <= 1:
             raise InputError(f"probability = {probability:g}: must be from 0 to 1")
-        tables: dict[str, Any] = {"title": "inject", "dataset": {"seed": seed}, "faults": dict(faults)}
-        tables |= {key: dict(table) for key, table in (("camera", camera), ("image", image)) if table}
-        self._scene = Scene.model_validate(tables)
-        self._probability, self._sun, self.seed = probability, sun, seed
+        tables: dict[str, Any] = {"title": "inject", "dataset": {"seed": seed}, "faults": faults}
+        tables |= {key: table for key, table in (("camera", camera), ("image", image)) if table}
+        self._scene = parse_scene(tables, source="Inject")
+        self._probability, self.seed = probability, seed
+        self._sun = self._scene.image.sun if sun is None and self._scene.image else sun
         self.classes = tuple(self.injector.faults)
+        self.left_out: dict[str, str] = {}
 
     @cached_property
     def injector(self) -> Injector:
         """Return what injects the faults; each process makes its own."""
-        return Injector(self._scene, effects=False)
+        return Injector(self._scene, source="Inject", effects=False)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what another process needs."""
         return {key: value for key, value in vars(self).items() if key != "injector"}
 
     def __call__(
-        self, images: torch.Tensor, numbers: Sequence[int] | torch.Tensor
+        self,
+        images: torch.Tensor,
+        numbers: Sequence[int] | torch.Tensor,
+        suns: Sequence[str | Sequence[float] | None] | None = None,
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return images with faults, in the data type of the given ones, and masks.
 
         Parameters
         ----------
         images
-            uint8 or float32 (white is 1) [image, channel, y, x] on the CPU, with 1 channel or R, G, B.
+            uint8 or float32 [image, channel, y, x] on the CPU, with 1 channel or R, G, B. White of floats is 1,
+            which no fault exceeds.
         numbers
             Number of each image, such as its index in the data set plus the epoch times its length.
+        suns
+            Position of the Sun for each image; None: `sun`. Where "auto" finds none, there is none.
 
         Returns
         -------
@@ -86,19 +105,37 @@ class Inject:
         Raises
         ------
         InputError
-            The tensor has another shape or data type.
+            The tensor has another shape or data type, or the numbers are not one for each image.
         """
         if images.ndim != 4 or images.shape[1] not in (1, 3) or images.dtype not in (torch.uint8, torch.float32):
             raise InputError(
                 f"images: {images.dtype} of shape {list(images.shape)}: must be uint8 or float32 of "
                 "[image, channel, y, x] with 1 or 3 channels"
             )
-        out, masks = [], []
-        for image, number in zip(images.permute(0, 2, 3, 1).contiguous().numpy(), numbers, strict=True):
-            chance = keyed_random.rng(self.seed, int(number), "inject", "classes").random(len(self.classes))
-            chosen = [name for name, p in zip(self.classes, chance, strict=True) if p < self._probability]
-            result = self.injector(image, int(number), sun=self._sun, commanded=chosen)
-            out.append(result.image.reshape(image.shape))
-            masks.append(result.masks)
-        changed = torch.from_numpy(np.stack(out)).permute(0, 3, 1, 2).contiguous()
-        return changed, torch.from_numpy(np.stack(masks))
+        if get_worker_info() is not None:
+            llvm.use_one_thread()
+        given = images.contiguous().numpy()
+        changed, masks = np.empty_like(given), np.empty((len(given), len(self.classes), *given.shape[2:]), bool)
+        places = [self._sun] * len(given) if suns is None else [self._sun if s is None else s for s in suns]
+        if not len(given) == len(numbers) == len(places):
+            raise InputError(f"{len(given)} images: {len(numbers)} numbers and {len(places)} Suns; must be as many")
+        self.left_out = {}
+        for planes, out, mask, number, sun in zip(given, changed, masks, numbers, places, strict=True):
+            result = self._injected(cv2.merge(list(planes)), int(number), sun)
+            cv2.split(result.image, list(out))
+            if given.dtype.kind == "f":
+                np.clip(out, np.minimum(planes, 0), np.maximum(planes, 1), out=out)
+            mask[...] = result.masks
+            self.left_out |= result.left_out
+        return torch.from_numpy(changed), torch.from_numpy(masks)
+
+    def _injected(self, image: NDArray[Any], number: int, sun: str | Sequence[float] | None) -> Injected:
+        """Return an image with the classes that its number draws."""
+        chance = keyed_random.rng(self.seed, number, "inject", "classes").random(len(self.classes))
+        chosen = [name for name, p in zip(self.classes, chance, strict=True) if p < self._probability]
+        try:
+            return self.injector(image, number, sun=sun, commanded=chosen)
+        except InputError:
+            if sun != "auto":
+                raise
+            return self.injector(image, number, sun="none", commanded=chosen)

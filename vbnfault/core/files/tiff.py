@@ -116,9 +116,43 @@ def with_numbers(data: bytes, numbers: NDArray[Any], text: str) -> bytes:
         for tag, value in ((where, tuple(offsets)), (sizes, tuple(counts)), (259, 1), (317, 1)):
             if tag in page.tags:
                 page.tags[tag].overwrite(value[0] if isinstance(value, tuple) and len(value) == 1 else value)
-        if 270 in page.tags and not str(page.tags[270].value).strip():
+        if 270 not in page.tags:
+            _describe(stream, page, text)
+        elif not str(page.tags[270].value).strip():
             page.tags[270].overwrite(text)
     return stream.getvalue()
+
+
+def _describe(stream: io.BytesIO, page: TiffPage, text: str) -> None:
+    """Append the directory of a page with the tag 270, ImageDescription, and write its new offset over the old."""
+    order, big = page.parent.byteorder, page.parent.is_bigtiff
+    number, offset = (f"{order}Q", f"{order}Q") if big else (f"{order}H", f"{order}I")
+    head, inline = struct.calcsize(number), struct.calcsize(offset)
+    entry = 4 + 2 * inline
+
+    def value(kind: str, position: int) -> int:
+        return int(struct.unpack_from(kind, stream.getbuffer(), position)[0])
+
+    def append(data: bytes) -> int:
+        stream.seek(0, io.SEEK_END)
+        position = stream.seek(stream.tell() % 2, io.SEEK_CUR)  # everything begins at an even offset
+        stream.write(data)
+        return position
+
+    count = value(number, page.offset)
+    start, stop = page.offset + head, page.offset + head + count * entry
+    directory = stream.getvalue()[start : stop + inline]
+    words = text.encode("ascii", "replace") + b"\0"
+    field = words.ljust(inline, b"\0") if len(words) <= inline else struct.pack(offset, append(words))
+    tag = struct.pack(f"{order}HH{offset[1]}", 270, 2, len(words)) + field
+    tags = [directory[k : k + entry] for k in range(0, count * entry, entry)] + [tag]
+    tags.sort(key=lambda data: int(struct.unpack_from(f"{order}H", data)[0]))
+    moved = append(struct.pack(number, count + 1) + b"".join(tags) + directory[-inline:])
+    position = 8 if big else 4
+    while value(offset, position) != page.offset:  # of the directories before this one
+        before = value(offset, position)
+        position = before + head + value(number, before) * entry
+    struct.pack_into(offset, stream.getbuffer(), position, moved)
 
 
 def check_values(rows: int, columns: int, channels: int, most_values: int) -> None:

@@ -113,6 +113,17 @@ def backend() -> Any:
     return SimpleNamespace(dr=drjit, **{name: getattr(types, name) for name in names})
 
 
+@functools.lru_cache(maxsize=1)
+def use_one_thread() -> None:
+    """Run kernels in the calling thread alone, as one of several processes that share the cores.
+
+    A thread of drjit that waits for work keeps its core busy for a while. A forked process has no such thread where
+    its parent loaded the backend; to end it there would wait for ever.
+    """
+    if not backend.cache_info().currsize:
+        backend().dr.set_thread_count(0)
+
+
 def flat(array: NDArray[T]) -> NDArray[T]:
     """Return an array, or a copy of it, in one dimension and beginning at a multiple of 16 numbers and 64 bytes.
 
