@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import av
@@ -459,3 +460,14 @@ def test_layers_and_depth_of_a_render_reach_the_store(tmp_path: Path) -> None:
     twin = read_image(tmp_path / "out" / "clean" / "a.exr").numbers
     np.testing.assert_array_equal(data["clean"][0, ..., :3], np.rint(np.clip(twin * 255, 0, 255)))
     assert 0 < twin[..., 1].std() < 0.05
+
+
+def test_an_image_for_which_the_memory_does_not_suffice_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_png(tmp_path / "large.png", np.full((100, 200), 90, np.uint8))
+    monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(available=10**6))
+    with pytest.raises(
+        VbnfaultError, match=r"large\.png: has 200 x 100 pixels, which need 1\.8 MB .* 1 MB are free"
+    ):
+        inject_files([tmp_path / "large.png"], load_scene("quickstart", SCENE), tmp_path / "out", progress=False)
