@@ -161,15 +161,23 @@ def _pixels(frame: Any, stream: Any, *, grey: bool) -> NDArray[Any]:
 
 
 def _lack(container: Any, stream: Any, number: int, last: Any) -> str:
-    """Return what is wrong if a film is longer than its frames, by what its header says; "" if it is whole."""
-    if stream.frames:
-        return f"is missing: the film has {stream.frames}" if number < stream.frames else ""
+    """Return what is wrong if a film is longer than its frames, by what its header says; "" if it is whole.
+
+    Frames that an edit cuts off are counted in the header, too, so its duration must not be reached either.
+    """
     if number == 0:
         return "is missing"
-    if container.duration and len(container.streams) == 1 and last.time is not None:
-        step_s, length_s = float(1 / (stream.average_rate or 25)), container.duration / 1e6
-        if last.time + 2 * step_s < length_s:
-            return f"is missing: the film lasts {length_s:.2f} s"
+    length_s = None
+    if stream.duration:
+        length_s = float((stream.start_time or 0) + stream.duration) * float(stream.time_base)
+    elif container.duration and len(container.streams) == 1:
+        length_s = container.duration / 1e6
+    if length_s is None or last.time is None:
+        return f"is missing: the film has {stream.frames}" if number < stream.frames else ""
+    # a whole film ends one step after its last frame begins, where the steps are equal
+    steps = (length_s - last.time) * float(stream.average_rate or 25)
+    if steps > 2 or (steps > 1.5 and number < stream.frames):
+        return f"is missing: the film lasts {length_s:.2f} s"
     return ""
 
 
