@@ -7,6 +7,8 @@ continues as with any other images.
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -34,6 +36,7 @@ _FORMATS_OF_PIXELS = {
     (3, 16): ("rgb48le", "gbrp16le"),
 }
 
+_GREY_LEVELS = 4  # of 255, between the channels: lossy codecs give grey a colour of 2
 # Version 3 of FFV1 has checksums; slices are coded alone, so that the number of threads does not matter.
 _CODER = {"level": "3", "slices": "4", "slicecrc": "1", "threads": "1"}
 
@@ -76,14 +79,10 @@ def unpack(path: Path, folder: Path, most_values: int) -> Film:
         pass
     record.unlink(missing_ok=True)
     folder.mkdir(parents=True, exist_ok=True)
+    grey = _is_grey(path, most_values)
     number, rate, ended = 0, Fraction(25), ""
     try:
-        with av.open(str(path), format=_FORMATS[path.suffix.lower()]) as container:
-            if not container.streams.video:
-                raise InputError(f"{path}: has no images")
-            stream = container.streams.video[0]
-            check_values(stream.height, stream.width, 3, most_values)
-            stream.codec_context.options = {"err_detect": "explode"}  # a damaged frame is an error and not guessed
+        with _opened(path, most_values) as (container, stream):
             rate, last = stream.average_rate or rate, None
             for frame in container.decode(stream):
                 check()
@@ -91,15 +90,13 @@ def unpack(path: Path, folder: Path, most_values: int) -> Film:
                     ended = "is damaged"
                     break
                 last, number = frame, number + 1
-                write_png(frame_path(folder, number), _pixels(frame, stream))
+                write_png(frame_path(folder, number), _pixels(frame, stream, grey=grey))
             else:
                 ended = _lack(container, stream, number, last)
     except av.error.FFmpegError as error:
         ended = f"cannot be decoded: {error.strerror}"
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
     if ended:
-        ended = f"{path}: frame {number + 1} {ended}; the {number} frames before it are made"
+        ended = f"{path}: frame {number + 1} {ended}; what comes before it is made"
     film = Film(sha256=sha256, frames=number, rate=str(rate), ended=ended)
     write_json(record, asdict(film))
     return film
@@ -131,24 +128,56 @@ def assemble(folder: Path, path: Path, film: Film) -> None:
             container.mux(stream.encode())
 
 
-def _pixels(frame: Any, stream: Any) -> NDArray[Any]:
+@contextmanager
+def _opened(path: Path, most_values: int) -> Iterator[tuple[Any, Any]]:
+    """Open a film, and give its container and its stream of images. Raises InputError, or FFmpegError of PyAV."""
+    with _av().open(str(path), format=_FORMATS[path.suffix.lower()], metadata_errors="replace") as container:
+        stream = next(iter(container.streams.video), None)
+        if stream is None or stream.codec_context is None:
+            raise InputError(f"{path}: has no images, or images of an unknown codec")
+        try:
+            check_values(stream.height, stream.width, 3, most_values)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from None
+        stream.codec_context.options = {"err_detect": "explode"}  # a damaged frame is an error and not guessed
+        yield container, stream
+
+
+def _is_grey(path: Path, most_values: int) -> bool:
+    """Return whether no frame of a film has a colour: many codecs know colours only, and grey cameras use them."""
+    with suppress(_av().error.FFmpegError), _opened(path, most_values) as (container, stream):
+        for frame in container.decode(stream):
+            levels = frame.reformat(format="rgb24").to_ndarray()
+            if (np.ptp(levels, axis=2) > _GREY_LEVELS).any():
+                return False
+    return True
+
+
+def _pixels(frame: Any, stream: Any, *, grey: bool) -> NDArray[Any]:
     """Return a frame as grey [y, x] or RGB [y, x, 3], of 16 bits where the film has more than 8."""
-    parts = frame.format.components
-    bits = 16 if max(part.bits for part in parts) > 8 else 8
-    given, _ = _FORMATS_OF_PIXELS[1 if len(parts) == 1 else 3, bits]
+    bits = 16 if max(part.bits for part in frame.format.components) > 8 else 8
+    given, _ = _FORMATS_OF_PIXELS[1 if grey else 3, bits]
     return np.asarray(frame.reformat(stream.width, stream.height, given).to_ndarray())
 
 
 def _lack(container: Any, stream: Any, number: int, last: Any) -> str:
-    """Return what is wrong if a film is longer than its frames, by what its header says; "" if it is whole."""
-    if stream.frames:
-        return f"is missing: the film has {stream.frames}" if number < stream.frames else ""
+    """Return what is wrong if a film is longer than its frames, by what its header says; "" if it is whole.
+
+    Frames that an edit cuts off are counted in the header, too, so its duration must not be reached either.
+    """
     if number == 0:
         return "is missing"
-    if container.duration and len(container.streams) == 1 and last.time is not None:
-        step_s, length_s = float(1 / (stream.average_rate or 25)), container.duration / 1e6
-        if last.time + 2 * step_s < length_s:
-            return f"is missing: the film lasts {length_s:.2f} s"
+    length_s = None
+    if stream.duration:
+        length_s = float((stream.start_time or 0) + stream.duration) * float(stream.time_base)
+    elif container.duration and len(container.streams) == 1:
+        length_s = container.duration / 1e6
+    if length_s is None or last.time is None:
+        return f"is missing: the film has {stream.frames}" if number < stream.frames else ""
+    # a whole film ends one step after its last frame begins, where the steps are equal
+    steps = (length_s - last.time) * float(stream.average_rate or 25)
+    if steps > 2 or (steps > 1.5 and number < stream.frames):
+        return f"is missing: the film lasts {length_s:.2f} s"
     return ""
 
 

@@ -185,4 +185,5 @@ def _numbers(values: Any) -> tuple[float, ...]:
 
 def _line(error: Exception) -> str:
     """Return the message of a reader in one line."""
-    return " ".join(str(error).split())[:200] or type(error).__name__
+    text = " ".join(str(error).split())[:200] or type(error).__name__
+    return f"{text} is missing or unknown" if isinstance(error, KeyError) else text
