@@ -441,6 +441,7 @@ def test_the_camera_adds_the_noise_of_light_and_readout_to_a_render(dtype: Any, 
 def test_a_render_saturates_at_white_and_differs_from_its_twin_in_the_masks_only() -> None:
     render = np.full((96, 128), 0.3, np.float32)
     render[:8] = 40.0
+    render[80:] = 0.0  # where the readout's noise is below black
     keys = {"noise_free": True}
     given = {"broken_pixels": {"model": "texture"}}
     images = [vbnfault.inject(render, given, camera=CAMERA, seed=s, image_keys=keys) for s in (2, 2, 3)]
@@ -448,9 +449,11 @@ def test_a_render_saturates_at_white_and_differs_from_its_twin_in_the_masks_only
     assert (result.clean[:8] == 1).all()
     assert result.image.max() <= 1
     assert result.unrecoverable[:8].all()
+    assert not result.unrecoverable[8:].any()
     np.testing.assert_array_equal(result.image[~result.masks[0]], result.clean[~result.masks[0]])
     np.testing.assert_array_equal(images[1].image, result.image)
     assert (images[2].clean[8:] != result.clean[8:]).mean() > 0.9
+    assert (result.clean[80:] < 0).mean() == pytest.approx(0.5, abs=4 * 0.5 / np.sqrt(16 * 128))
     np.testing.assert_array_equal(vbnfault.inject(render, given, camera=CAMERA).clean, render)
 
 

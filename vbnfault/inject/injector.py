@@ -204,7 +204,7 @@ class Injector:
         else:
             picture = Picture.of(given, table, camera, raw=raw)
             if table.noise_free:
-                picture = Picture.of(picture.exposed(drawing.rng), table, camera, raw=raw)
+                picture = picture.exposed(table, drawing.rng)
             assumed += picture.assumptions
             light = picture.electrons
         known = replace(self._context(camera, sun, depth_m, picture), **(context or {}))
