@@ -604,6 +604,7 @@ def test_unusable_arrays(image: np.ndarray, sentence: str) -> None:
         ("a.fits", b"SIMPLE", "is a damaged FITS|without an image"),
         ("a.exr", b"v/1\x01", "is a damaged OpenEXR"),
         ("a.npy", b"\x93NUMPY", "is no array of numpy"),
+        ("b.npy", b"\x93NUMPY\x01\0\x05\0{'a':", "is no array of numpy"),
         ("a.bmp", b"BM", "must end with one of"),
     ],
 )
@@ -625,6 +626,11 @@ def test_unusable_files(tmp_path: Path, name: str, content: bytes, sentence: str
 def test_unusable_descriptions_of_an_image(keys: dict[str, Any], sentence: str) -> None:
     with pytest.raises((InputError, ValueError), match=sentence):
         vbnfault.inject(np.full((64, 64), 90, np.uint8), {"dust_on_optics": {}}, camera=CAMERA, image_keys=keys)
+
+
+def test_a_direction_of_the_sun_with_a_word_in_it_is_named() -> None:
+    with pytest.raises(InputError, match=r"image\.sun\[2\] = 'a': must be a number"):
+        load_scene("quickstart", {"image.sun": [1.0, 2.0, "a"]})
 
 
 def test_a_response_that_falls_is_refused(tmp_path: Path) -> None:

@@ -58,7 +58,7 @@ def _stored(dtype: np.dtype[Any]) -> np.ndarray:
     return numbers.astype(dtype)
 
 
-def _pds3(path: Path, stored: np.ndarray, kind: str, *, attached: bool = True, more: str = "") -> int:
+def pds3_file(path: Path, stored: np.ndarray, kind: str, *, attached: bool = True, more: str = "") -> int:
     """Write an image with a label of PDS3, 6 bytes before and 4 behind each line; return where its lines begin."""
     size = stored.dtype.itemsize
     before, after = 2 * size, size
@@ -83,7 +83,7 @@ def _pds3(path: Path, stored: np.ndarray, kind: str, *, attached: bool = True, m
     return len(head) + before
 
 
-def _pds4(path: Path, stored: np.ndarray, kind: str, more: str = "") -> int:
+def pds4_file(path: Path, stored: np.ndarray, kind: str, more: str = "") -> int:
     """Write an image with a label of PDS4, after a header of 32 bytes; return where it begins."""
     rows, columns = stored.shape
     axes = "".join(
@@ -134,7 +134,7 @@ def test_pds3_keeps_every_byte_but_the_pixels(
 
     stored = _stored(np.dtype(f"{order}{letter}{size}"))
     path = tmp_path / "frame.img"
-    begin = _pds3(path, stored, kind, attached=attached)
+    begin = pds3_file(path, stored, kind, attached=attached)
     numbers = _changed_back(path, tmp_path / "out", stored, begin, 27 * size)
     label = tmp_path / "out" / ("frame.img" if attached else "frame.lbl")
     np.testing.assert_array_equal(pdr.read(str(label))["IMAGE"], numbers)
@@ -148,7 +148,7 @@ def test_pds4_keeps_every_byte_but_the_pixels(kind: str, dtype: str, tmp_path: P
 
     stored = _stored(np.dtype(dtype))
     path = tmp_path / "frame.dat"
-    begin = _pds4(path, stored, kind)
+    begin = pds4_file(path, stored, kind)
     numbers = _changed_back(path, tmp_path / "out", stored, begin, stored[0].nbytes)
     label = tmp_path / "out" / "frame.xml"
     np.testing.assert_array_equal(pdr.read(str(label))["image"], numbers)
@@ -158,9 +158,9 @@ def test_pds4_keeps_every_byte_but_the_pixels(kind: str, dtype: str, tmp_path: P
 def test_pixels_that_a_label_calls_missing_stay_so(tmp_path: Path) -> None:
     stored = _stored(np.dtype(">i2"))
     stored[4, 6:9] = -32768
-    _pds3(tmp_path / "a.img", stored, "MSB_INTEGER", more=" MISSING_CONSTANT = -32768")
+    pds3_file(tmp_path / "a.img", stored, "MSB_INTEGER", more=" MISSING_CONSTANT = -32768")
     constants = "<Special_Constants><missing_constant>-32768</missing_constant></Special_Constants>"
-    _pds4(tmp_path / "b.img", stored, "SignedMSB2", constants)
+    pds4_file(tmp_path / "b.img", stored, "SignedMSB2", constants)
     for name in ("a.img", "b.img"):
         image = read_image(tmp_path / name)
         assert (image.numbers[4, 6:9] == 0).all()
@@ -173,9 +173,9 @@ def test_a_batch_of_an_archive_keeps_its_names_and_follows_its_labels(tmp_path: 
     folder = tmp_path / "in"
     folder.mkdir()
     flat = np.full((64, 96), 9000, ">u2")
-    _pds3(folder / "a.img", flat, "MSB_UNSIGNED_INTEGER", attached=False)
-    _pds4(folder / "b.img", flat, "UnsignedMSB2")
-    _pds3(folder / "c.img", flat, "MSB_UNSIGNED_INTEGER")
+    pds3_file(folder / "a.img", flat, "MSB_UNSIGNED_INTEGER", attached=False)
+    pds4_file(folder / "b.img", flat, "UnsignedMSB2")
+    pds3_file(folder / "c.img", flat, "MSB_UNSIGNED_INTEGER")
     batch = inject_files([folder], load_scene("quickstart", SCENE), tmp_path / "out", progress=False)
     assert batch.names == ("a.img", "b.img", "c.img")
     assert {p.name for p in (tmp_path / "out").iterdir() if p.is_file()} == {p.name for p in folder.iterdir()}
@@ -207,7 +207,7 @@ def test_a_batch_of_an_archive_keeps_its_names_and_follows_its_labels(tmp_path: 
 )
 def test_unusable_labels(old: bytes, new: bytes, sentence: str, tmp_path: Path) -> None:
     path = tmp_path / "frame.img"
-    _pds3(path, _stored(np.dtype(">i2")), "MSB_INTEGER", attached=False)
+    pds3_file(path, _stored(np.dtype(">i2")), "MSB_INTEGER", attached=False)
     label = path.with_suffix(".lbl")
     assert old in label.read_bytes()
     label.write_bytes(label.read_bytes().replace(old, new))
@@ -227,7 +227,7 @@ def test_unusable_archives(tmp_path: Path) -> None:
 # --- films --------------------------------------------------------------------------------------------------------
 
 
-def _film(path: Path, codec: str, pixels: str, frames: int = 6, rate: int = 12) -> np.ndarray:
+def film_file(path: Path, codec: str, pixels: str, frames: int = 6, rate: int = 12) -> np.ndarray:
     """Write a film of noise that moves, and return its frames as RGB of 8 bits."""
     noise = np.random.default_rng(3).integers(20, 200, (64, 96 + frames, 3), np.uint8)
     images = np.array([np.ascontiguousarray(noise[:, k : k + 96]) for k in range(frames)])
@@ -240,7 +240,7 @@ def _film(path: Path, codec: str, pixels: str, frames: int = 6, rate: int = 12) 
     return images
 
 
-def _read(path: Path, pixels: str) -> tuple[np.ndarray, Fraction]:
+def _read(path: Path, pixels: str) -> tuple[np.ndarray, Fraction | None]:
     """Return the frames of a film and its rate."""
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
@@ -261,7 +261,7 @@ def _read(path: Path, pixels: str) -> tuple[np.ndarray, Fraction]:
 def test_frames_go_through_ffv1_without_loss(
     name: str, codec: str, given: str, read: str, dtype: Any, tmp_path: Path
 ) -> None:
-    images = _film(tmp_path / name, codec, given)
+    images = film_file(tmp_path / name, codec, given)
     film = unpack(tmp_path / name, tmp_path / "frames", 10**6)
     assert (film.frames, Fraction(film.rate), film.ended) == (6, 12, "")
     first = read_image(tmp_path / "frames" / "000001.png").numbers
@@ -302,7 +302,7 @@ def _results(folder: Path) -> dict[str, bytes]:
 
 def test_a_film_becomes_images_with_masks_and_a_film(tmp_path: Path) -> None:
     (tmp_path / "in").mkdir()
-    _film(tmp_path / "in" / "film.mp4", "mpeg4", "yuv420p")
+    film_file(tmp_path / "in" / "film.mp4", "mpeg4", "yuv420p")
     scene, out = load_scene("quickstart", SCENE), tmp_path / "out"
     batch = inject_files([tmp_path / "in"], scene, out, sun=(60.0, 20.0), progress=False)
     assert batch.names == tuple(f"film/{k:06d}.png" for k in range(1, 7))
@@ -345,7 +345,7 @@ def test_a_film_that_ends_early_is_made_as_far_as_it_goes(
     name: str, codec: str, pixels: str, left: float, tmp_path: Path
 ) -> None:
     whole, film = tmp_path / f"whole_{name}", tmp_path / name
-    _film(whole, codec, pixels, frames=12)
+    film_file(whole, codec, pixels, frames=12)
     data = whole.read_bytes()
     film.write_bytes(data[: int(left * len(data))])
     with pytest.raises(VbnfaultError, match=rf"{name}: frame \d+ (is|cannot).*; what comes before it is made") as e:
@@ -366,7 +366,7 @@ def test_a_film_that_ends_early_is_made_as_far_as_it_goes(
 def test_unusable_films(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scene, path = load_scene("quickstart", SCENE), tmp_path / "a.mp4"
     write_png(tmp_path / "image.png", np.full((64, 96), 90, np.uint8))
-    _film(tmp_path / "b.mp4", "mpeg4", "yuv420p")
+    film_file(tmp_path / "b.mp4", "mpeg4", "yuv420p")
     for content, sentence in (
         (b"", "film file is empty"),
         (b"#EXTM3U\n#EXTINF:1\n/etc/hostname\n", "a.mp4: frame 1 cannot be decoded"),
@@ -388,8 +388,8 @@ def test_unusable_films(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
         monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(InputError, match=r"vbnfault\[video\]"):
         unpack(tmp_path / "b.mp4", tmp_path / "frames", 10**6)
-    _pds3(tmp_path / "a.img", np.zeros((20, 24), ">i2"), "MSB_INTEGER")
-    _pds4(tmp_path / "b.img", np.zeros((20, 24), ">i2"), "SignedMSB2")
+    pds3_file(tmp_path / "a.img", np.zeros((20, 24), ">i2"), "MSB_INTEGER")
+    pds4_file(tmp_path / "b.img", np.zeros((20, 24), ">i2"), "SignedMSB2")
     for name in ("a.img", "b.img"):
         with pytest.raises(InputError, match=r"vbnfault\[pds\]"):
             read_image(tmp_path / name)
@@ -441,6 +441,7 @@ def test_the_camera_adds_the_noise_of_light_and_readout_to_a_render(dtype: Any, 
 def test_a_render_saturates_at_white_and_differs_from_its_twin_in_the_masks_only() -> None:
     render = np.full((96, 128), 0.3, np.float32)
     render[:8] = 40.0
+    render[80:] = 0.0  # where the readout's noise is below black
     keys = {"noise_free": True}
     given = {"broken_pixels": {"model": "texture"}}
     images = [vbnfault.inject(render, given, camera=CAMERA, seed=s, image_keys=keys) for s in (2, 2, 3)]
@@ -448,9 +449,11 @@ def test_a_render_saturates_at_white_and_differs_from_its_twin_in_the_masks_only
     assert (result.clean[:8] == 1).all()
     assert result.image.max() <= 1
     assert result.unrecoverable[:8].all()
+    assert not result.unrecoverable[8:].any()
     np.testing.assert_array_equal(result.image[~result.masks[0]], result.clean[~result.masks[0]])
     np.testing.assert_array_equal(images[1].image, result.image)
     assert (images[2].clean[8:] != result.clean[8:]).mean() > 0.9
+    assert (result.clean[80:] < 0).mean() == pytest.approx(0.5, abs=4 * 0.5 / np.sqrt(16 * 128))
     np.testing.assert_array_equal(vbnfault.inject(render, given, camera=CAMERA).clean, render)
 
 

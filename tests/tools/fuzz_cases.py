@@ -189,9 +189,13 @@ def case_image(seeds: Seeds, rng: random.Random, here: Path) -> Case:
     """Damage an image into which faults go, or what describes it, or options."""
     name = rng.choice(list(seeds.images))
     path = here / name
+    for label in (path.with_suffix(ending).name for ending in (".img", ".lbl", ".xml")):
+        if path.suffix in (".img", ".lbl", ".xml") and label in seeds.images:
+            (here / label).write_bytes(seeds.images[label])
     damaged = rng.random() < 0.7
     path.write_bytes(flipped(seeds.images[name], rng, seeds.images["a.png"]) if damaged else seeds.images[name])
-    keys = ("black_dn", "white_dn", "response", "gamma", "response_file", "sun", "raw")
+    path = path.with_suffix(".img") if path.suffix in (".lbl", ".xml") else path
+    keys = ("black_dn", "white_dn", "response", "gamma", "response_file", "sun", "raw", "noise_free")
     table = {} if rng.random() < 0.6 else {key: hostile(rng) for key in rng.sample(keys, rng.choice((1, 2)))}
     models = {"dust_on_optics": {}, "broken_pixels": {"model": "texture"}, "straylight": {}}
     scene = whole_scene(seeds, here, faults=models, **({"image": table} if table else {}))

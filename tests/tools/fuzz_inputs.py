@@ -315,6 +315,7 @@ def _images(folder: Path) -> dict[str, bytes]:
     import numpy as np
     import tifffile
     from astropy.io import fits
+    from test_inject_formats import film_file, pds3_file, pds4_file
 
     from vbnfault.core.files.images import write_exr, write_png
 
@@ -330,6 +331,11 @@ def _images(folder: Path) -> dict[str, bytes]:
     fits.writeto(made / "b.fits", grey.astype(np.float32))
     np.save(made / "a.npy", grey)
     write_exr(made / "a.exr", {name: grey.astype(np.float32) / 60000 for name in ("R", "G", "B", "Z")})
+    pds3_file(made / "attached.img", grey, "LSB_UNSIGNED_INTEGER")
+    pds3_file(made / "beside.img", grey.astype(">f4"), "IEEE_REAL", attached=False)
+    pds4_file(made / "pds4.img", grey, "UnsignedLSB2")
+    film_file(made / "a.mkv", "ffv1", "bgr0", frames=2)
+    film_file(made / "a.mp4", "mpeg4", "yuv420p", frames=2)
     return {path.name: path.read_bytes() for path in sorted(made.iterdir())}
 
 

@@ -481,10 +481,9 @@ def _locate(loc: Sequence[int | str], root: Mapping[str, Any]) -> tuple[list[int
         lists.sort(key=lambda choice: -len(choice.get("prefixItems", ())))  # a longer one has the same first items
         if tables:
             node = tables[0]["properties"][part]
-        elif lists and "prefixItems" in lists[0]:
-            node = lists[0]["prefixItems"][part]
-        elif lists:
-            node = lists[0].get("items", {})
+        elif lists and isinstance(part, int):
+            items = (choice["prefixItems"][part] for choice in lists if part < len(choice.get("prefixItems", ())))
+            node = next(items, lists[0].get("items", {}))
         elif len(choices) > 1 and any(choice.get("title") == part for choice in choices):
             node = next(choice for choice in choices if choice.get("title") == part)
             continue

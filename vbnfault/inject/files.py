@@ -95,7 +95,7 @@ class Npy(ImageFile):
         """Read an array."""
         try:
             self.numbers = np.load(io.BytesIO(user_files.read_input(path, "image")), allow_pickle=False)
-        except (ValueError, EOFError) as error:
+        except Exception as error:  # a damaged header fails anywhere in numpy's parser
             raise InputError(f"is no array of numpy: {error}") from None
 
     def write(self, path: Path, numbers: NDArray[Any], text: str) -> None:

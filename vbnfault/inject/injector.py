@@ -242,7 +242,7 @@ class Injector:
         """Return an image as the camera sees it; one without noise is first taken by the camera."""
         table = self.scene.image or ImageTable()
         picture = Picture.of(numbers, table, camera, raw=raw)
-        return Picture.of(picture.exposed(drawing.rng), table, camera, raw=raw) if table.noise_free else picture
+        return picture.exposed(table, drawing.rng) if table.noise_free else picture
 
     def _struck(
         self,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, reduce
 from typing import Any
 
@@ -128,8 +128,8 @@ class Picture:
         out[changed] = self._rounded(response.numbers(response.light(numbers[changed]) + change[changed]))
         return out
 
-    def exposed(self, rng: Callable[[str, str], np.random.Generator]) -> NDArray[Any]:
-        """Return the numbers of a noise-free image as the camera takes it, saturated at white.
+    def exposed(self, table: ImageTable, rng: Callable[[str, str], np.random.Generator]) -> Picture:
+        """Return a noise-free image as the camera takes it; only the light that saturates it is unrecoverable.
 
         The light has the noise of its electrons, and the readout adds its own; `rng` returns the generator for
         (stage, name).
@@ -138,7 +138,8 @@ class Picture:
         electrons = poisson(self.light * self.white_e, draw_normals(shape, rng("inject", "shot")))
         electrons += self.camera.detector.read_noise_e_rms * normal_field(shape, rng("inject", "readout"))
         light = np.minimum(electrons / self.white_e, 1).reshape(self.numbers.shape)
-        return self._rounded(self.response.numbers(light))
+        taken = Picture.of(self._rounded(self.response.numbers(light)), table, self.camera, raw=self.raw)
+        return replace(taken, unrecoverable=taken.light.max(axis=2) >= 1)
 
     def spread(self, mosaic_e: F32) -> F32:
         """Return electrons of the mosaic, float32[y, x], in all channels, [y, x, channel]; their own stay exact."""
