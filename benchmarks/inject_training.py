@@ -5,8 +5,9 @@
 It needs PyTorch. A `DataLoader` makes batches of synthetic images, and a ResNet-18 (He et al. 2016, doi:10.1109/
 CVPR.2016.90) learns to tell which faults are in them. The arms take turns: without faults, with faults that
 `vbnfault.torch.Inject` puts into each batch inside the worker, and for comparison batches with faults that nobody
-trains on. The table has images a second as medians, the processor time of all processes, and their ratios. A line
-says how much of the machine's processor time other programs took: rates count only where that is little.
+trains on. The table has medians of images a second and of the processor time of all processes, and the median ratio
+of each to the arm without faults in the same round. A line says how much of the machine's processor time other
+programs took: rates count only where that is little.
 
 The six faults are those of the paper, each in half of the images.
 """
@@ -144,11 +145,10 @@ def main() -> None:
     for workers in options.workers:
         start = time.perf_counter()
         turns = in_turns(dict(arms(options, workers)), options.rounds)
-        plain, busy = turns.wall_ms["without faults"], turns.processor_ms["without faults"]
         for kind, wall in turns.wall_ms.items():
+            faster, used = turns.rate(kind, "without faults"), turns.processor_ms[kind] / count
             name = f"{kind}, {workers} workers"
-            used = turns.processor_ms[kind]
-            print(f"{name:<30}{1e3 * count / wall:10.1f}{plain / wall:8.2f}{used / count:18.1f}{busy / used:8.2f}")
+            print(f"{name:<30}{1e3 * count / wall:10.1f}{faster[0]:8.2f}{used:18.1f}{faster[1]:8.2f}")
         print(turns, f"({time.perf_counter() - start:.0f} s)", flush=True)
 
 

@@ -10,14 +10,32 @@ from typing import Any
 
 import psutil
 
+Times = dict[str, list[float]]  # of each round in ms, by name
+
 
 @dataclass(frozen=True)
 class Turns:
-    """Hold median wall and processor times in ms by name, and what other programs took of the machine, 0 to 1."""
+    """Hold times of each round by name, and the fraction of the machine that other programs took."""
 
-    wall_ms: dict[str, float]
-    processor_ms: dict[str, float]
+    wall: Times
+    processor: Times
     others: float
+
+    @property
+    def wall_ms(self) -> dict[str, float]:
+        """Return the median wall times by name."""
+        return {name: statistics.median(times) for name, times in self.wall.items()}
+
+    @property
+    def processor_ms(self) -> dict[str, float]:
+        """Return the median processor times by name."""
+        return {name: statistics.median(times) for name, times in self.processor.items()}
+
+    def rate(self, name: str, of: str) -> tuple[float, float]:
+        """Return how many times as fast `name` is as `of`, by wall and processor time: medians over the rounds."""
+        pairs = [zip(times[of], times[name], strict=True) for times in (self.wall, self.processor)]
+        wall, processor = (statistics.median(other / own for other, own in pair) for pair in pairs)
+        return wall, processor
 
     def __str__(self) -> str:
         return f"other programs took {self.others:.0%} of the machine's processor time"
@@ -28,8 +46,8 @@ def in_turns(arms: Mapping[str, Callable[[int], Any]], rounds: int, *, warm_up: 
 
     The times are those of one call; processor time is that of all threads and child processes.
     """
-    wall: dict[str, list[float]] = {name: [] for name in arms}
-    processor: dict[str, list[float]] = {name: [] for name in arms}
+    wall: Times = {name: [] for name in arms}
+    processor: Times = {name: [] for name in arms}
     for number in range(warm_up):
         for function in arms.values():
             function(number)
@@ -43,8 +61,7 @@ def in_turns(arms: Mapping[str, Callable[[int], Any]], rounds: int, *, warm_up: 
             processor[name].append(1e3 * (processor_s() - used) / calls)
     own, after = processor_s() - own_before, of_machine_s()
     busy, whole = after[0] - before[0], after[1] - before[1]
-    medians = [{name: statistics.median(times) for name, times in of.items()} for of in (wall, processor)]
-    return Turns(*medians, others=max(0.0, busy - own) / max(whole, 1e-9))
+    return Turns(wall, processor, others=max(0.0, busy - own) / max(whole, 1e-9))
 
 
 def processor_s() -> float:
