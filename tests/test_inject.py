@@ -147,7 +147,7 @@ def simple_faults() -> Iterator[None]:
     define("test_veil", lambda array: array + np.float32(2000))
     define("test_blur", lambda array: cv2.blur(array, (5, 5)))
     yield
-    forget(__name__)
+    forget(__file__)
 
 
 @pytest.mark.parametrize(
