@@ -149,7 +149,7 @@ def simple_faults() -> Iterator[None]:
     define("test_veil", lambda array: array + np.float32(2000))
     define("test_blur", lambda array: cv2.blur(array, (5, 5)).reshape(array.shape))
     yield
-    forget(__name__)
+    forget(__file__)
 
 
 @pytest.mark.parametrize(

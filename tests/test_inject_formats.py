@@ -401,21 +401,21 @@ CAMERA = {"fov_deg": 20.0, "full_well_e": 13500.0, "read_noise_e_rms": 13.0, "ex
 
 
 @pytest.fixture
-def half() -> Iterator[None]:
+def dim() -> Iterator[None]:
     """Define a fault that takes half of the light away."""
 
     @dataclass(frozen=True, kw_only=True)
-    class Half(vbnfault.Fault):
-        fault, model, default, step, after = "test_half", "simple", True, "electrons", "dust_on_optics"
+    class Dim(vbnfault.Fault):
+        fault, model, default, step, after = "test_dim", "simple", True, "electrons", "dust_on_optics"
 
         def apply(self, quantity: Any, params: Any, context: Any) -> Any:
             return quantity.with_array(quantity.array * np.float32(0.5))
 
     yield
-    forget(__name__)
+    forget(__file__)
 
 
-@pytest.mark.usefixtures("half")
+@pytest.mark.usefixtures("dim")
 @pytest.mark.parametrize(("dtype", "white"), [(np.float32, 2.0), (np.uint16, 60000)])
 def test_the_camera_adds_the_noise_of_light_and_readout_to_a_render(dtype: Any, white: float) -> None:
     """Of a flat of λ electrons the variance is λ + σ², and of half of its light λ / 2 + σ².
@@ -425,7 +425,7 @@ def test_the_camera_adds_the_noise_of_light_and_readout_to_a_render(dtype: Any, 
     """
     render = np.full((256, 256, 3), 0.6 * white, dtype)
     keys = {"noise_free": True, "white_dn": white, "black_dn": 0.0}
-    result = vbnfault.inject(render, {"test_half": {}}, camera=CAMERA, seed=3, image_keys=keys)
+    result = vbnfault.inject(render, {"test_dim": {}}, camera=CAMERA, seed=3, image_keys=keys)
     assert result.image.dtype == result.clean.dtype == dtype
     detector = ThreeColourDetector(full_well_e=13500.0, read_noise_e_rms=13.0)
     for channel, white_e in enumerate(detector.white_e.tolist()):
