@@ -615,3 +615,24 @@ def test_light_of_a_flare_smears_in_the_image_as_in_its_mask(exposure_s: float) 
     assert 0.1 < mask.mean() < 0.9
     assert (changed != mask).mean() < 0.05  # levels that noise moves across a rounding, at the edge of the flare
     assert (mask.all(axis=0).mean() > 0.2) == (exposure_s < 0.01)
+
+
+def test_images_of_one_state_share_what_lasts_and_differ_in_what_happens_in_an_exposure() -> None:
+    image = np.full((96, 128), 90, np.uint8)
+    tables = {
+        "title": "inject",
+        "camera": {"detector": "rosetta_navcam", "fov_deg": 5.0, "exposure_s": 0.3},
+        "faults": {"dust_on_optics": {"model": "gaussian"}, "cosmic_rays": {"flux_per_cm2_s": [900.0, 1000.0]}},
+    }
+    injector = Injector(Scene.model_validate(tables))
+    film = [injector(image, number, state=4) for number in (4, 5)]
+    alone = [injector(image, number) for number in (4, 5)]
+    np.testing.assert_array_equal(film[0].image, alone[0].image)
+    for class_ in injector.faults:
+        same = film[0].parameters[class_] == film[1].parameters[class_]
+        assert same == (not injector.faults[class_].per_exposure)
+        assert alone[0].parameters[class_] != alone[1].parameters[class_]
+    dust = (
+        film[0].masks[film[0].faults.index("dust_on_optics")] & ~film[0].masks[film[0].faults.index("cosmic_rays")]
+    )
+    assert (film[0].image != film[1].image)[dust].any()  # the noise of the light that is left is that of its frame

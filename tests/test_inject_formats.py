@@ -309,13 +309,15 @@ def test_a_film_becomes_images_with_masks_and_a_film(tmp_path: Path) -> None:
     faulty, rate = _read(out / "film.mkv", "rgb24")
     assert rate == 12
     before = _read(tmp_path / "in" / "film.mp4", "rgb24")[0]
-    masks = []
+    masks, drawn = [], {}
     for k, name in enumerate(batch.names):
         np.testing.assert_array_equal(faulty[k], read_image(out / name).numbers)
         masks.append(read_image(out / "masks" / f"{name}_any.png").numbers > 0)
         label = json.loads((out / "labels" / f"{name}.json").read_text())
         assert label["number"] == k
         assert label["injected"]
+        drawn = {**label["parameters"], **drawn}
+        assert label["parameters"].items() <= drawn.items()  # dust and defects stay through a film
     assert (faulty != before).any(axis=(1, 2, 3)).all()
     expected = _results(out)
     inject_files([tmp_path / "in"], scene, tmp_path / "two", sun=(60.0, 20.0), workers=2, progress=False)

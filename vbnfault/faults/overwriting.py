@@ -49,6 +49,7 @@ class TextureOverwriting(Fault):
     default = True
     after = "transmission"
     step = "rgbi"
+    per_exposure = True
 
     texture_file: str = path(content="texture", doc="path of a PNG or TIFF texture; required")
     channels: str = text("RGBI", doc='the channels to overwrite, such as "RGBI", "I" or "R"')

@@ -45,6 +45,7 @@ class PacketTransmission(Fault):
     default = True
     after = "broken_lines"
     step = "raw"
+    per_exposure = True
     severity = Severity(key="lost_count", low=1, high=1000, width_power=2)
     needs_mosaic = True
 

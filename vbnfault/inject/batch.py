@@ -68,6 +68,8 @@ class Batch:
         lie below its name without the ending.
     out
         Folder of the results.
+    states
+        Number of the instrument's state in each image, which the frames of a film share.
     sun
         In place of `image.sun` of the scene; None: as there.
     """
@@ -76,6 +78,7 @@ class Batch:
     sources: tuple[Path, ...]
     names: tuple[str, ...]
     out: Path
+    states: tuple[int, ...]
     sun: str | tuple[float, ...] | None = None
 
     @cached_property
@@ -93,7 +96,7 @@ class Batch:
     def key(self, index: int) -> str:
         """Return a digest of the input of an image: its file, its number, the scene and the Sun."""
         content, scene = self.content(index), self.scene.model_dump(mode="json")
-        told = json.dumps([content, index, self.sun, len(self.names), scene], sort_keys=True)
+        told = json.dumps([content, index, self.states[index], self.sun, len(self.names), scene], sort_keys=True)
         return user_files.sha256(told.encode())
 
     def content(self, index: int) -> str:
@@ -133,6 +136,7 @@ class Batch:
             return image, self.injector(
                 image.numbers,
                 index,
+                state=self.states[index],
                 sun=self.sun,
                 commanded=self.plan.commanded(index),
                 depth_m=image.depth_m,
@@ -316,10 +320,10 @@ def inject_files(
     VbnfaultError
         Some images failed; all others are made, and the same call tries the failed ones again.
     """
-    sources, names, films = _frames(*_found(images, out), out)
+    sources, names, states, films = _frames(*_found(images, out), out)
     dataset = scene.dataset.model_copy(update={"samples": len(names)})
     scene = scene.model_copy(update={"dataset": dataset})
-    batch = Batch(scene=scene, sources=sources, names=names, out=out, sun=sun)
+    batch = Batch(scene=scene, sources=sources, names=names, out=out, states=states, sun=sun)
     options = build.BuildOptions(workers=workers, progress=progress)
     batch.injector  # noqa: B018  an unusable scene is reported before any image
     if labels == "zarr":
@@ -382,14 +386,16 @@ def _first_image(batch: Batch) -> ImageFile:
 
 def _frames(
     root: Path, paths: Sequence[Path], out: Path
-) -> tuple[tuple[Path, ...], tuple[str, ...], dict[str, Film]]:
-    """Return images with their names below the folder `root`, films as their frames, and the films by name."""
+) -> tuple[tuple[Path, ...], tuple[str, ...], tuple[int, ...], dict[str, Film]]:
+    """Return images, with frames for films, their names below the folder `root`, states, and the films by name."""
     sources: list[Path] = []
     names: list[str] = []
+    states: list[int] = []
     films = {}
     for path in paths:
         name = path.relative_to(root).as_posix()
         if path.suffix.lower() not in FILMS:
+            states.append(len(sources))
             sources.append(path)
             names.append(name)
             continue
@@ -402,6 +408,7 @@ def _frames(
                 film = Film(sha256="", frames=0, rate="1", ended=str(error))
         films[name] = film
         frames = [frame_path(folder, number) for number in range(1, film.frames + 1)]
+        states += [len(sources)] * len(frames)
         sources += frames
         names += [f"{name}/{frame.name}" for frame in frames]
     twice = next((name for name, count in Counter(names).items() if count > 1), None)
@@ -409,7 +416,7 @@ def _frames(
         raise InputError(f"{root / twice}: is named twice")
     if not names:
         raise InputError("; ".join(film.ended for film in films.values()))
-    return tuple(sources), tuple(names), films
+    return tuple(sources), tuple(names), tuple(states), films
 
 
 def _found(images: Sequence[str | Path], out: Path) -> tuple[Path, list[Path]]:

@@ -24,7 +24,7 @@ from ..pipeline.injection import draw_faults, visible_draws
 from ..pipeline.labels import labels_of
 from ..pipeline.spec import Draw, Injection, Labels, SceneExposure, SceneLight, mask_any_faults
 from ..scene import keyed_random
-from ..scene.config import Scene, configure_faults, load_scene
+from ..scene.config import Scene, configure_faults, load_scene, parse_scene
 from ..scene.instrument import CameraTable, ImageTable
 from ..world import cameras, ephemeris
 from .change import struck
@@ -125,10 +125,12 @@ class _Drawing:
     faults: Mapping[str, Fault]
     seed: int
     index: int
+    state: int
 
     def rng(self, stage: str, name: str) -> np.random.Generator:
-        """Return the generator for (stage, name)."""
-        return keyed_random.rng(self.seed, self.index, stage, name)
+        """Return the generator for (stage, name); faults that last from image to image follow `state`."""
+        lasts = stage == "fault" and not self.faults[name.partition("/")[0]].per_exposure
+        return keyed_random.rng(self.seed, self.state if lasts else self.index, stage, name)
 
 
 class Injector:
@@ -163,6 +165,7 @@ class Injector:
         image: NDArray[Any] | Electrons | Radiance,
         index: int = 0,
         *,
+        state: int | None = None,
         sun: str | Sequence[float] | None = None,
         commanded: Sequence[str] | None = None,
         depth_m: NDArray[Any] | None = None,
@@ -179,6 +182,9 @@ class Injector:
             expected electrons of the camera, or radiance, from which the camera takes the image with its own noise.
         index
             Number of the image: with the seed of the scene it keys all random numbers.
+        state
+            Number of the instrument's state: images with the same one have the same dust, defects and lens, and
+            differ in what happens during an exposure (`Fault.per_exposure`). None: each image has its own.
         sun
             "auto" finds the Sun as the saturated disc; two numbers are its pixel position, three its direction in
             the camera frame; None is what `[image]` says.
@@ -201,7 +207,9 @@ class Injector:
         given = image if isinstance(image, Electrons | Radiance) else _checked_array(image)
         grey = isinstance(given, np.ndarray) and given.ndim == 2
         camera, assumed = self._camera(_shape(given), camera, grey=grey)
-        drawing = _Drawing(faults=self.faults, seed=self.scene.dataset.seed, index=index)
+        drawing = _Drawing(
+            faults=self.faults, seed=self.scene.dataset.seed, index=index, state=index if state is None else state
+        )
         picture = None
         if isinstance(given, Electrons | Radiance):
             light = given if isinstance(given, Electrons) else camera.expose(given, camera.exposure_s)
@@ -413,7 +421,7 @@ def inject(
         tables["image"] = known.pop("image_keys")
     if isinstance(camera, Mapping):
         tables["camera"] = dict(camera)
-    injector = Injector(Scene.model_validate(tables))
+    injector = Injector(parse_scene(tables, source="inject"), source="inject")
     return injector(image, sun=sun, camera=camera if isinstance(camera, Camera) else None, **known)
 
 

@@ -144,6 +144,8 @@ class Picture:
     def spread(self, mosaic_e: F32) -> F32:
         """Return electrons of the mosaic, float32[y, x], in all channels, [y, x, channel]; their own stay exact."""
         pattern = self.camera.mosaic.sensor.pattern
+        if len(pattern.channels) == 1:
+            return mosaic_e[..., None]
         planes = np.stack([interpolate(mosaic_e, pattern, name) for name in pattern.channels], axis=-1)
         own = channel_of(pattern, mosaic_e.shape)[..., None].astype(np.intp)
         np.put_along_axis(planes, own, mosaic_e[..., None], axis=2)
