@@ -19,13 +19,14 @@ import numpy as np
 import pytest
 import tifffile
 from astropy.io import fits
-from PIL import ImageCms
+from PIL import Image, ImageCms
 from typer.testing import CliRunner
 
 import vbnfault
 from vbnfault.camera import Camera
 from vbnfault.cli import app
 from vbnfault.core.errors import InputError, VbnfaultError
+from vbnfault.core.files import images as image_files
 from vbnfault.core.files import resources
 from vbnfault.core.files.images import write_exr, write_png
 from vbnfault.core.registry import forget
@@ -250,7 +251,9 @@ def test_faults_that_an_image_cannot_have_are_left_out_with_a_reason() -> None:
     image = np.full((64, 64), 90, np.uint8)
     result = vbnfault.inject(image, {"straylight": {}, "dust_on_optics": {}}, camera=CAMERA)
     assert result.injected.tolist() == [True, False]
-    assert result.left_out == {"straylight": "needs the Sun before the camera; give it by image.sun or --sun"}
+    assert result.left_out == {
+        "straylight": "needs the Sun before the camera; give its position: image.sun, --sun or sun="
+    }
 
 
 def test_what_was_assumed_is_said() -> None:
@@ -481,7 +484,9 @@ def test_results_below_the_images_are_no_images_of_the_next_run(tmp_path: Path) 
 def test_a_batch_goes_on_past_a_damaged_image_and_names_it(tmp_path: Path) -> None:
     pictures = _pictures(tmp_path / "in", 3)
     (pictures / "01.png").write_bytes((pictures / "01.png").read_bytes()[:200])
-    with pytest.raises(VbnfaultError, match=r"image 1 of 3 failed, the first with: .*01\.png: is a damaged PNG"):
+    with pytest.raises(
+        VbnfaultError, match=r"image 1 of 3 failed, the first with: .*01\.png: is (a damaged|no) PNG"
+    ):
         inject_files([pictures], load_scene("quickstart", BATCH), tmp_path / "out", progress=False)
     assert [path.name for path in sorted((tmp_path / "out").glob("*.png"))] == ["00.png", "02.png"]
 
@@ -492,7 +497,7 @@ def test_the_command_says_what_it_assumed_and_where_the_images_are(tmp_path: Pat
     arguments += [v for key, value in BATCH.items() for v in ("--set", f"{key}={json.dumps(value)}")]
     result = CliRunner().invoke(app, [*arguments, "--sun", "60,20", "--seed", "3"])
     assert result.exit_code == 0, result.output
-    assert "assumed: image.white_dn = 255" in result.output
+    assert "image.white_dn = 255: assumed" in result.output
     assert f"2 images: {tmp_path / 'out'}" in result.output
     assert json.loads((tmp_path / "out/labels/00.png.json").read_text())["seed"] == 3
 
@@ -519,7 +524,8 @@ def test_unusable_arrays(image: np.ndarray, sentence: str) -> None:
     ("name", "content", "sentence"),
     [
         ("a.png", b"", "image file is empty"),
-        ("b.png", b"\x89PNG", "is a damaged PNG"),
+        ("b.png", b"\x89PNG", "is no PNG file"),
+        ("b.png", b"\x89PNG\r\n\x1a\nIHDR", "is a damaged PNG"),
         ("a.tif", b"II*\0", "is a damaged TIFF"),
         ("a.fits", b"SIMPLE", "is a damaged FITS|without an image"),
         ("a.exr", b"v/1\x01", "is a damaged OpenEXR"),
@@ -579,7 +585,7 @@ def test_a_store_keeps_what_fits_and_names_the_rest(tmp_path: Path) -> None:
     (pictures / "00.png").write_bytes(b"no image")
     write_png(pictures / "large.png", np.zeros((80, 96), np.uint8))
     with pytest.raises(
-        VbnfaultError, match=r"2 samples \(0, 3\) failed, the first with: .*00.png: is a damaged PNG"
+        VbnfaultError, match=r"2 samples \(0, 3\) failed, the first with: .*00.png: is no PNG"
     ) as failed:
         inject_files([pictures], scene, tmp_path / "out", labels="zarr", progress=False)
     assert failed.value.exit_code == 1
@@ -636,3 +642,75 @@ def test_images_of_one_state_share_what_lasts_and_differ_in_what_happens_in_an_e
         film[0].masks[film[0].faults.index("dust_on_optics")] & ~film[0].masks[film[0].faults.index("cosmic_rays")]
     )
     assert (film[0].image != film[1].image)[dust].any()  # the noise of the light that is left is that of its frame
+
+
+def test_a_scene_without_a_plan_commands_every_class_in_every_image_and_says_what_came_of_it(
+    tmp_path: Path,
+) -> None:
+    pictures = _pictures(tmp_path / "in", 4)
+    tables = {"title": "own", "camera": CAMERA, "faults": {"dust_on_optics": {}, "straylight": {}}}
+    batch = inject_files([pictures], Scene.model_validate(tables), tmp_path / "out", progress=False)
+    report = batch.report()
+    assert "dust_on_optics: in 4 of 4 images" in report
+    why = "4 without: it needs the Sun before the camera; give its position: image.sun, --sun or sun="
+    assert f"straylight: in 0 of 4 images; {why}" in report
+    traced = {**tables, "faults": {"straylight": {"model": "traced"}}}  # at 10 ms, the Sun's veil is white
+    white = inject_files([pictures], Scene.model_validate(traced), tmp_path / "b", sun=(40.0, 20.0), progress=False)
+    assert white.report()[-1].startswith("100% of the pixels are white, and 0% were before")
+
+
+def test_grey_png_with_alpha_keeps_both(tmp_path: Path) -> None:
+    """Written and read back by Pillow, which knows such images."""
+    rng = np.random.default_rng(3)
+    both = rng.integers(1, 200, (64, 96, 2), dtype=np.uint8)
+    (tmp_path / "in").mkdir()
+    Image.fromarray(both, "LA").save(tmp_path / "in/a.png")
+    camera = {"detector": "rosetta_navcam", "fov_deg": 20.0, "exposure_s": 0.1}
+    tables = {"title": "own", "camera": camera, "faults": {"dust_on_optics": {}}}
+    inject_files([tmp_path / "in"], Scene.model_validate(tables), tmp_path / "out", progress=False)
+    after = Image.open(tmp_path / "out/a.png")
+    assert after.mode == "LA"
+    np.testing.assert_array_equal(np.asarray(after)[..., 1], both[..., 1])
+    assert (np.asarray(after)[..., 0] != both[..., 0]).any()
+    deep = np.dstack([both[..., 0].astype(np.uint16) * 257, both[..., 1].astype(np.uint16) * 257])
+    png = image_files.with_png_numbers(image_files._grey_with_alpha(deep), deep, "text")
+    np.testing.assert_array_equal(image_files.png_numbers(png, 10**6), deep)
+
+
+def test_mistakes_are_named_in_a_sentence(tmp_path: Path) -> None:
+    image = np.full((64, 96), 90, np.uint8)
+    (tmp_path / "text.png").write_text("no image")
+    for call, sentence in (
+        (lambda: vbnfault.inject(image, {}), r"\[faults\] names no class"),
+        (lambda: vbnfault.inject(None, {"dust_on_optics": {}}), "is None and no array; was the file read?"),
+        (lambda: vbnfault.inject(image, {"dust": {}}), "dust.*dust_on_optics"),
+        (
+            lambda: vbnfault.inject(image, {"dust_on_optics": {}}, image_keys={"white_dn": 4095}),
+            "white_dn = 4095: must be at most 255, the largest number of this image",
+        ),
+        (
+            lambda: vbnfault.inject(image, {"dust_on_optics": {}}, image_keys={"white_dn": 4, "black_dn": 9}),
+            "white_dn = 4: must be above image.black_dn = 9",
+        ),
+        (lambda: read_image(tmp_path / "text.png"), "is no PNG file, whatever its name says"),
+        (lambda: read_image(tmp_path / "a.jpg"), "save it as PNG or TIFF"),
+    ):
+        with pytest.raises(InputError, match=sentence):
+            call()
+
+
+def test_an_exposure_at_which_the_sun_would_be_far_too_bright_is_said() -> None:
+    image, faults = np.full((64, 96), 90, np.uint8), {"dust_on_optics": {}}
+    for exposure_s, said in ((0.3, True), (1e-3, False)):
+        camera = {"fov_deg": 5.0, "f_number": 2.5, "exposure_s": exposure_s, "detector": "rosetta_navcam"}
+        assumptions = vbnfault.inject(image, faults, camera=camera).assumptions
+        assert any("times too bright" in text for text in assumptions) == said
+
+
+@pytest.mark.parametrize("detector", ["", "rosetta_navcam"])
+def test_light_that_saturates_the_sensor_is_white(detector: str) -> None:
+    image = np.full((64, 96), 90, np.uint8)
+    camera = {"fov_deg": 20.0, "exposure_s": 0.1, "detector": detector}
+    result = vbnfault.inject(image, {"straylight": {"model": "traced"}}, camera=camera, sun=(40.0, 20.0))
+    assert (result.image == 255).all()
+    assert (result.white_fraction(result.image), result.white_fraction(result.clean)) == (1, 0)

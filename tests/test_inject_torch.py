@@ -34,7 +34,7 @@ def test_batches_of_a_training_loop_have_the_draws_of_their_numbers() -> None:
     with pytest.raises(InputError, match="must be uint8 or float32"):
         transform(batch[0], [0])
     assert transform(batch[:0], [])[1].shape == (0, 3, 48, 64)
-    with pytest.raises(InputError, match="5 images: 2 numbers and 5 Suns; must be as many"):
+    with pytest.raises(InputError, match="5 images: 2 numbers and 5 Suns; must be one for each image"):
         transform(batch, [0, 1])
     with pytest.raises(InputError, match=r"^Inject: camera\.fov_degrees: unknown key \(did you mean fov_deg"):
         Inject(faults, camera={"fov_degrees": 3})
@@ -62,7 +62,9 @@ def test_every_model_acts_in_a_batch_or_says_why_it_cannot(name: str) -> None:
         assert struck.min() >= 0
         assert struck.max() <= images.max()  # white
         if registry()[fault][model].needs_sun:
-            assert transform.left_out == {fault: "needs the Sun before the camera; give it by image.sun or --sun"}
+            assert transform.left_out == {
+                fault: "needs the Sun before the camera; give its position: image.sun, --sun or sun="
+            }
             assert torch.equal(struck[1], images[1])
             assert not masks[1].any()
         else:

@@ -108,8 +108,8 @@ def inject(
     if seed is not None:
         changes["dataset.seed"] = seed
     batch = inject_files(images, load_scene(scene, changes), out, labels=labels, sun=_sun(sun), workers=workers)
-    for sentence in batch.assumptions:
-        typer.echo(f"assumed: {sentence}")
+    for sentence in batch.report():
+        typer.echo(sentence)
     typer.echo(f"{len(batch.names)} images: {out}")
 
 

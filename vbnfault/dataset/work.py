@@ -158,8 +158,9 @@ class Job:
         failed, noun = sorted(self.failures), self.item_noun
         names = ", ".join(map(str, failed[:8])) + (", ..." if len(failed) > 8 else "")
         listed = f"{noun} {names}" if len(failed) == 1 else f"{len(failed)} {noun}s ({names})"
+        first = self.failures[failed[0]].splitlines()[0].rstrip(".")
         raise self.error(
-            f"{self.path}: {listed}{of} failed{why}, the first with: {self.failures[failed[0]].splitlines()[0]}; "
+            f"{self.path}: {listed}{of} failed{why}, the first with: {first}; "
             f"{kept or f'all other {noun}s are kept'}; the same command tries the failed ones again",
             self.failures,
             **more,

@@ -37,6 +37,7 @@ from ..pipeline import Session
 from ..pipeline.record import proposal
 from ..scene import plan
 from ..scene.config import Scene
+from ..scene.sampling import PlanTable
 from ..store.schema import SCALARS
 from .files import ENDINGS, MOST_VALUES, ImageFile, read_image, source_files
 from .films import ENDINGS as FILMS
@@ -53,6 +54,7 @@ _LAYERS = ("clean", "mask_effect")
 # physical67p.
 _GREY_BYTES, _COLOUR_BYTES = 140, 90
 _EVERY = (*ENDINGS, *FILMS)
+_MUCH_WHITE = 0.1  # fraction of pixels that turn white, from which a person should know
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,14 +108,23 @@ class Batch:
             digest.update(path.read_bytes())
         return digest.hexdigest()
 
-    @property
-    def assumptions(self) -> list[str]:
-        """Return what was assumed of the camera, each sentence once, from the files of the images."""
-        said: dict[str, None] = {}
-        for index in range(len(self.names)):
-            if self.label_file(index).is_file():
-                said |= dict.fromkeys(json.loads(self.label_file(index).read_text(encoding="utf-8"))["assumptions"])
-        return list(said)
+    def report(self) -> list[str]:
+        """Return sentences on what was made, from the files of the images: assumptions, each once, and classes."""
+        labels = [self.label_file(index) for index in range(len(self.names))]
+        made = [json.loads(path.read_text(encoding="utf-8")) for path in labels if path.is_file()]
+        lines = list(dict.fromkeys(text for label in made for text in label["assumptions"]))
+        for name in self.injector.faults:
+            reasons = Counter(label["left_out"][name] for label in made if name in label["left_out"])
+            has = sum(name in label["injected"] for label in made)
+            why = "".join(f"; {count} without: it {reason}" for reason, count in reasons.items())
+            lines.append(f"{name}: in {has} of {len(made)} images{why}")
+        before, after = (sum(label["white_fraction"][k] for label in made) / max(len(made), 1) for k in (0, 1))
+        if after > before + _MUCH_WHITE:
+            lines.append(
+                f"{after:.0%} of the pixels are white, and {before:.0%} were before: light of the faults saturates "
+                "the camera; see camera.exposure_s, camera.f_number and camera.transmission"
+            )
+        return lines
 
     def label_file(self, index: int) -> Path:
         """Return the path of the JSON file of an image."""
@@ -176,6 +187,7 @@ class Batch:
                 "left_out": result.left_out,
                 "parameters": result.parameters,
                 "unrecoverable_fraction": float(result.unrecoverable.mean()),
+                "white_fraction": [result.white_fraction(result.clean), result.white_fraction(result.image)],
                 "assumptions": list(result.assumptions),
                 "files": files,
             }
@@ -322,7 +334,7 @@ def inject_files(
     """
     sources, names, states, films = _frames(*_found(images, out), out)
     dataset = scene.dataset.model_copy(update={"samples": len(names)})
-    scene = scene.model_copy(update={"dataset": dataset})
+    scene = scene.model_copy(update={"dataset": dataset, "plan": _plan(scene)})
     batch = Batch(scene=scene, sources=sources, names=names, out=out, states=states, sun=sun)
     options = build.BuildOptions(workers=workers, progress=progress)
     batch.injector  # noqa: B018  an unusable scene is reported before any image
@@ -342,6 +354,11 @@ def inject_files(
     if ended:
         raise VbnfaultError("; ".join(ended))
     return batch
+
+
+def _plan(scene: Scene) -> PlanTable:
+    """Return the plan of a scene; one that has none commands every class in every image."""
+    return scene.plan if "plan" in scene.model_fields_set else PlanTable(mode="per_class", faulty_fraction=1.0)
 
 
 def _build(batch: Batch, options: build.BuildOptions) -> None:

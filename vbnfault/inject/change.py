@@ -113,4 +113,8 @@ def _through_sensor(picture: Picture, development: Development, draws: Draws, af
     added = sensor.device.expected_e(light, exposure_s, acts) - sensor.device.expected_e(light, exposure_s)
     added = np.maximum(added, 0).astype(np.float32)
     noise = poisson(added, draw_normals(added.shape, rng("inject", "charge"))) - added
-    return picture.spread((with_it - without) / np.float32(plain.sensor.readout.system_gain_dn_per_e) + noise)
+    change = (with_it - without) / np.float32(plain.sensor.readout.system_gain_dn_per_e) + noise
+    # the difference lacks what the plain sensor adds to the image, but a saturated pixel is white
+    room = sample(picture.electrons.white_e - picture.electrons.array, sensor.sensor.pattern)
+    full = (with_it >= sensor.device.saturated_dn) & (with_it != without)
+    return picture.spread(np.where(full, np.maximum(change, room), change))

@@ -256,7 +256,9 @@ def read_image(path: Path) -> ImageFile:
     """Return the image of a file. Raises InputError, which names the file, if it cannot be used."""
     kind = _kind(path)
     if kind is None:
-        raise InputError(f"{path}: must end with one of {', '.join(ENDINGS)}")
+        lossy = path.suffix.lower() in (".jpg", ".jpeg", ".webp")
+        why = "; its compression would change every pixel again, so save it as PNG or TIFF" if lossy else ""
+        raise InputError(f"{path}: must end with one of {', '.join(ENDINGS)}{why}")
     try:
         return kind(path)
     except InputError as error:

@@ -28,7 +28,7 @@ from ..scene.config import Scene, configure_faults, load_scene, parse_scene
 from ..scene.instrument import CameraTable, ImageTable
 from ..world import cameras, ephemeris
 from .change import struck
-from .picture import Picture
+from .picture import Picture, check_levels
 from .response import Response
 from .sun import sun_direction
 
@@ -36,6 +36,10 @@ F32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 _LEAST_PX = 16
+_UNSEEN = (
+    "changes nothing in any of its draws; it is too weak here, or other faults hide it, as by turning all white"
+)
+_MUCH_LONGER = 30.0  # exposure over that of sunlit ground, from which a person should know
 _ROUNDING_DN = 2.0  # a larger change of the model's image of 8 bits shows in any image
 
 
@@ -95,6 +99,11 @@ class Injected:
     response: Response | None = None
     sun_xy_px: NDArray[np.float64] | None = None
     assumptions: tuple[str, ...] = ()
+
+    def white_fraction(self, image: NDArray[Any]) -> float:
+        """Return the fraction of an image's numbers that are white, of one like `image` or `clean`."""
+        white = 255.0 if self.response is None else self.response.white_dn
+        return float(np.mean(image >= white))
 
 
 class _ImageDevelopment(Development):
@@ -157,7 +166,12 @@ class Injector:
             source, scene = str(scene), load_scene(scene)
         self.scene, self.source, self.effects = scene, source, effects
         self.faults = configure_faults(scene, source)
-        self._cameras: dict[tuple[tuple[int, int], bool], Camera] = {}
+        table = scene.image or ImageTable()
+        if not self.faults and not table.noise_free:
+            raise InputError(f"{source}: [faults] names no class, so no image would change; `vbnfault list faults`")
+        if table.black_dn is not None and table.white_dn is not None:
+            check_levels(table.black_dn, table.white_dn)
+        self._cameras: dict[tuple[tuple[int, int], bool], tuple[Camera, tuple[str, ...]]] = {}
         self._shared: tuple[Any, SharedResults] | None = None
 
     def __call__(
@@ -224,7 +238,9 @@ class Injector:
         draws, result, electrons = drawn, None, None
         if picture is not None:
             draws, (result, electrons) = self._struck(picture, development, drawn, of)
-            left_out |= {name: "changes no number of the image" for name in drawn if name not in draws}
+            left_out |= {
+                name: "changes no number of the image; it is too weak here" for name in drawn if name not in draws
+            }
         labels = self._labels(Injection(draws=draws, development=development))
         nothing = np.zeros(known.shape, dtype=bool)
         effects = np.array([labels.effects.get(name, nothing) for name in self.faults], dtype=bool)
@@ -290,7 +306,7 @@ class Injector:
         if not self.effects:
             return draw_faults(drawing, development, possible, {}, 0), left_out
         draws = visible_draws(drawing, development, possible, stored=True)
-        unseen = {name: "no draw of it changes the image" for name in possible if name not in draws}
+        unseen = {name: _UNSEEN for name in possible if name not in draws}
         return draws, {**left_out, **unseen}
 
     # --- camera and Sun ------------------------------------------------------------------------------------------
@@ -318,23 +334,35 @@ class Injector:
                 table.model_copy(update={"width_px": width, "height_px": height}),
                 GreyDetector if grey else ThreeColourDetector,
             )
-        camera = self._cameras[shape, grey]
-        if table.exposure_s == "auto":
-            assumed.append(
-                f"camera.exposure_s = {camera.exposure_s:.3g}: assumed, as ground of body.reflectance lit at 45 "
-                "degrees is metered"
-            )
-        return camera, assumed
+        camera, of_exposure = self._cameras[shape, grey]
+        return camera, [*assumed, *of_exposure]
 
-    def _made_camera(self, table: CameraTable, generic: type[ThreeColourDetector]) -> Camera:
-        """Return the camera of a table, with its exposure; `generic` is as in `cameras.base_camera`."""
+    def _made_camera(
+        self, table: CameraTable, generic: type[ThreeColourDetector]
+    ) -> tuple[Camera, tuple[str, ...]]:
+        """Return the camera of a table with its exposure, and a sentence where this is assumed, or far too long.
+
+        `generic` is as in `cameras.base_camera`.
+        """
         scene = self.scene.model_copy(update={"camera": table})
         camera = cameras.base_camera(scene, generic=generic)
-        exposure_s = table.exposure_s
-        if exposure_s == "auto":
-            reference_s = reference_exposure_s(scene, camera)
+        reference_s = reference_exposure_s(scene, camera)
+        said: tuple[str, ...] = ()
+        if table.exposure_s == "auto":
             exposure_s = float(np.clip(reference_s, table.exposure_min_s, table.exposure_max_s))
-        return replace(camera, exposure_s=float(exposure_s))
+            said = (
+                f"camera.exposure_s = {exposure_s:.3g}: assumed, as ground of body.reflectance lit at 45 "
+                "degrees is metered",
+            )
+            return replace(camera, exposure_s=exposure_s), said
+        exposure_s = float(table.exposure_s)
+        if exposure_s > _MUCH_LONGER * reference_s:
+            said = (
+                f"camera.exposure_s = {exposure_s:g}: taken as given; sunlit ground of body.reflectance would need "
+                f"{reference_s:.2g} s, so if camera.f_number or camera.transmission is wrong, sunlight on dust and "
+                f"in the lens is up to {exposure_s / reference_s:.0f} times too bright",
+            )
+        return replace(camera, exposure_s=exposure_s), said
 
     def _context(
         self, camera: Camera, sun: str | Sequence[float] | None, depth_m: Any, picture: Picture | None
@@ -367,7 +395,7 @@ class Injector:
     def _impossible(self, names: Sequence[str], context: FaultContext) -> dict[str, str]:
         """Return why some of the classes cannot act on an image."""
         dark = [name for name in names if self.faults[name].needs_sun and context.sun_xy_px is None]
-        return dict.fromkeys(dark, "needs the Sun before the camera; give it by image.sun or --sun")
+        return dict.fromkeys(dark, "needs the Sun before the camera; give its position: image.sun, --sun or sun=")
 
 
 def _development(
@@ -427,6 +455,8 @@ def inject(
 
 def _checked_array(image: Any) -> NDArray[Any]:
     """Return an image as an array. Raises InputError if it has another shape or data type than an image."""
+    if image is None or isinstance(image, str | Path):
+        raise InputError(f"image: is {image!r} and no array; was the file read?")
     array = np.asarray(image)
     if array.ndim == 3 and array.shape[2] == 1:
         array = array[..., 0]

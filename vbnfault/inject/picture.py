@@ -193,6 +193,12 @@ def levels(numbers: NDArray[Any], response: Response) -> NDArray[np.uint8]:
     return np.ascontiguousarray(eight)
 
 
+def check_levels(black_dn: float, white_dn: float) -> None:
+    """Raise InputError unless white is above black."""
+    if white_dn <= black_dn:
+        raise InputError(f"image.white_dn = {white_dn:g}: must be above image.black_dn = {black_dn:g}")
+
+
 def _response(
     dtype: np.dtype[Any], table: ImageTable, camera: Camera, *, raw: bool
 ) -> tuple[Response, tuple[str, ...]]:
@@ -213,8 +219,10 @@ def _response(
         assumed.append(f"image.white_dn = {white:g}: " + ("the sensor's white" if raw else "assumed"))
     if "response" not in table.model_fields_set:
         assumed.append("image.response = 'linear': assumed")
-    if white <= black:
-        raise InputError(f"image.white_dn = {white:g}: must be above image.black_dn = {black:g}")
+    check_levels(black, white)
+    largest = np.iinfo(dtype).max if dtype.kind in "ui" else np.inf
+    if white > largest:
+        raise InputError(f"image.white_dn = {white:g}: must be at most {largest}, the largest number of this image")
     curve = None if table.response != "table" else read_table(table.response_file)
     return (
         Response(black_dn=black, white_dn=white, curve=table.response, gamma=table.gamma, table=curve),

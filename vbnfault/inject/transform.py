@@ -118,7 +118,9 @@ class Inject:
         changed, masks = np.empty_like(given), np.empty((len(given), len(self.classes), *given.shape[2:]), bool)
         places = [self._sun] * len(given) if suns is None else [self._sun if s is None else s for s in suns]
         if not len(given) == len(numbers) == len(places):
-            raise InputError(f"{len(given)} images: {len(numbers)} numbers and {len(places)} Suns; must be as many")
+            raise InputError(
+                f"{len(given)} images: {len(numbers)} numbers and {len(places)} Suns; must be one for each image"
+            )
         self.left_out = {}
         for planes, out, mask, number, sun in zip(given, changed, masks, numbers, places, strict=True):
             result = self._injected(cv2.merge(list(planes)), int(number), sun)

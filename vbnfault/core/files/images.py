@@ -72,19 +72,26 @@ def png_numbers(data: bytes, most_values: int) -> NDArray[Any]:
         check_values(rows, columns, _PNG_CHANNELS.get(data[25:26], 1), most_values)
         if data[25:26] == b"\3" or data[24] < 8:
             raise InputError("is a PNG file with a palette or packed bits; save it as grey or RGB of 8 or 16 bits")
+    if not data.startswith(_PNG):
+        raise InputError("is no PNG file, whatever its name says")
     chunks = _chunks(data)
     image = cv2.imdecode(np.frombuffer(chunks, np.uint8), cv2.IMREAD_UNCHANGED) if chunks else None
     if image is None:
         raise InputError("is a damaged PNG file")
+    if data[25:26] == b"\4":  # grey with alpha, of which OpenCV makes B, G, R and alpha
+        return np.ascontiguousarray(image[..., [0, 3]])
     return np.ascontiguousarray(np.atleast_3d(_swapped(image)))
 
 
 def with_png_numbers(data: bytes, numbers: NDArray[Any], text: str) -> bytes:
     """Return a PNG file with other numbers [y, x, channel], the chunks of the former one, and a text chunk."""
-    done, encoded_data = cv2.imencode(".png", np.ascontiguousarray(_swapped(numbers)))
-    if not done:
-        raise VbnfaultError("the image cannot be encoded as PNG")
-    body = encoded_data.tobytes()
+    if numbers.shape[2] == 2:
+        body = _grey_with_alpha(numbers)
+    else:
+        done, encoded_data = cv2.imencode(".png", np.ascontiguousarray(_swapped(numbers)))
+        if not done:
+            raise VbnfaultError("the image cannot be encoded as PNG")
+        body = encoded_data.tobytes()
     head = body.index(b"IDAT") - 4
     kept, start = [], len(_PNG)
     while start + 12 <= len(data):
@@ -95,6 +102,18 @@ def with_png_numbers(data: bytes, numbers: NDArray[Any], text: str) -> bytes:
     words = b"vbnfault\0" + text.encode("latin-1", "replace")
     note = struct.pack(">I4s", len(words), b"tEXt") + words + struct.pack(">I", zlib.crc32(b"tEXt" + words))
     return body[:head] + b"".join(kept) + note + body[head:]
+
+
+def _grey_with_alpha(numbers: NDArray[Any]) -> bytes:
+    """Return a PNG file of grey and alpha, uint8 or uint16 [y, x, 2], which OpenCV does not write."""
+    height, width, _ = numbers.shape
+    rows = numbers.astype(numbers.dtype.newbyteorder(">")).view(np.uint8).reshape(height, -1)
+    lines = np.concatenate([np.zeros((height, 1), np.uint8), rows], axis=1)  # each begins with its filter: none
+    header = struct.pack(">IIBBBBB", width, height, 8 * numbers.itemsize, 4, 0, 0, 0)
+    out = _PNG
+    for kind, content in ((b"IHDR", header), (b"IDAT", zlib.compress(lines.tobytes())), (b"IEND", b"")):
+        out += struct.pack(">I4s", len(content), kind) + content + struct.pack(">I", zlib.crc32(kind + content))
+    return out
 
 
 def read_exr(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:

@@ -197,7 +197,7 @@ def _check_kind(page: TiffPage) -> None:
     is_grey_and_more = page.photometric != _RGB and extra and not (extra == 1 and _has_alpha(page))
     wrong = None
     if page.photometric not in (_WHITE_IS_0, _GREY, _RGB, _PALETTE):
-        wrong = f"colours of the kind {_name(page.photometric)}; must be grey or RGB"
+        wrong = f"colours of the kind {_name(page.photometric)} (SEPARATED is CMYK); must be grey or RGB"
     elif page.compression not in (_NONE, _LZW, *_DEFLATE, _PACKBITS, _LZMA):
         wrong = f"the compression {_name(page.compression)}; must be none, LZW, PackBits, deflate or LZMA"
     elif page.sampleformat not in (1, 2, 3) or max(map(len, widths)) > 1:
