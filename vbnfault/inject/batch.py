@@ -337,7 +337,7 @@ def inject_files(
     scene = scene.model_copy(update={"dataset": dataset, "plan": _plan(scene)})
     batch = Batch(scene=scene, sources=sources, names=names, out=out, states=states, sun=sun)
     options = build.BuildOptions(workers=workers, progress=progress)
-    batch.injector  # noqa: B018  an unusable scene is reported before any image
+    batch.injector.require_faults()  # an unusable scene is reported before any image
     if labels == "zarr":
         _build(batch, options)
     else:

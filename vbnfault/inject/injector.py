@@ -167,12 +167,17 @@ class Injector:
         self.scene, self.source, self.effects = scene, source, effects
         self.faults = configure_faults(scene, source)
         table = scene.image or ImageTable()
-        if not self.faults and not table.noise_free:
-            raise InputError(f"{source}: [faults] names no class, so no image would change; `vbnfault list faults`")
         if table.black_dn is not None and table.white_dn is not None:
             check_levels(table.black_dn, table.white_dn)
         self._cameras: dict[tuple[tuple[int, int], bool], tuple[Camera, tuple[str, ...]]] = {}
         self._shared: tuple[Any, SharedResults] | None = None
+
+    def require_faults(self) -> None:
+        """Raise InputError if no image would change, since there are no faults and the camera adds no noise."""
+        if not self.faults and not (self.scene.image or ImageTable()).noise_free:
+            raise InputError(
+                f"{self.source}: [faults] names no class, so no image would change; `vbnfault list faults`"
+            )
 
     def __call__(
         self,
@@ -450,6 +455,7 @@ def inject(
     if isinstance(camera, Mapping):
         tables["camera"] = dict(camera)
     injector = Injector(parse_scene(tables, source="inject"), source="inject")
+    injector.require_faults()
     return injector(image, sun=sun, camera=camera if isinstance(camera, Camera) else None, **known)
 
 
