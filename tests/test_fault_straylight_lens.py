@@ -106,6 +106,19 @@ def test_light_follows_sun_exposure_and_coating() -> None:
     assert np.median(dirty[far]) > np.median(base[far])
 
 
+@pytest.mark.parametrize("model", ["paraxial", "traced"])
+def test_a_filter_before_the_lens_dims_all_straylight(model: str) -> None:
+    """A filter of 1/20 leaves 1/20 of ghosts, starburst, glare and veil; both lenses lose more than the traced one."""
+    where = context()
+    lens = where.camera.lens
+    added = [
+        light(model, replace(where, camera=replace(where.camera, lens=replace(lens, transmission=t))))[0]
+        for t in (0.2, 0.01)
+    ]
+    assert added[0].max() > 0
+    np.testing.assert_allclose(added[1], added[0] / 20, rtol=1e-4, atol=1e-6 * added[0].max())
+
+
 def test_no_sun_no_light() -> None:
     for where in (context(None), context(sun_visible_fraction=0.0)):
         added, params = light("traced", where)

@@ -714,3 +714,12 @@ def test_light_that_saturates_the_sensor_is_white(detector: str) -> None:
     result = vbnfault.inject(image, {"straylight": {"model": "traced"}}, camera=camera, sun=(40.0, 20.0))
     assert (result.image == 255).all()
     assert (result.white_fraction(result.image), result.white_fraction(result.clean)) == (1, 0)
+
+
+def test_masks_of_an_earlier_run_go_with_their_faults(tmp_path: Path) -> None:
+    pictures, out = _pictures(tmp_path / "in", 2), tmp_path / "out"
+    for classes in (("dust_on_optics", "vignetting"), ("vignetting",)):
+        tables = {"title": "own", "camera": CAMERA, "faults": {name: {} for name in classes}}
+        inject_files([pictures], Scene.model_validate(tables), out, progress=False)
+        names = {path.name.partition(".png_")[2] for path in (out / "masks").iterdir()}
+        assert names == {f"{name}.png" for name in (*classes, "any")}

@@ -138,6 +138,14 @@ class Batch:
         except (OSError, ValueError, KeyError, TypeError):
             return False
 
+    def _files_of_before(self, label: Path) -> list[str]:
+        """Return the masks and images that the JSON file of an earlier run lists, as far as they lie in `out`."""
+        try:
+            files = json.loads(label.read_text(encoding="utf-8"))["files"]
+            return [f for f in files if PurePosixPath(f).parts[0] in ("masks", "clean") and ".." not in f]
+        except (OSError, ValueError, KeyError, TypeError, IndexError, AttributeError):
+            return []
+
     def injected(self, index: int) -> tuple[ImageFile, Injected]:
         """Return an image and its result. Raises InputError, with the name of the file, if it cannot be used."""
         path = self.sources[index]
@@ -177,6 +185,8 @@ class Batch:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 write_png(path, mask.astype(np.uint8) * 255)
             label = self.label_file(index)
+            for old in set(self._files_of_before(label)) - set(files):  # masks of classes that are no longer in it
+                own(self.out / old).unlink(missing_ok=True)
             label.parent.mkdir(parents=True, exist_ok=True)
             content = {
                 "image": name,
@@ -185,6 +195,7 @@ class Batch:
                 "input": self.key(index),
                 "injected": names,
                 "left_out": result.left_out,
+                "sun_xy_px": None if result.sun_xy_px is None else result.sun_xy_px.tolist(),
                 "parameters": result.parameters,
                 "unrecoverable_fraction": float(result.unrecoverable.mean()),
                 "white_fraction": [result.white_fraction(result.clean), result.white_fraction(result.image)],

@@ -67,13 +67,13 @@ def png_numbers(data: bytes, most_values: int) -> NDArray[Any]:
 
     Raises InputError if it is damaged, too large, has a palette or fewer than 8 bits.
     """
+    if not data.startswith(_PNG):
+        raise InputError("is no PNG file, whatever its name says")
     if len(data) >= 26:
         columns, rows = struct.unpack(">II", data[16:24])
         check_values(rows, columns, _PNG_CHANNELS.get(data[25:26], 1), most_values)
         if data[25:26] == b"\3" or data[24] < 8:
             raise InputError("is a PNG file with a palette or packed bits; save it as grey or RGB of 8 or 16 bits")
-    if not data.startswith(_PNG):
-        raise InputError("is no PNG file, whatever its name says")
     chunks = _chunks(data)
     image = cv2.imdecode(np.frombuffer(chunks, np.uint8), cv2.IMREAD_UNCHANGED) if chunks else None
     if image is None:

@@ -8,7 +8,8 @@ mount, barrel and edges scatter (veil) is part of P. It is subtracted from the d
 
 each on the whole sensor plane, inside and outside the frame. Ghosts are part of the light that surfaces reflect,
 which T already excludes. Only where the image path has lost less than the ghosts contain (a thin lens without
-losses), the rest of the ghosts is subtracted from the direct image too.
+losses), the rest of the ghosts is subtracted from the direct image too. Where the image path loses more than the
+lens whose ghosts are traced, a filter before the lens takes the rest, from the ghosts as well.
 
 An extended scene follows the same rule where its effect is visible: the image loses the fraction that surfaces,
 mount, barrel and edges scatter, and all of it returns as a veil. Diffraction and ghosts of the scene stay in its
@@ -150,7 +151,7 @@ class SunStraylight:
     ghosts, starburst
         The light over the Sun's irradiance at the entrance.
     ghost_gain
-        Fraction of the ghosts that a baffle leaves.
+        float64[band]: fraction of the ghosts that a baffle leaves, and a filter before the lens.
     layout, glare, veil
         Steps of the scattered light on the sensor, what surfaces scatter, float32[band, step], and the veil on the
         axis, float32[band]. On the sensor both have the factor cos⁴.
@@ -164,7 +165,7 @@ class SunStraylight:
 
     ghosts: SpreadLight
     starburst: SpreadLight
-    ghost_gain: float
+    ghost_gain: F64
     layout: GlareLayout
     glare: F32
     veil: F32
@@ -195,7 +196,7 @@ class SunStraylight:
         """Return ghosts, starburst, glare and veil in a second, float32[band, y, x] each."""
         by_band, cos4 = self.rates[:, None, None].astype(np.float32), self.layout.cos4
         return {
-            "ghosts": self.ghosts.planes * (by_band * np.float32(self.ghost_gain)),
+            "ghosts": self.ghosts.planes * (by_band * self.ghost_gain[:, None, None].astype(np.float32)),
             "starburst": self.starburst.planes * by_band,
             "glare": self.glare[:, self.layout.steps] * cos4 * by_band,
             "veil": self.veil[:, None, None] * cos4 * by_band,
@@ -282,19 +283,20 @@ class SunInLens:
             glare, _scattering(lens), bands, settings.cleanliness, sun.angle_deg, layout
         )
         glare_gain = lit * passed / bands.mean(own) * kept_of_single
+        ghost_gain = past_baffle * np.minimum(passed / bands.mean(own), 1)
         veil_mm2 = lit * passed * pupil_mm2 * settings.veil_fraction
         taken = (layout.flux_mm2(table) + beyond) * glare_gain + veil_mm2
         taken = taken + starburst_.flux_mm2 + starburst_.beyond_mm2
         return SunStraylight(
             ghosts=ghosts_,
             starburst=starburst_,
-            ghost_gain=past_baffle,
+            ghost_gain=ghost_gain,
             layout=layout,
             glare=table * glare_gain[:, None].astype(np.float32),
             veil=(veil_mm2 * (1 / (np.pi * efl_mm**2))).astype(np.float32),
             glare_beyond_mm2=beyond * glare_gain,
             rates=np.ones(len(bands)) if rates is None else rates,
-            direct_fraction=_direct_fraction(passed, path.admitted_mm2, ghosts_.flux_mm2 * past_baffle, taken),
+            direct_fraction=_direct_fraction(passed, path.admitted_mm2, ghosts_.flux_mm2 * ghost_gain, taken),
         )
 
 
