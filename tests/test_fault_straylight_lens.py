@@ -108,7 +108,7 @@ def test_light_follows_sun_exposure_and_coating() -> None:
 
 @pytest.mark.parametrize("model", ["paraxial", "traced"])
 def test_a_filter_before_the_lens_dims_all_straylight(model: str) -> None:
-    """A filter of 1/20 leaves 1/20 of ghosts, starburst, glare and veil; both lenses lose more than the traced one."""
+    """A filter of 1/20 leaves 1/20 of ghosts, starburst, glare and veil; both lose more than the traced lens."""
     where = context()
     lens = where.camera.lens
     added = [
