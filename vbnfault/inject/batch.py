@@ -49,9 +49,9 @@ Labels = Literal["png", "zarr"]
 
 STORE = "dataset.zarr"
 _LAYERS = ("clean", "mask_effect")
-# Least memory for a pixel of a grey image and for each number of a colour image. Measured at the peak, less that of
-# Python: 144 of grey and 276 of colours with dust alone, 153 with dust and hot pixels, 600 with the six faults of
-# physical67p.
+# Least memory for a pixel of a grey image, and for each number of a colour image. What was measured for a pixel at
+# the peak, less the memory of Python: 144 bytes (grey) and 276 bytes (colours) with dust alone, 153 bytes (grey)
+# with dust and hot pixels, 600 bytes with the six faults of physical67p.
 _GREY_BYTES, _COLOUR_BYTES = 140, 90
 _EVERY = (*ENDINGS, *FILMS)
 _MUCH_WHITE = 0.1  # fraction of pixels that turn white, from which a person should know
@@ -110,8 +110,10 @@ class Batch:
 
     def report(self) -> list[str]:
         """Return sentences on what was made, from the files of the images: assumptions, each once, and classes."""
-        labels = [self.label_file(index) for index in range(len(self.names))]
-        made = [json.loads(path.read_text(encoding="utf-8")) for path in labels if path.is_file()]
+        paths = filter(Path.is_file, map(self.label_file, range(len(self.names))))
+        labels = (json.loads(path.read_text(encoding="utf-8")) for path in paths)
+        told = ("assumptions", "injected", "left_out", "white_fraction")
+        made = [{key: label[key] for key in told} for label in labels]  # parameters of many images fill the memory
         lines = list(dict.fromkeys(text for label in made for text in label["assumptions"]))
         for name in self.injector.faults:
             reasons = Counter(label["left_out"][name] for label in made if name in label["left_out"])
@@ -206,7 +208,7 @@ class Batch:
 
 
 def _check_memory(numbers: NDArray[Any]) -> None:
-    """Raise InputError if not even the least that an image needs is free: the system would end the process."""
+    """Raise InputError if less memory is free than an image needs at least; the system would end the process."""
     import psutil
 
     needed = numbers.size * (_GREY_BYTES if numbers.ndim == 2 else _COLOUR_BYTES)

@@ -345,7 +345,7 @@ class Injector:
     def _made_camera(
         self, table: CameraTable, generic: type[ThreeColourDetector]
     ) -> tuple[Camera, tuple[str, ...]]:
-        """Return the camera of a table with its exposure, and a sentence where this is assumed, or far too long.
+        """Return the camera of a table, and a sentence where its exposure is assumed or would be far too long.
 
         `generic` is as in `cameras.base_camera`.
         """
