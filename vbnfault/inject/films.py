@@ -66,8 +66,8 @@ class Film:
 def unpack(path: Path, folder: Path, most_values: int) -> Film:
     """Write the frames of a film as PNG, `000001.png` and so on, and return what the film is.
 
-    Frames that an earlier call wrote of the same file are kept. Raises InputError if the file cannot be read at all,
-    or PyAV is not installed.
+    Frames that an earlier call wrote of the same file are kept. Raises InputError if the file cannot be read at
+    all, or PyAV is not installed.
     """
     av = _av()
     sha256 = user_files.sha256_of_input(path, "film")
