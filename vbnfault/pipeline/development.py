@@ -278,12 +278,14 @@ class Development:
         with_it = self.image(draws, noisy=False).array
         return masks.effect(with_it, self.read_out(before, others).array, least_dn)
 
-    def effect_on(self, rows: slice, draws: Draws, name: str, least_dn: float) -> Mask:
-        """Return `effect` of a local fault on some rows, bool[row, x], before the faults that act on the image."""
+    def effects_on(self, rows: slice, draws: Draws, least_dn: Mapping[str, float]) -> dict[str, Mask]:
+        """Return `effect` of local faults on some rows, bool[row, x], before the faults that act on the image."""
         whole, camera = self.signal(draws, acting_at(draws, "electrons")).merged, self.exposure.camera
-        signals = [s.with_array(np.ascontiguousarray(s.array[rows])) for s in (whole, self._part(draws, name))]
-        images = [camera.detector.develop(signal, camera.exposure_s, None).array for signal in signals]
-        return masks.effect(images[0], images[1], least_dn)
+        signals = [whole, *(self._part(draws, name) for name in least_dn)]
+        stacked = whole.with_array(np.concatenate([signal.array[rows] for signal in signals]))
+        developed = camera.detector.develop(stacked, camera.exposure_s, None).array
+        with_all, *lacking = np.split(developed, len(signals))
+        return {name: masks.effect(with_all, image, least_dn[name]) for name, image in zip(least_dn, lacking)}
 
     def _part(self, draws: Draws, name: str) -> Electrons:
         """Return the expected electrons without one drawn fault."""

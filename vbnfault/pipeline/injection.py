@@ -169,13 +169,13 @@ def _seen_on_some_rows(development: Development, draws: Draws) -> set[str]:
         if footprint is None:
             return set()
         overwritten |= footprint[rows]
-    seen = set()
-    for name in acting_at(draws, "electrons"):
-        if development.is_local(draws, name) and not informs(draws[name].fault):
-            level = max(draws[name].fault.effect_level_dn, _MORE_THAN_ROUNDING_DN)
-            if (development.effect_on(rows, draws, name, level) & ~overwritten).any():
-                seen.add(name)
-    return seen
+    least_dn = {
+        name: max(draws[name].fault.effect_level_dn, _MORE_THAN_ROUNDING_DN)
+        for name in acting_at(draws, "electrons")
+        if development.is_local(draws, name) and not informs(draws[name].fault)
+    }
+    effects = development.effects_on(rows, draws, least_dn) if least_dn else {}
+    return {name for name, effect in effects.items() if (effect & ~overwritten).any()}
 
 
 def _is_invisible(development: Development, draws: Draws, name: str) -> bool:
