@@ -285,7 +285,10 @@ class Development:
         stacked = whole.with_array(np.concatenate([signal.array[rows] for signal in signals]))
         developed = camera.detector.develop(stacked, camera.exposure_s, None).array
         with_all, *lacking = np.split(developed, len(signals))
-        return {name: masks.effect(with_all, image, least_dn[name]) for name, image in zip(least_dn, lacking)}
+        return {
+            name: masks.effect(with_all, image, least_dn[name])
+            for name, image in zip(least_dn, lacking, strict=True)
+        }
 
     def _part(self, draws: Draws, name: str) -> Electrons:
         """Return the expected electrons without one drawn fault."""
