@@ -272,9 +272,7 @@ def same_distribution(ours: NDArray[Any], theirs: NDArray[Any]) -> bool:
 
 @pytest.mark.parametrize("name", ["parallel", "serial"])
 @pytest.mark.parametrize("release_time_s", [4e-4, 2e-3, 1e-2])
-def test_charge_transfer_where_two_models_meet(
-    pyxel: Any, name: str, release_time_s: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_charge_transfer_where_two_models_meet(pyxel: Any, name: str, release_time_s: float) -> None:
     """CDM (Short et al. 2013, MNRAS 430, 3078) and ours (ArCTIC's) have an exact limit in common.
 
     CDM counts the traps of a column in one pool, of which a packet S_i fills what is free of γ i S_i^β. Ours
@@ -286,7 +284,6 @@ def test_charge_transfer_where_two_models_meet(
     """
     from pyxel.models.charge_transfer import cdm
 
-    monkeypatch.setattr("vbnfault.detector.charge._TRAIL_LEFT_OUT", 1e-9)
     transfer_s, power, well_e, pool, volume_cm3 = 1e-3, 0.6, 1e6, 20.0, 1e-10
     stay = np.exp(-transfer_s / release_time_s)
     image = np.zeros((60, 4), np.float32)

@@ -136,7 +136,12 @@ class Device:
         self.sensor, self.seed, self.direction = sensor, seed, direction
         self.shape = (sensor.height_px, sensor.width_px) if shape is None else shape
         self.temperature_K = sensor.temperature_K if temperature_K is None else temperature_K
-        bare = replace(sensor, readout=ReadoutSpec(nodes=sensor.readout.nodes), effects=())
+        bare = replace(
+            sensor,
+            readout=ReadoutSpec(nodes=sensor.readout.nodes),
+            transfer=replace(sensor.transfer, parallel_traps=(), serial_traps=()),
+            effects=(),
+        )
         self.maps = _maps(bare, seed, self.shape, self.temperature_K, direction)
         self.drawn, self.individual = self.maps.drawn, self.maps.individual
         self.response, self.offset_e = self.maps.response, self.maps.offset_e
@@ -287,15 +292,11 @@ class Device:
         red, green, blue = (scale.get(colour, scale.get("W", full)) for colour in "RGB")
         noise_dn = sensor.readout.read_noise_e_rms * sensor.readout.system_gain_dn_per_e
         linear = demosaic(mosaic, sensor.pattern, sensor.method)
-        linear = bounded_at_edges(
-            linear,
-            mosaic,
-            sensor.pattern,
-            sensor.method,
-            black=black,
-            noise=noise_dn,
-            clipped=mosaic >= self.saturated_dn,
-        )
+        if sensor.pattern.is_bayer and sensor.method != "bilinear":
+            clipped = mosaic >= self.saturated_dn
+            linear = bounded_at_edges(
+                linear, mosaic, sensor.pattern, sensor.method, black=black, noise=noise_dn, clipped=clipped
+            )
         above = cv2.subtract(linear, (black, black, black, 0.0))
         rgb = self._levels(above, (red, green, blue, 0.0))
         out = np.empty((*raw.shape, 4), dtype=np.uint8)

@@ -11,15 +11,17 @@ A direction ("up", "down", "left", "right") says where the charge moves. "up" ha
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from functools import partial
-from typing import TYPE_CHECKING
+import hashlib
+from collections.abc import Callable, Sequence
+from functools import lru_cache, partial
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from ..core.process.llvm import backend, evaluated, flat
 from ..core.tables import table_class
 
 if TYPE_CHECKING:
@@ -29,7 +31,6 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 ROWS_PER_BLOCK = 64  # measured as the fastest for steps on one plane
-_TRAIL_LEFT_OUT = 0.01
 
 
 # ------------------------------------------------------------------------------------------------------ smear
@@ -294,9 +295,9 @@ def cti(
     own pixel. All traps are empty when readout
     starts.
 
-    The computation is an express approximation: a packet's cloud keeps its size (`_clock`). The cost
-    rises with the longest release time. The total charge is conserved, except for charge that is still trapped when
-    the last row has left.
+    The computation is an express approximation: a packet's cloud keeps its size during the pass, instead of
+    shrinking from pixel to pixel. The total charge is conserved, except for charge that is still trapped when the
+    last row has left.
 
     Parameters
     ----------
@@ -309,74 +310,99 @@ def cti(
     """
     species = [s for s in species if s.density_per_px > 0]
     image = _facing(signal_e.copy() if direction == "up" else signal_e, direction)
-    if not species or image.shape[0] == 0:
+    if not species or not image.size:
         return signal_e.copy()
-    trapped = _trapped(species, transfer_s, len(image))
-    density = sum(s.density_per_px for s in species)
-    met = density * (np.arange(len(image)) + 1.0)  # number of traps that a packet passes
-    _clock(image, cloud, (1 / met).astype(np.float32)[:, None], trapped)
-    return _facing(image, direction, back=True)
+    met = sum(s.density_per_px for s in species) * (np.arange(len(image)) + 1.0)  # traps that a packet passes
+    # a cloud meets no more traps than its packet has electrons
+    volume = np.minimum(cloud.volume(image), image * (1 / met).astype(np.float32)[:, None])
+    traps = [(s.density_per_px, float(np.exp(-transfer_s / s.release_time_s))) for s in species]
+    return _facing(_clocked(image, volume, traps), direction, back=True)
 
 
-def _trapped(species: Iterable[TrapSpecies], transfer_s: float, height: int) -> F64:
-    """Return f(j) = Σ ρ exp(−j t/τ), float64[j]: electrons that a pixel's traps hold j transfers after a cloud.
+def _clocked(image: F32, volume: F32, traps: Sequence[tuple[float, float]]) -> F32:
+    """Return the packets, float32[y, x], after one pass of `cti` towards row 0; `volume` are their clouds.
 
-    The trail ends where the fraction `_TRAIL_LEFT_OUT` of the trapped charge is left: f is lowered by a constant to
-    reach 0 there and scaled to keep f(0), so that nothing is lost.
+    `traps` holds the density ρ of each species and the fraction w of its full traps that stay full for a transfer.
+    With V(m, i) the largest cloud among the packets m … i, the traps hold Σ_m V(m, i) ρ wⁱ⁻ᵐ [1 + (1 - w) m]
+    electrons after packet i, which leaves with its charge less the change of that sum over all species.
+
+    Going from a packet to the next one multiplies the sums of V wⁱ⁻ᵐ and m V wⁱ⁻ᵐ by w. Then the new cloud raises V
+    wherever it is the largest so far. V rises with the distance behind packet i in steps, so a stack of steps is
+    kept for each column: a new cloud removes those below its own size and adds one. Each lane goes its own way
+    through a column: a round of the loop either removes a step or lets a packet leave. Sums are in double
+    precision, so that columns that differ in one packet agree again once its trail has ended.
     """
-    f = np.zeros(height + 1)
-    for s in species:
-        f += s.density_per_px * np.exp(-np.arange(height + 1) * (transfer_s / s.release_time_s))
-    window = 1 + int(np.count_nonzero(f[1:] > _TRAIL_LEFT_OUT * f[0]))
-    if window < height:
-        f = (f[: window + 1] - f[window]) * (f[0] / (f[0] - f[window]))
-    return f
+    be = backend()
+    dr, Float, Double, UInt32 = be.dr, be.Float, be.Float64, be.UInt32
+    height, width = image.shape
+    lags = np.arange(height + 2)
+    # sums of wᵏ and k wᵏ over the lags before each
+    sums = [[Double(np.cumsum(k * w**lags) - k * w**lags) for k in (np.ones_like(lags), lags)] for _, w in traps]
+    kept = [dr.opaque(Double, w) for _, w in traps]
+    densities = [[dr.opaque(Double, value) for value in (rho, rho * (1 - w))] for rho, w in traps]
+    packets, clouds, out = Float(flat(image)), Float(flat(volume)), dr.empty(Float, height * width)
+    rows, columns = dr.opaque(UInt32, height), dr.opaque(UInt32, width)
+    column = dr.arange(UInt32, width)
+    deep = 1 << (height - 1).bit_length()  # few sizes, since each has a kernel of its own
+    stack = [dr.alloc_local(kind, deep) for kind in (Float, UInt32)]  # size of a step, and the row where it begins
 
+    def more(row: Any, *_: Any) -> Any:
+        return row < rows
 
-def _clock(image: F32, cloud: ChargeCloud, per_cloud: F32, trapped: F64) -> None:
-    """Run one pass of `cti` towards row 0, in place, in blocks of rows.
+    def turn(
+        row: Any, depth: Any, cloud: Any, step: Any, began: Any, begins: Any, before: Any, held: Any, stack: Any
+    ) -> tuple[Any, ...]:
+        """Remove the last step, of the size `step` from the row `began` on, or let the packet of `row` leave.
 
-    A packet's cloud keeps its size during the pass, instead of shrinking from pixel to pixel. Then the sum over all
-    transfers has a closed form. With V_j(i) the largest cloud among the packets i−j … i and f = `trapped`, the
-    traps hold Σ_j V_j [f(j) + (f(j) − f(j+1)) (i − j)] electrons after packet i. Packet i leaves with its charge
-    plus the change of that sum. `per_cloud` float32[y, 1] limits a cloud to the charge that its packet has.
-    """
-    height = len(image)
-    volume = np.empty(image.shape, dtype=np.float32)
-    held = np.empty(image.shape, dtype=np.float32)
-    released = (trapped[:-1] - trapped[1:]).tolist()
-    f = trapped.tolist()
+        The step of its cloud begins in the row `begins`, and `before` electrons were held after the packet before.
+        """
+        below = (depth > 0) & (step <= cloud)
+        leaves = ~below
+        rise = Double(dr.select(below, cloud - step, 0))
+        near, far, here = row - begins + 1, row - began + 1, row * columns + column
+        raised = []
+        for (total, moment), (of_one, of_lag) in zip(held, sums, strict=True):
+            one, lag = (
+                dr.gather(Double, table, far, below) - dr.gather(Double, table, near, below)
+                for table in (of_one, of_lag)
+            )
+            raised.append((dr.fma(rise, one, total), dr.fma(rise, Double(row) * one - lag, moment)))
+        now = sum(a * total + b * moment for (a, b), (total, moment) in zip(densities, raised, strict=True))
+        # what is below 0 is a rounding error
+        left = dr.maximum(dr.gather(Float, packets, here, leaves) - Float(now - before), 0)
+        dr.scatter(out, left, here, leaves)
+        for memory, value in zip(stack, (cloud, begins), strict=True):
+            memory.write(value, depth, leaves)
+        depth, row = dr.select(leaves, depth + 1, depth - 1), dr.select(leaves, row + 1, row)
+        new = dr.gather(Float, clouds, row * columns + column, leaves & (row < rows))
+        moved = []
+        for w, (total, moment) in zip(kept, raised, strict=True):
+            pair = dr.fma(total, w, Double(new)), dr.fma(moment, w, Double(row) * Double(new))
+            moved.append(tuple(dr.select(leaves, b, a) for a, b in zip((total, moment), pair, strict=True)))
+        older = below & (depth > 0)
+        size, start = (memory.read(depth - 1, older) for memory in stack)
+        return (
+            row,
+            depth,
+            dr.select(leaves, new, cloud),
+            dr.select(leaves, cloud, size),
+            dr.select(leaves, begins, start),
+            dr.select(leaves, row, began),
+            dr.select(leaves, now, before),
+            moved,
+            stack,
+        )
 
-    def fill(rows: slice) -> None:
-        cv2.min(cloud.volume(image[rows]), image[rows] * per_cloud[rows], dst=volume[rows])
-
-    def hold(rows: slice) -> None:
-        start, stop = rows.start, rows.stop
-        largest = volume[rows].copy()
-        total = held[rows]
-        total[:] = 0
-        slope = np.zeros_like(largest)  # the weight of a lag is linear in the row: value and slope from `start` on
-        for j in range(min(len(released), stop)):
-            skip = max(j - start, 0)  # the first rows have no packet j rows ahead
-            part = largest[skip:]
-            if j:
-                np.maximum(part, volume[start + skip - j : stop - j], out=part)
-            cv2.scaleAdd(part, f[j] + released[j] * (start - j), total[skip:], dst=total[skip:])
-            cv2.scaleAdd(part, released[j], slope[skip:], dst=slope[skip:])
-        slope *= np.arange(stop - start, dtype=np.float32)[:, None]
-        total += slope
-
-    def leave(rows: slice) -> None:
-        part = image[rows]
-        part -= held[rows]
-        if rows.start == 0:
-            part[1:] += held[: rows.stop - 1]
-        else:
-            part += held[rows.start - 1 : rows.stop - 1]
-        cv2.max(part, 0.0, dst=part)  # removes rounding errors only
-
-    for step in (fill, hold, leave):
-        by_rows(step, height)
+    first, zero = dr.gather(Float, clouds, column), dr.zeros(Double, width)
+    state = (
+        *(dr.zeros(kind, width) for kind in (UInt32, UInt32)),
+        first,
+        *(dr.zeros(kind, width) for kind in (Float, UInt32, UInt32)),
+        zero,
+    )
+    held = [(Double(first), zero) for _ in traps]
+    dr.while_loop((*state, held, stack), more, turn, mode="symbolic")
+    return evaluated(out).reshape(height, width)
 
 
 def capture(
@@ -444,6 +470,35 @@ def parasitic_light(
 
 
 # ---------------------------------------------------------------------------------------------------- helpers
+
+
+class _Plane:
+    """Hold a plane of electrons, float32[y, x], that equals others with the same bits."""
+
+    def __init__(self, array: F32) -> None:
+        self.array = array
+        bits = hashlib.sha1(np.ascontiguousarray(array).data, usedforsecurity=False)
+        self._key = array.shape, bits.digest()
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Plane) and self._key == other._key
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+
+def remembered(step: Callable[..., F32]) -> Callable[..., F32]:
+    """Return a function that keeps its last four results, for images that share the charge before a step.
+
+    `step` takes a plane of electrons, float32[y, x], and options that can be hashed.
+    """
+
+    @lru_cache(maxsize=4)
+    def made(plane: _Plane, **options: Any) -> F32:
+        array, plane.array = plane.array, np.empty((0, 0), np.float32)  # the plane itself is not kept
+        return step(array, **options)
+
+    return lambda signal_e, **options: made(_Plane(signal_e), **options).copy()
 
 
 def by_rows(step: Callable[[slice], None], height: int) -> None:
