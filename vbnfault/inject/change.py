@@ -107,8 +107,11 @@ def _through_sensor(picture: Picture, development: Development, draws: Draws, af
     plain, sensor = development.exposure.camera.mosaic, development.camera_with(draws).mosaic
     exposure_s, acts = development.exposure.camera.exposure_s, development.acts(draws)
     struck_light = picture.electrons.with_array(np.maximum(after, 0).astype(np.float32))
-    without = plain.raw(picture.electrons, exposure_s, None).astype(np.float32)
-    with_it = sensor.raw(struck_light, exposure_s, None, acts).astype(np.float32)
+    without = development.raw({}, noisy=False).astype(np.float32)
+    if acting_at(draws, "electrons"):  # the light has noise of its own
+        with_it = sensor.raw(struck_light, exposure_s, None, acts).astype(np.float32)
+    else:
+        with_it = development.raw(draws, noisy=False).astype(np.float32)
     light = sample(struck_light.array, sensor.sensor.pattern)
     added = sensor.device.expected_e(light, exposure_s, acts) - sensor.device.expected_e(light, exposure_s)
     added = np.maximum(added, 0).astype(np.float32)

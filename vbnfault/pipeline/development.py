@@ -179,16 +179,13 @@ class Development:
         key = (*self._image_key(draws, noisy), ())
         if key not in self._images:
             camera = self.camera_with(draws)
-            signal = self.signal(draws, acting_at(draws, "electrons"), keep=keep_signals).merged
-            noise = self.noise if noisy else None
-            if noisy and camera.detector.mosaic is not None:
-                raw = camera.mosaic.raw(signal, camera.exposure_s, noise, self.acts(draws))
-                self._raws[key] = raw  # a fifth of the memory of the image, and needed by `raw`
+            if camera.detector.mosaic is not None:
+                raw = self.raw(draws, noisy=noisy, keep=keep_signals)
                 self._images[key] = camera.mosaic.rgbi(raw, camera.exposure_s)
             else:
-                self._images[key] = camera.detector.develop(
-                    signal, camera.exposure_s, noise, self.acts(draws), self._clean(draws, noisy)
-                )
+                signal = self.signal(draws, acting_at(draws, "electrons"), keep=keep_signals).merged
+                noise, clean = self.noise if noisy else None, self._clean(draws, noisy)
+                self._images[key] = camera.detector.develop(signal, camera.exposure_s, noise, base=clean)
         return self._images[key]
 
     def _clean(self, draws: Draws, noisy: bool) -> tuple[Electrons, RGBI] | None:
@@ -229,10 +226,21 @@ class Development:
             for step in MOSAIC_STEPS
         }
 
-    def raw(self, draws: Draws) -> NDArray[np.uint16]:
-        """Return the raw mosaic of the image, uint16[y, x], before the faults that act on the finished image."""
-        self._before_readout(draws, noisy=True)
-        return self._raws[(*self._image_key(draws, True), ())]
+    def raw(self, draws: Draws, *, noisy: bool = True, keep: bool = True) -> NDArray[np.uint16]:
+        """Return the raw mosaic of the image, uint16[y, x], before the faults that act on the finished image.
+
+        It is kept, as are the signals that lead to it, if `keep` is set.
+        """
+        key = self._image_key(draws, noisy)
+        raw = self._raws.get(key)
+        if raw is None:
+            camera = self.camera_with(draws)
+            signal = self.signal(draws, acting_at(draws, "electrons"), keep=keep).merged
+            noise = self.noise if noisy else None
+            raw = camera.mosaic.raw(signal, camera.exposure_s, noise, self.acts(draws))
+            if keep:
+                self._raws[key] = raw
+        return raw
 
     def defects(self, draws: Draws) -> NDArray[np.uint8]:
         """Return the defects of the mosaic's pixels, uint8[y, x]: those of the device and those of the faults."""
