@@ -283,6 +283,45 @@ def test_cti_against_a_register_clocked_trap_by_trap() -> None:
     np.testing.assert_allclose(got, truth, rtol=0, atol=2e-3 * effect)
 
 
+def test_cti_of_slow_traps_is_the_sum_over_all_clouds() -> None:
+    # traps hold Σ_m V(m, i) Σ_s ρ wⁱ⁻ᵐ [1 + (1 - w) m] after packet i, with V the largest cloud of packets m … i
+    image = np.concatenate([scene(6, (200, 4)), np.linspace(9000, 10, 200 * 4, dtype=np.float32).reshape(200, 4)])
+    species = [TrapSpecies(density_per_px=r, release_time_s=t) for r, t in ((0.8, 0.7), (2.0, 40.0), (1.0, 1e5))]
+    got = cti(image, species, cloud=CLOUD, transfer_s=1.0)
+    met = 3.8 * (np.arange(len(image)) + 1)[:, None]
+    volume = np.minimum(CLOUD.volume(image), image / met).astype(np.float64)
+    held = np.zeros(image.shape)
+    for i in range(len(image)):
+        m = np.arange(i, -1, -1)
+        largest = np.maximum.accumulate(volume[m], axis=0)
+        for s in species:
+            w = np.exp(-1 / s.release_time_s)
+            held[i] += (s.density_per_px * w ** (i - m) * (1 + (1 - w) * m)) @ largest
+    expected = np.maximum(image - np.diff(held, axis=0, prepend=0), 0)
+    assert np.abs(expected - image).max() > 100
+    # clouds are float32: 3e-8 of what 400 rows' traps hold at most (1500 e), and packets round to 5e-4 of 10 000 e
+    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-3)
+
+
+def test_remembered_steps_run_once_for_equal_planes_and_give_copies() -> None:
+    calls = []
+
+    def double(plane: np.ndarray, *, offset: float) -> np.ndarray:
+        calls.append(offset)
+        return 2 * plane + np.float32(offset)
+
+    step, plane = charge.remembered(double), scene(7)
+    first = step(plane, offset=1.0)
+    first[:] = 0  # a later step may change it
+    np.testing.assert_array_equal(step(plane.copy(), offset=1.0), 2 * plane + 1)
+    assert calls == [1.0]
+    plane[0, 0] += 1
+    assert step(plane, offset=1.0)[0, 0] == 2 * plane[0, 0] + 1
+    step(plane.reshape(1, -1), offset=1.0)
+    step(plane, offset=2.0)
+    assert calls == [1.0, 1.0, 1.0, 2.0]
+
+
 def test_cti_of_one_bright_row_by_hand() -> None:
     image = np.zeros((60, 1), np.float32)
     image[9] = 20_000.0
