@@ -247,19 +247,23 @@ def poisson(mean: F32, normal: NormalField) -> F32:
     in the kernel takes longer than all of its arithmetic.
     """
     be = backend()
-    dr = be.dr
-    codes = flat(normal.codes)
+    z, place = be.Float(flat(normal.looked_up)), be.dr.arange(be.UInt32, mean.size)
+    out: F32 = evaluated(_quantile(be.Float(flat(mean)), z, place, codes_on_device(normal)))
+    out[normal.tail] = poisson_quantile(mean.reshape(-1)[normal.tail], normal.tail_values)
+    return out.reshape(mean.shape)
+
+
+def codes_on_device(normal: NormalField) -> Callable[..., Any]:
+    """Return a function of flat indices, UInt32, and of active lanes that gives the codes of variates, UInt32."""
+    be, codes = backend(), flat(normal.codes)
     if codes.size % 2:  # two codes share a word
         codes = flat(np.append(codes, np.uint16(0)))
     words = be.UInt32(codes.view(np.uint32))
 
-    def code_at(place: Any, lanes: Any) -> Any:
-        return dr.gather(be.UInt32, words, place >> 1, lanes) >> 16 * (place & 1) & 0xFFFF
+    def code_at(place: Any, active: Any = True) -> Any:
+        return be.dr.gather(be.UInt32, words, place >> 1, active) >> 16 * (place & 1) & 0xFFFF
 
-    z = be.Float(flat(normal.looked_up))
-    out: F32 = evaluated(_quantile(be.Float(flat(mean)), z, dr.arange(be.UInt32, mean.size), code_at))
-    out[normal.tail] = poisson_quantile(mean.reshape(-1)[normal.tail], normal.tail_values)
-    return out.reshape(mean.shape)
+    return code_at
 
 
 def poisson_of_codes(mean: Any, code: Any, active: Any = True) -> Any:

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from ..core.process.llvm import backend, evaluated, flat, on_device
 from ..core.quantities import RGBI, Electrons
 from ..detector.mosaic import sample
-from ..detector.noise import draw_normals, poisson
+from ..detector.noise import codes_on_device, draw_normals, poisson, poisson_of_codes, poisson_quantile
 from ..faults import MOSAIC_STEPS
 from ..pipeline.development import Development, Draws, acting_at
 from .picture import Picture, levels
@@ -77,11 +77,12 @@ def _missing_noise(picture: Picture, change: F32, act: Callable[[Electrons], F32
         return np.zeros_like(change)
     be, shape = backend(), change.shape
     dr, normal = be.dr, draw_normals(shape, rng("inject", "noise"))
+    code = codes_on_device(normal)(dr.arange(be.UInt32, change.size))
     white = dr.tile(on_device(picture.white_e), change.size // len(picture.white_e))
     read2 = dr.opaque(be.Float, picture.camera.detector.read_noise_e_rms**2)
     light, moved = on_device(picture.light), on_device(change)
     # the lowest bit of a variate's number says nothing of its size, and serves as the sign of the perturbation
-    signs = be.Float(1 - 2 * be.Int32(be.UInt8(flat((normal.codes & 1).astype(np.uint8)))))
+    signs = be.Float(1 - 2 * be.Int32(code & 1))
     probe = evaluated(light + dr.sqrt(light * white + read2) / white * signs).reshape(shape)
     left = on_device(picture.in_image(act(picture.seen(probe)))) * white
     variance = left * left
@@ -94,8 +95,14 @@ def _missing_noise(picture: Picture, change: F32, act: Callable[[Electrons], F32
         variance = dr.select(mixed, on_device(smooth), variance)
     after = dr.maximum(light + moved, 0) * white
     missing = dr.maximum(after + read2 - variance, 0)
-    drawn = on_device(poisson(evaluated(missing).reshape(shape), normal))
-    return evaluated(dr.select(moved != 0, (drawn - missing) / white, 0)).reshape(shape)
+    noise = dr.select(moved != 0, (poisson_of_codes(missing, code) - missing) / white, 0)
+    dr.eval(noise, missing)
+    out = evaluated(noise)
+    # the outermost numbers stand for variates of their own
+    tail = be.UInt32(normal.tail.astype(np.uint32))
+    mean, per_e = (dr.gather(be.Float, of, tail).numpy() for of in (missing, dr.select(moved != 0, 1 / white, 0)))
+    out[normal.tail] = (poisson_quantile(mean, normal.tail_values) - mean) * per_e
+    return out.reshape(shape)
 
 
 def _through_sensor(picture: Picture, development: Development, draws: Draws, after: F32, rng: Rng) -> F32:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ..camera import Camera
 from ..core import spectra
 from ..core.errors import InputError
+from ..core.process.environment import share_arenas
 from ..core.quantities import RGBI, Electrons, Radiance
 from ..core.shared_results import SharedResults
 from ..detector import GreyDetector, ThreeColourDetector
@@ -164,6 +165,7 @@ class Injector:
     def __init__(self, scene: Scene | str | Path, *, source: str = "scene", effects: bool = True) -> None:
         if not isinstance(scene, Scene):
             source, scene = str(scene), load_scene(scene)
+        share_arenas()  # an image passes through many arrays of its size: a tenth of the time
         self.scene, self.source, self.effects = scene, source, effects
         self.faults = configure_faults(scene, source)
         table = scene.image or ImageTable()
