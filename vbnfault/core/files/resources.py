@@ -10,7 +10,13 @@ from .path_checks import check_path, file_status, kind_of, path_of, shown_path, 
 
 # Folder of the package vbnfault.
 PACKAGE = Path(__file__).resolve().parents[2]
-_SINGULAR = {"scenes": "scene", "lenses": "lens", "detectors": "detector", "studies": "study"}
+_SINGULAR = {
+    "scenes": "scene",
+    "lenses": "lens",
+    "detectors": "detector",
+    "studies": "study",
+    "benchmarks": "benchmark",
+}
 
 
 def data_dir(kind: str) -> Path:

@@ -24,6 +24,7 @@ MIB = 1 << 20
 LIMIT_BYTES: dict[str, int] = {
     "scene": 4 * MIB,
     "study": 4 * MIB,
+    "benchmark": 4 * MIB,
     "severity table": 4 * MIB,
     "lens": 4 * MIB,
     "glass catalogue": 16 * MIB,

@@ -1,0 +1,117 @@
+"""The datasets of a benchmark: what a file may say, and what one command makes of it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from vbnfault.cli.app import app
+from vbnfault.core.errors import InputError
+from vbnfault.core.files import resources
+from vbnfault.dataset import verify
+from vbnfault.detect.benchmark import load_benchmark, make_benchmark, read_manifest, scene_of
+from vbnfault.store import open_store
+
+FILE = """
+title = "tiny"
+
+[common]
+"camera.width_px" = 64
+"camera.height_px" = 64
+"patch.max_triangles" = 20000
+"patch.boulders" = false
+"dataset.sites" = 3
+"dataset.variants_per_view" = 2
+
+[faults.few.broken_pixels]
+model = "texture"
+
+[parts.train]
+purpose = "train"
+scene = "quickstart"
+faults = "few"
+samples = 40
+
+[parts.nominal]
+description = "no fault"
+scene = "quickstart"
+faults = "few"
+samples = 40
+set = {"dataset.seed" = 3, "plan.faulty_fraction" = 0.0}
+"""
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    path = tmp_path / "tiny.toml"
+    path.write_text(FILE)
+    return path
+
+
+@pytest.mark.parametrize("name", resources.packaged("scenes/benchmarks"))
+def test_every_part_of_a_packaged_benchmark_has_a_scene(name: str) -> None:
+    benchmark, path = load_benchmark(name)
+    scenes = {part: scene_of(benchmark, part, path) for part in benchmark.parts}
+    seeds = {part: scene.dataset.seed for part, scene in scenes.items() if benchmark.parts[part].purpose == "test"}
+    train = {scene.dataset.seed for part, scene in scenes.items() if part not in seeds}
+    assert len(set(seeds.values())) == len(seeds)
+    assert train.isdisjoint(seeds.values())  # so their sites and individuals are others
+    for part, scene in scenes.items():
+        assert set(scene.faults) == set(benchmark.faults[benchmark.parts[part].faults])
+        assert benchmark.parts[part].samples % scene.dataset.variants_per_view == 0
+
+
+def test_one_command_makes_all_parts_and_continues(file: Path, tmp_path: Path) -> None:
+    out = tmp_path / "made"
+    arguments = ["bench", "--out", str(out), "--benchmark", str(file), "--fraction", "0.1"]
+    first = CliRunner().invoke(app, [*arguments, "--only", "nominal"])
+    assert first.exit_code == 0, first.output
+    assert list(read_manifest(out)["parts"]) == ["nominal"]
+    both = CliRunner().invoke(app, arguments)
+    assert both.exit_code == 0, both.output
+    manifest = json.loads((out / "benchmark.json").read_text())
+    assert list(manifest["parts"]) == ["train", "nominal"]
+    for name, part in manifest["parts"].items():
+        store = open_store(out / part["store"])
+        report = verify(store)
+        assert not report.problems
+        assert report.digest == part["digest"]
+        assert part["samples"] == store.samples == 4
+        assert f"{name}: 4 samples" in both.output
+    assert manifest["parts"]["train"]["purpose"] == "train"
+    assert not open_store(out / "nominal.zarr").read("injected").any()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        (
+            'faults = "few"\nsamples',
+            'faults = "fev"\nsamples',
+            r"parts.train.faults = 'fev': .* \(did you mean few\?\)",
+        ),
+        ("samples = 40\n\n", "samples = 0\n\n", "parts.train.samples = 0: must be a whole number from 1"),
+        ('purpose = "train"', 'purpose = "tests"', "parts.train.purpose"),
+        ('"camera.width_px" = 64', '"camera.width" = 64', r"parts.train: .*camera.width"),
+        ('scene = "quickstart"', 'scene = "quick"', "parts.train: quick: neither a file nor a packaged name"),
+        ("[parts.", "[pieces.", "parts"),
+    ],
+)
+def test_a_wrong_file_is_told_in_one_sentence(
+    file: Path, tmp_path: Path, old: str, new: str, sentence: str
+) -> None:
+    file.write_text(FILE.replace(old, new))
+    with pytest.raises(InputError, match=sentence):
+        list(make_benchmark(file, tmp_path / "made"))
+    assert not (tmp_path / "made").exists()
+
+
+def test_an_unknown_part_and_a_broken_manifest_are_refused(file: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"has no part 'nominl' \(did you mean nominal\?\); train, nominal"):
+        list(make_benchmark(file, tmp_path / "made", only=["nominl"]))
+    (tmp_path / "benchmark.json").write_text('{"parts": {"a": 3}}')
+    with pytest.raises(InputError, match="is no list of a benchmark's datasets"):
+        read_manifest(tmp_path)

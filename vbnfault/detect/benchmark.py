@@ -1,0 +1,156 @@
+"""Make the datasets of a benchmark: what to train on, and tests that differ from it in one thing each.
+
+A benchmark is a TOML file, packaged in `scenes/benchmarks` or a user's own. Its parts name a scene, a set of
+faults, a number of samples and the keys that replace those of the scene. One call builds all parts, resumes what
+was begun, and writes `benchmark.json` with the size and the digest of each.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field
+
+from .. import __version__, dataset
+from ..core import tables
+from ..core.errors import InputError, in_file, suggestion
+from ..core.files import resources, toml_files, user_files
+from ..core.files.whole_files import write_json, writing
+from ..core.tables import Table
+from ..scene.config import Scene, load_scene
+
+MANIFEST = "benchmark.json"
+
+
+class Part(Table):
+    """Describe one dataset of a benchmark."""
+
+    scene: str = Field(description="name or path of the scene, from the file's folder")
+    faults: str = Field(description="set of faults, a table of [faults], in place of the scene's")
+    samples: int = Field(ge=1, le=10_000_000, description="number of samples")
+    purpose: Literal["train", "test"] = Field("test", description="train: for training; test: a detector is scored")
+    description: str = Field("", description="what the part has that others have not")
+    set: dict[str, Any] = Field({}, description="dotted keys of the scene and their values")
+
+
+class Benchmark(Table):
+    """Describe the datasets of a benchmark."""
+
+    title: str = Field(description="name of the benchmark")
+    description: str = Field("", description="what it asks")
+    common: dict[str, Any] = Field({}, description="dotted keys of all scenes and their values")
+    faults: dict[str, dict[str, dict[str, Any]]] = Field(description="sets of faults: tables as a scene's [faults]")
+    parts: dict[str, Part] = Field(min_length=1, description="the datasets by name")
+
+
+@dataclass(frozen=True, kw_only=True)
+class BuiltPart:
+    """Describe a finished part: its store, the number of its samples, its size and its digest."""
+
+    store: str
+    purpose: str
+    description: str
+    samples: int
+    size_bytes: int
+    digest: str
+
+
+def load_benchmark(name_or_path: str | Path) -> tuple[Benchmark, Path]:
+    """Return a benchmark by its path or packaged name, and its file. Raises InputError."""
+    path = resources.find("scenes/benchmarks", name_or_path)
+    found = tables.parse(Benchmark, toml_files.read_toml(path, "benchmark"), source=str(path))
+    for name, part in found.parts.items():
+        if part.faults not in found.faults:
+            known = ", ".join(found.faults)
+            raise InputError(
+                f"{path}: parts.{name}.faults = {part.faults!r}: no such table of [faults]"
+                f"{suggestion(part.faults, found.faults)}; {known}"
+            )
+    return found, path
+
+
+def scene_of(benchmark: Benchmark, name: str, path: Path) -> Scene:
+    """Return the scene of a part. Raises InputError."""
+    part = benchmark.parts[name]
+    values = {**benchmark.common, "faults": benchmark.faults[part.faults], **part.set}
+    beside = path.parent / part.scene
+    with in_file(f"{path}: parts.{name}"):
+        return load_scene(beside if Path(part.scene).suffix and beside.is_file() else part.scene, values)
+
+
+def make_benchmark(
+    name_or_path: str | Path,
+    out: Path,
+    options: dataset.BuildOptions | None = None,
+    *,
+    fraction: float = 1.0,
+    only: Sequence[str] = (),
+) -> Iterator[tuple[str, BuiltPart]]:
+    """Build the parts of a benchmark, or those of the names `only`, and yield name and result of each.
+
+    A `fraction` of the samples of each part is made, for a trial. The same call continues what was begun.
+
+    Raises
+    ------
+    InputError
+        The benchmark cannot be used, or a store holds another scene.
+    BuildFailed
+        Samples failed.
+    """
+    benchmark, path = load_benchmark(name_or_path)
+    for name in only:
+        if name not in benchmark.parts:
+            known = ", ".join(benchmark.parts)
+            raise InputError(f"{path}: has no part {name!r}{suggestion(name, benchmark.parts)}; {known}")
+    scenes = {name: scene_of(benchmark, name, path) for name in only or benchmark.parts}
+    with writing(out):
+        out.mkdir(parents=True, exist_ok=True)
+    for name, scene in scenes.items():
+        part, store, variants = benchmark.parts[name], out / f"{name}.zarr", scene.dataset.variants_per_view
+        summary = dataset.build_scene(
+            scene,
+            store,
+            options,
+            samples=max(1, round(fraction * part.samples / variants)) * variants,
+            source=f"{path}: parts.{name}",
+        )
+        built = BuiltPart(
+            store=store.name,
+            purpose=part.purpose,
+            description=part.description,
+            samples=summary.samples,
+            size_bytes=sum(file.stat().st_size for file in store.rglob("*") if file.is_file()),
+            digest=str(summary.digest),
+        )
+        with writing(out / MANIFEST):
+            write_json(out / MANIFEST, _manifest(benchmark, out, {name: built}))
+        yield name, built
+
+
+def _manifest(benchmark: Benchmark, out: Path, built: Mapping[str, BuiltPart]) -> dict[str, Any]:
+    """Return the contents of the manifest with further parts, in the order of the benchmark."""
+    parts = read_manifest(out)["parts"] if (out / MANIFEST).exists() else {}
+    parts |= {name: asdict(part) for name, part in built.items()}
+    order = [name for name in (*benchmark.parts, *parts) if name in parts]
+    return {
+        "title": benchmark.title,
+        "description": benchmark.description,
+        "version": __version__,
+        "parts": {name: parts[name] for name in order},
+    }
+
+
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """Return the manifest of a folder that `make_benchmark` wrote. Raises InputError."""
+    path = folder / MANIFEST
+    try:
+        manifest = json.loads(user_files.read_input(path, "benchmark"))
+        if all(isinstance(part["store"], str) for part in manifest["parts"].values()):
+            return dict(manifest)
+    except (ValueError, TypeError, KeyError, AttributeError):
+        pass
+    raise InputError(f"{path}: is no list of a benchmark's datasets; make it with vbnfault bench")
