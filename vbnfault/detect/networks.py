@@ -35,8 +35,8 @@ MODEL, WEIGHTS, CHECKPOINT = "model.json", "weights.pt", "checkpoint.pt"
 FORMAT = 1
 _HIDDEN = 64
 # Widths of the U-Net at full size, 1/2, … 1/16. Lines and defects of one pixel need the full size, where a channel
-# costs most; flares and blur need the coarse maps. 0.5 million parameters; 270 ms of processor time to train with an
-# image of 256 px on the machine of `benchmarks/detect_training.py`.
+# costs most; flares and blur need the coarse maps. 0.5 million parameters; 270 ms of processor time train it with
+# an image of 256 px on the machine of `benchmarks/detect_training.py`.
 _WIDTHS = (16, 24, 48, 64, 96)
 _MOST_PIXELS = 1 << 21  # that are predicted at once
 
@@ -76,7 +76,7 @@ class _Heads(nn.Module):
         self.layers = nn.Sequential(nn.Linear(summary, _HIDDEN), nn.ReLU(), nn.Linear(_HIDDEN, 2 * classes + 1))
 
     def forward(self, features: Tensor, masks: Tensor) -> Outputs:
-        # how much of the image a class takes says most of its severity; the masks are taught by their own loss alone
+        # how much of the image a class takes says most of its severity; masks are taught by their own loss alone
         areas = masks.detach().sigmoid()
         pooled = [features.mean((2, 3)), features.amax((2, 3)), areas.mean((2, 3)), areas.amax((2, 3))]
         said = self.layers(torch.cat(pooled, 1))
@@ -92,9 +92,9 @@ def _block(given: int, width: int) -> nn.Sequential:
 
 
 class UNet(nn.Module):
-    """Segment with a small U-Net (Ronneberger et al. 2015), whose coarsest features know their mean over the image.
+    """Segment with a small U-Net (Ronneberger et al. 2015), whose coarsest features know their mean.
 
-    The mean and maximum over the image tell each pixel of veils, blur and falloff, which no window of an image shows.
+    Mean and maximum over the image tell each pixel of veils, blur and falloff, which no window of an image shows.
     Maps grow by repetition: its gradient is the same in every run on a GPU, unlike that of an interpolation.
     """
 
@@ -145,7 +145,7 @@ class Segmentation(nn.Module):
 
 
 def new_network(architecture: str, classes: int) -> nn.Module:
-    """Return a network with random weights. Raises InputError for an unknown architecture, or without torchvision."""
+    """Return a network with random weights. Raises InputError if it is unknown, or torchvision is missing."""
     if architecture not in ARCHITECTURES:
         raise InputError(f"architecture = {shown(architecture)}: must be one of {', '.join(ARCHITECTURES)}")
     if architecture == UNET:
@@ -160,9 +160,9 @@ _declared: list[Any] = []  # a declaration lasts as long as its library
 def _torchvision() -> Any:
     """Return torchvision. Raises InputError if it is not installed.
 
-    A torchvision that was compiled for another PyTorch, such as the plain wheel beside a PyTorch for the CPU, cannot
-    load its compiled operators, and its import fails at the first one that it describes to PyTorch. No network here
-    needs an operator, so this one is declared, without a definition.
+    A torchvision that was compiled for another PyTorch, such as the plain wheel beside one for the CPU, cannot load
+    its compiled operators, and its import fails at the first of two that it describes to PyTorch. No network
+    here needs an operator, so these two are declared, without a definition.
     """
     for attempt in range(2):
         try:
@@ -175,7 +175,8 @@ def _torchvision() -> Any:
             if attempt or "torchvision::nms" not in str(error):
                 raise InputError(f"torchvision does not fit this PyTorch {torch.__version__}: {error}") from None
             library = torch.library.Library("torchvision", "DEF")
-            library.define("nms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
+            for name in ("nms", "qnms"):
+                library.define(f"{name}(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
             _declared.append(library)
     raise AssertionError("unreachable")
 
@@ -255,7 +256,7 @@ class TrainedDetector:
         """
         if images.ndim != 4 or images.shape[-1] != CHANNELS or images.dtype != np.uint8:
             raise InputError(
-                f"images: {images.dtype}{list(images.shape)}: must be uint8[sample, y, x, {CHANNELS}], R, G, B and I"
+                f"images: {images.dtype}{list(images.shape)}: must be uint8[sample, y, x, 4]: R, G, B and I"
             )
         height, width = images.shape[1:3]
         step = max(1, _MOST_PIXELS // max(1, height * width))
