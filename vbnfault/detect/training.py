@@ -1,0 +1,561 @@
+"""Train a network to find faults, so that a training that is killed at any step goes on to the same weights.
+
+A step depends on what the checkpoint holds, on the batch, which is keyed by seed, epoch and number, and on random
+numbers that are keyed by seed and step. Nothing else is random, so a training that is resumed and one that never
+stopped have the same weights bit for bit, on one machine with as many threads of PyTorch.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import io
+import logging
+import math
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..core.errors import InputError, VbnfaultError, shown
+from ..core.files.whole_files import remove, write_whole, writing
+from ..core.process.interrupts import Stopped, held, interruptible
+from ..dataset.progress import Progress
+from ..store import digest
+from . import networks
+from .model_files import finish
+from .networks import (
+    ARCHITECTURES,
+    CHECKPOINT,
+    MODEL,
+    UNET,
+    Outputs,
+    as_input,
+    new_network,
+    read_model,
+    read_weights,
+)
+
+import torch  # isort: skip  # behind `networks`, which says in a sentence that it is missing
+from torch import Tensor, nn  # isort: skip
+from torch.nn import functional  # isort: skip
+
+from .training_data import TrainingData  # isort: skip
+
+_CHECKPOINT_EVERY_S = 60.0  # what a kill loses at most; an end of an epoch and an interrupt write one, too
+_WARM_UP = 0.05  # fraction of all steps in which the rate of learning rises to its full value
+_WEIGHT_DECAY = 1e-2  # the default of AdamW; a few epochs show no difference from 0
+_LARGEST_GRADIENT = 5.0
+_THRESHOLD = 0.5  # of a mask's probability, in the figures of an epoch
+# of presence, severity (in levels) and usable fraction beside the masks in the loss
+_OF_PRESENCE, _OF_SEVERITY, _OF_USABLE = 0.2, 0.1, 1.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainOptions:
+    """Hold how a network is trained.
+
+    Attributes
+    ----------
+    architecture
+        One of `ARCHITECTURES`.
+    classes
+        Classes to find; None: those that all datasets have.
+    masks
+        "footprint" or "effect": what the network learns to mark. The footprint is the default, because it is what
+        every dataset has and what the paper labels; it is where navigation must not look although nothing shows there
+        in this image (dust before the black sky, a dead pixel in a shadow), and `mask_any` unites footprints. The
+        effect of 1 DN is also less than the noise of most images, so that its rim cannot be seen; straylight, whose
+        reach no shape bounds, follows the effect in both.
+    crop_px
+        Side of the crops; None: 256, or the shortest side of the images if this is less.
+    epochs
+        Number of passes through the images.
+    batch_size
+        Images of a step.
+    learning_rate
+        The largest one: it rises over the first steps, then falls along a cosine to 0.
+    patience
+        Epochs without a better validation after which the training ends.
+    seed
+        Of everything that is random.
+    weights
+        File of weights to begin with.
+    """
+
+    architecture: str = UNET
+    classes: tuple[str, ...] | None = None
+    masks: str = "footprint"
+    crop_px: int | None = None
+    epochs: int = 30
+    batch_size: int = 8
+    learning_rate: float = 3e-3
+    patience: int = 10
+    seed: int = 0
+    weights: Path | None = None
+
+    def __post_init__(self) -> None:
+        if self.architecture not in ARCHITECTURES:
+            raise InputError(
+                f"architecture = {shown(self.architecture)}: must be one of {', '.join(ARCHITECTURES)}"
+            )
+        for name in ("epochs", "batch_size", "patience"):
+            if type(value := getattr(self, name)) is not int or value < 1:
+                raise InputError(f"{name} = {shown(value)}: must be a whole number of at least 1")
+        if not 0 < self.learning_rate <= 1:
+            raise InputError(f"learning_rate = {self.learning_rate:g}: must be above 0 and at most 1")
+        if self.batch_size < 2 and self.architecture != UNET:
+            raise InputError(f"batch_size = 1: {self.architecture} normalises over a batch; must be at least 2")
+
+
+def train(
+    stores: Sequence[str],
+    out: Path,
+    options: TrainOptions | None = None,
+    *,
+    workers: int = 0,
+    device: str | None = None,
+    onnx: bool = False,
+    progress: bool = False,
+) -> dict[str, Any]:
+    """Train a network on datasets, write it to a folder, and return what `model.json` then holds.
+
+    The same call continues a training that was stopped, and returns at once where it is finished.
+
+    Parameters
+    ----------
+    stores
+        Paths or URLs of one or several datasets, whose images are mixed.
+    out
+        Folder to make, or that holds this training.
+    options
+        How the network is trained.
+    workers
+        Processes that read; 0 reads in this process, which takes less than a hundredth of a step on a CPU.
+    device
+        Device of PyTorch; by default a GPU where there is one.
+    onnx
+        Whether to write `model.onnx`, too.
+    progress
+        Whether to show steps, rate and time left.
+
+    Raises
+    ------
+    InputError
+        If options and datasets do not fit, or the folder holds something else.
+    Interrupted
+        After Ctrl-C, SIGTERM or SIGHUP, with the state of the last step written.
+    VbnfaultError
+        If the loss is no number any more, memory is short, or a dataset is damaged.
+    """
+    options = options or TrainOptions()
+    data = TrainingData(
+        stores, options.classes, options.masks, options.crop_px, options.batch_size, options.seed, workers
+    )
+    what = _identity(options, data)
+    if (out / MODEL).is_file():
+        record = read_model(out)
+        _check_same(out, record, what)
+        if not onnx or "onnx" in record:
+            return record
+        return finish(out, networks.load_detector(out, "cpu").network, record, onnx=True)
+    saved = _checkpoint_of(out, what)
+    run = _Run(out, options, data, what, _device(device), saved)
+    with interruptible(lambda: f"{out}: interrupted; the same command continues the training"):
+        run.go(progress)
+    network = new_network(options.architecture, len(data.classes))
+    network.load_state_dict(run.best)
+    record = {
+        **run.what,
+        "epochs": run.history,
+        "best_epoch": run.best_epoch,
+        "pixel_weights": run.weights.tolist(),
+    }
+    record = finish(out, network, record, onnx=onnx)
+    remove(out / CHECKPOINT)
+    return record
+
+
+# --- which training a folder holds -------------------------------------------------------------------------------
+
+
+def _identity(options: TrainOptions, data: TrainingData) -> dict[str, Any]:
+    """Return on what the weights depend, but for the machine, as plain data."""
+    given = asdict(options) | {"crop_px": data.crop_px}
+    del given["classes"], given["architecture"]
+    if options.weights is not None:
+        content = _content(options.weights)
+        given["weights"] = {"name": options.weights.name, "sha256": hashlib.sha256(content).hexdigest()}
+    return {
+        "architecture": options.architecture,
+        "classes": list(data.classes),
+        "options": given,
+        "datasets": data.identity(),
+    }
+
+
+def _content(path: Path) -> bytes:
+    """Return the content of a file. Raises InputError if it cannot be read."""
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
+
+
+def _check_same(out: Path, held_there: Mapping[str, Any], what: Mapping[str, Any]) -> None:
+    """Raise InputError, which says what differs, unless a folder holds the training that is asked for."""
+    if not all(key in held_there for key in what):
+        raise InputError(f"{out}: holds no training of this vbnfault; choose another --out")
+    there, here = dict(held_there["options"]), dict(what["options"])
+    for key in ("architecture", "classes"):
+        there[key], here[key] = held_there[key], what[key]
+    for key, value in here.items():
+        if there.get(key) != value:
+            raise InputError(
+                f"{out}: holds a training with {key} = {shown(there.get(key))}, not {shown(value)}; choose another "
+                "--out, or the options with which it began"
+            )
+    kept = ("name", "checksums_sha256", "train", "val", "mirrored")
+    of = [[{key: one.get(key) for key in kept} for one in held["datasets"]] for held in (held_there, what)]
+    if of[0] != of[1]:
+        names = ["{name} ({train} images, {checksums_sha256:.8})".format(**one) for one in (*of[0], *of[1])]
+        then, now = ", ".join(names[: len(of[0])]), ", ".join(names[len(of[0]) :])
+        raise InputError(f"{out}: holds a training on {then}, not on {now}; choose another --out")
+
+
+def _checkpoint_of(out: Path, what: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Return the checkpoint in a folder; None if it is new or empty. Raises InputError if it holds something else."""
+    if (file := out / CHECKPOINT).is_file():
+        saved = read_weights(file, "a checkpoint")
+        if not isinstance(saved, dict) or "what" not in saved:
+            raise InputError(f"{file}: is no checkpoint of vbnfault train; choose another --out")
+        _check_same(out, saved["what"], what)
+        return saved
+    if (out / MODEL).is_file():
+        return None
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f"{out}: exists and holds no training; choose another --out")
+    return None
+
+
+def _device(asked: str | None) -> torch.device:
+    """Return the device to compute on. Raises InputError if PyTorch has no such device."""
+    try:
+        device = torch.device(asked or ("cuda" if torch.cuda.is_available() else "cpu"))
+        torch.zeros(1, device=device)
+        return device
+    except (RuntimeError, AssertionError) as error:
+        raise InputError(f"device = {shown(asked)}: PyTorch has no such device: {_first_line(error)}") from None
+
+
+def _first_line(error: BaseException) -> str:
+    """Return the first line of an error's message."""
+    return str(error).strip().partition("\n")[0]
+
+
+# --- the loss ----------------------------------------------------------------------------------------------------
+
+
+def loss_of(said: Outputs, batch: Mapping[str, Tensor], weights: Tensor) -> Tensor:
+    """Return the loss of a batch.
+
+    For each class c, with the pixels' labels y and probabilities p, the sums over all pixels of the batch:
+
+        L_c = −⟨w_c y ln p + (1 − y) ln(1 − p)⟩ + 1 − 2 Σ y p / (Σ y + Σ p)
+
+    The first term is cross entropy; w_c balances rare classes (`TrainingData.pixel_weights`). The second, the Dice
+    loss (Milletari et al. 2016, doi 10.1109/3DV.2016.79), counts a thin line as much as a veil; it is left out for
+    classes that the batch does not have. The loss is the mean of L_c, plus 0.2 times the cross entropy of presence,
+    plus 0.1 times the Huber loss of the levels of severity that are known of classes that are present, in levels,
+    plus the squared error of the usable fraction.
+    """
+    masks = batch["masks"].to(said.masks.dtype)
+    entropy = functional.binary_cross_entropy_with_logits(
+        said.masks, masks, pos_weight=weights[:, None, None], reduction="none"
+    ).mean((0, 2, 3))
+    guess, over = said.masks.sigmoid(), (0, 2, 3)
+    size = masks.sum(over)
+    dice = 1 - 2 * (guess * masks).sum(over) / (guess.sum(over) + size).clamp(min=1)
+    loss = entropy.mean() + (dice * (size > 0)).mean()
+    _, _, level, usable = said.probabilities()
+    presence = functional.binary_cross_entropy_with_logits(said.present, batch["present"])
+    known = (batch["present"] > 0) & batch["severity"].isfinite()
+    off = functional.smooth_l1_loss(level, torch.nan_to_num(batch["severity"]), reduction="none")
+    severity = (off * known).sum() / known.sum().clamp(min=1)
+    bad = functional.mse_loss(usable, batch["usable"])
+    return loss + _OF_PRESENCE * presence + _OF_SEVERITY * severity + _OF_USABLE * bad
+
+
+class _Figures:
+    """Add up what the figures of an epoch's validation are made of, over batches."""
+
+    def __init__(self, classes: Sequence[str]) -> None:
+        self.classes, self.images, self.loss = tuple(classes), 0, 0.0
+        self.sums: dict[str, Any] = {}
+
+    def add(self, said: Outputs, batch: Mapping[str, Tensor], loss: Tensor) -> None:
+        """Add a batch."""
+        masks, present, level, usable = said.probabilities()
+        marked, there = masks > _THRESHOLD, batch["present"] > 0
+        known = there & batch["severity"].isfinite()
+        off = (level - torch.nan_to_num(batch["severity"])).abs() * known
+        over = (0, 2, 3)
+        counts = {
+            "both": (marked & batch["masks"]).sum(over),
+            "either": (marked | batch["masks"]).sum(over),
+            "masked": batch["masks"].sum(over),
+            "right": ((present > _THRESHOLD) == there).sum(0),
+            "levels_off": off.sum(),
+            "within": ((off <= 1) & known).sum(),
+            "known": known.sum(),
+            "usable_off": (usable - batch["usable"]).abs().sum(),
+        }
+        for name, value in counts.items():
+            self.sums[name] = self.sums.get(name, 0) + value.double().cpu().numpy()
+        self.images += len(present)
+        self.loss += float(loss) * len(present)
+
+    def values(self) -> dict[str, Any]:
+        """Return the figures; nan, and null in a file, where nothing of a kind was seen."""
+        sums = self.sums
+        with np.errstate(invalid="ignore", divide="ignore"):
+            iou = np.where(sums["masked"] > 0, sums["both"] / sums["either"], np.nan)
+            levels_off, within = (float(sums[name] / sums["known"]) for name in ("levels_off", "within"))
+        return {
+            "val_loss": self.loss / self.images,
+            "val_iou": dict(zip(self.classes, iou.tolist(), strict=True)),
+            "val_mean_iou": float(np.nanmean(iou)) if np.isfinite(iou).any() else 0.0,
+            "val_presence_accuracy": float(sums["right"].mean() / self.images),
+            "val_severity_error_levels": levels_off,
+            "val_severity_within_one_level": within,
+            "val_usable_error": float(sums["usable_off"] / self.images),
+        }
+
+
+# --- a run -------------------------------------------------------------------------------------------------------
+
+
+class _Run:
+    """Hold the state of a training: network, optimiser, place in the epochs, the best weights so far."""
+
+    def __init__(
+        self,
+        out: Path,
+        options: TrainOptions,
+        data: TrainingData,
+        what: dict[str, Any],
+        device: torch.device,
+        saved: Mapping[str, Any] | None,
+    ) -> None:
+        self.out, self.options, self.data, self.what, self.device = out, options, data, what, device
+        self.epoch = self.step = self.best_epoch = 0
+        self.loss_sum = self.waited_s = self.trained_s = 0.0
+        self.history: list[dict[str, Any]] = []
+        self.best: dict[str, Tensor] = {}
+        with _keyed(options.seed, "weights"):
+            network = new_network(options.architecture, len(data.classes))
+        if saved is None and options.weights is not None:
+            networks.start_from(network, options.weights)
+        self.network: nn.Module = network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.optimizer = torch.optim.AdamW(
+            self.network.parameters(), lr=options.learning_rate, weight_decay=_WEIGHT_DECAY
+        )
+        if saved is None:
+            for one, store in zip(what["datasets"], data.stores, strict=True):
+                one["digest"] = digest(store)
+            self.weights = data.pixel_weights().to(device)
+        else:
+            self._restore(saved)
+        self.saved_at = time.monotonic()
+
+    @property
+    def is_over(self) -> bool:
+        """Return whether the training has ended: all epochs are done, or none was better for long enough."""
+        late = bool(self.data.val) and self.epoch - self.best_epoch >= self.options.patience
+        return self.epoch >= self.options.epochs or late
+
+    def go(self, progress: bool) -> None:
+        """Train until the end, and write checkpoints."""
+        data, options = self.data, self.options
+        if not self.epoch and not self.step:
+            with writing(self.out):
+                self.out.mkdir(parents=True, exist_ok=True)
+            self._save()
+        bar = Progress(options.epochs * data.steps, shown=progress, noun="steps")
+        with bar, _deterministic(self.device):
+            for _ in range(self.epoch * data.steps + self.step):
+                bar.advance(built=False)
+            try:
+                while not self.is_over:
+                    self._train_epoch(bar)
+                    self._end_epoch(bar)
+            except (Stopped, KeyboardInterrupt):  # of any other error the state may be one within a step
+                self._save()
+                raise
+            except RuntimeError as error:
+                if "memory" not in str(error):
+                    raise
+                raise VbnfaultError(
+                    f"batch_size = {options.batch_size}: memory is short for crops of {data.crop_px} px; choose "
+                    f"less, or a smaller crop: {_first_line(error)}"
+                ) from None
+
+    def _train_epoch(self, bar: Progress) -> None:
+        """Do the rest of the steps of an epoch; an interrupt arrives between two of them."""
+        batches = self.data.batches(self.epoch, self.step)
+        for _ in range(self.step, self.data.steps):
+            began = time.perf_counter()
+            batch = next(batches)
+            self.waited_s += time.perf_counter() - began
+            with held():
+                self._update(batch)
+            self.trained_s += time.perf_counter() - began
+            bar.advance(built=True)
+            if time.monotonic() - self.saved_at >= _CHECKPOINT_EVERY_S:
+                self._save()
+
+    def _update(self, batch: Mapping[str, Tensor]) -> None:
+        """Do one step. Raises VbnfaultError if its loss is no number."""
+        options, data = self.options, self.data
+        at = self.epoch * data.steps + self.step
+        for group in self.optimizer.param_groups:
+            group["lr"] = options.learning_rate * rate_at(at, options.epochs * data.steps)
+        self.network.train()
+        with _keyed(options.seed, f"step {at}", self.device):
+            _, loss = self._judged(batch)
+            value = float(loss.detach())
+            if not math.isfinite(value):
+                raise VbnfaultError(
+                    f"{self.out}: the loss of step {self.step} of epoch {self.epoch + 1} is no number; begin again in "
+                    f"another folder with a learning_rate below {options.learning_rate:g}"
+                )
+            self.optimizer.zero_grad(set_to_none=True)
+            loss.backward()
+        nn.utils.clip_grad_norm_(self.network.parameters(), _LARGEST_GRADIENT)
+        self.optimizer.step()
+        self.step += 1
+        self.loss_sum += value
+
+    def _judged(self, batch: Mapping[str, Tensor]) -> tuple[Outputs, Tensor]:
+        """Return what the network says about a batch, and its loss; in bfloat16 where a GPU has it."""
+        on_device = {name: value.to(self.device, non_blocking=True) for name, value in batch.items()}
+        mixed = self.device.type == "cuda" and torch.cuda.is_bf16_supported()
+        with torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=mixed):
+            said = self.network(as_input(on_device["image"], self.device))
+        said = Outputs(*(value.float() for value in said))
+        return said, loss_of(said, on_device, self.weights)
+
+    def _end_epoch(self, bar: Progress) -> None:
+        """Validate, keep the weights if they are the best, and write the checkpoint."""
+        data = self.data
+        figures: dict[str, Any] = {
+            "epoch": self.epoch + 1,
+            "train_loss": self.loss_sum / data.steps,
+            "images_per_s": round(data.steps * data.batch_size / max(self.trained_s, 1e-9), 3),
+            "waiting_fraction": round(self.waited_s / max(self.trained_s, 1e-9), 5),
+        }
+        if data.val:
+            bar.stage("validation")
+            figures |= self._validated()
+        with held():
+            self.epoch, self.step = self.epoch + 1, 0
+            self.loss_sum = self.waited_s = self.trained_s = 0.0
+            best = max((one["val_mean_iou"] for one in self.history if "val_mean_iou" in one), default=-1.0)
+            if figures.get("val_mean_iou", math.inf) > best:
+                self.best_epoch, now = self.epoch, self.network.state_dict()
+                self.best = {name: value.detach().cpu().clone() for name, value in now.items()}
+            self.history.append(figures)
+            self._save()
+        judged = f", mean IoU {figures['val_mean_iou']:.3f}" if data.val else ""
+        bar.say(f"epoch {self.epoch}: loss {figures['train_loss']:.4f}{judged}")
+
+    def _validated(self) -> dict[str, Any]:
+        """Return the figures of the validation images."""
+        figures = _Figures(self.data.classes)
+        self.network.eval()
+        with torch.inference_mode():
+            for batch in self.data.validation():
+                rim = [-size % networks.STRIDE_PX for size in batch["image"].shape[-2:]]
+                if any(rim):
+                    batch = _padded(batch, rim)
+                said, loss = self._judged(batch)
+                figures.add(said, {name: value.to(self.device) for name, value in batch.items()}, loss)
+        return figures.values()
+
+    def _save(self) -> None:
+        """Write the checkpoint."""
+        state = {
+            "what": self.what,
+            "network": self.network.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "best": self.best,
+            "history": self.history,
+            "weights": self.weights,
+            **{name: getattr(self, name) for name in _NUMBERS},
+        }
+        file = io.BytesIO()
+        torch.save(state, file)
+        with writing(self.out / CHECKPOINT):
+            write_whole(self.out / CHECKPOINT, file.getvalue())
+        self.saved_at = time.monotonic()
+
+    def _restore(self, saved: Mapping[str, Any]) -> None:
+        """Continue from a checkpoint. Raises InputError if it is of another version."""
+        try:
+            self.network.load_state_dict(saved["network"])
+            self.optimizer.load_state_dict(saved["optimizer"])
+            self.what, self.best, self.history = saved["what"], saved["best"], saved["history"]
+            self.weights = saved["weights"].to(self.device)
+            for name in _NUMBERS:
+                setattr(self, name, saved[name])
+        except (KeyError, RuntimeError, ValueError) as error:
+            file = self.out / CHECKPOINT
+            raise InputError(f"{file}: is a checkpoint of another version: {_first_line(error)}") from None
+        logging.getLogger("vbnfault").info(f"{self.out}: continued at epoch {self.epoch + 1}, step {self.step}")
+
+
+_NUMBERS = ("epoch", "step", "best_epoch", "loss_sum", "waited_s", "trained_s")
+
+
+def rate_at(step: int, steps: int) -> float:
+    """Return the rate of learning of a step over the largest one: a linear rise, then a cosine down to 0."""
+    rise = max(1, round(_WARM_UP * steps))
+    if step < rise:
+        return (step + 1) / rise
+    return 0.5 * (1 + math.cos(math.pi * (step - rise) / max(1, steps - rise)))
+
+
+def _padded(batch: Mapping[str, Tensor], rim: Sequence[int]) -> dict[str, Tensor]:
+    """Return whole images whose sides grow by `rim` in y and x: they go on as they end, and so do their masks."""
+    grown = (0, rim[1], 0, rim[0])
+    out = dict(batch)
+    for name in ("image", "masks"):
+        padded = functional.pad(batch[name].float(), grown, mode="replicate")
+        out[name] = padded.to(batch[name].dtype)
+    return out
+
+
+@contextlib.contextmanager
+def _keyed(seed: int, name: str, device: torch.device | None = None) -> Iterator[None]:
+    """Key the random numbers of PyTorch within a block; those of the program go on behind it."""
+    number = int.from_bytes(hashlib.sha256(f"{seed}\0train\0{name}".encode()).digest()[:7], "little")
+    with torch.random.fork_rng(devices=[device] if device is not None and device.type == "cuda" else []):
+        torch.manual_seed(number)
+        yield
+
+
+@contextlib.contextmanager
+def _deterministic(device: torch.device) -> Iterator[None]:
+    """Let a GPU choose the algorithms that give the same in every run, as far as it has such; a CPU has no others."""
+    if device.type != "cuda":
+        yield
+        return
+    before = torch.are_deterministic_algorithms_enabled(), torch.is_deterministic_algorithms_warn_only_enabled()
+    torch.use_deterministic_algorithms(True, warn_only=True)
+    try:
+        yield
+    finally:
+        torch.use_deterministic_algorithms(before[0], warn_only=before[1])
