@@ -37,7 +37,7 @@ def test_a_fault_of_a_level_has_this_level(fault: str, model: str, level: int) -
     found = severity_level(fault, params, context.shape, focal, table)
     if f"{fault}/{model}" in UNSAID:
         assert math.isnan(found)
-    else:  # a whole number that is drawn from two neighbours is off by half a step: 16 px or 17 px, levels 1 or 1.25
+    else:  # a whole number that is drawn from two neighbours is off by half a step: 17 px for 16 px, level 1.25
         assert found == pytest.approx(level, abs=0.26)
 
 
@@ -46,3 +46,9 @@ def test_levels_of_absent_and_unknown_faults() -> None:
     assert severity_level(fault, None, (8, 8), 8.0, table) == 0
     assert math.isnan(severity_level(fault, {"model": "of_a_plug_in"}, (8, 8), 8.0, table))
     assert math.isnan(severity_level(fault, {"model": model}, (8, 8), 8.0, table))
+
+
+def test_a_value_milder_than_the_mildest_is_level_0() -> None:
+    """A blur by 3 px in a frame of 256 px is less than none in one of 1024 px, whose logarithm does not exist."""
+    params = {"model": "gaussian", "filter_size_px": 3}
+    assert severity_level("optics_degradation", params, (256, 256), 200.0, Levels().table) == 0

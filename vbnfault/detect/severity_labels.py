@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..faults import LEVELS, Levels, SeverityTable, registry
+from ..faults.fields import REFERENCE_WIDTH_PX
 from ..store import ShardReader, Store
 
 F32 = NDArray[np.float32]
@@ -87,7 +88,7 @@ def severity_level(
     value = severity.of_sample(params, shape, focal_length_px)
     if not np.isfinite(value) or not known.any():
         return float("nan")
-    if value <= 0:  # the positions are logarithms
+    if severity.at_width(value, REFERENCE_WIDTH_PX, given_for_px=shape[1]) <= 0:  # positions are logarithms
         return 0.0 if severity.low < severity.high else float(LEVELS)
     positions = [severity.position(float(v), table.width_px) for v in values[known]]
     steps = np.arange(1, LEVELS + 1)[known]

@@ -65,7 +65,7 @@ class Severity:
     keys
         Other keys of the model that hold at every level, unless the scene sets them.
     drawn
-        Called with the drawn parameters of a sample, the shape of its frame in px and its focal length in px; returns
+        Called with the drawn parameters of a sample, and the shape and the focal length of its frame in px; returns
         the key's value. By default the parameters hold it under the key's name.
     """
 
