@@ -35,7 +35,8 @@ def finish(out: Path, network: nn.Module, record: Mapping[str, Any], *, onnx: bo
     """
     network = network.to("cpu").eval()
     file = io.BytesIO()
-    torch.save(network.state_dict(), file)
+    # the order of axes in memory is no part of weights
+    torch.save({name: value.contiguous() for name, value in network.state_dict().items()}, file)
     made = {
         "format": FORMAT,
         **record,
@@ -83,9 +84,9 @@ class _Exported(nn.Module):
 def export_onnx(network: nn.Module, path: Path) -> float:
     """Write a network as ONNX, compare it with PyTorch on images of two sizes, and return the largest difference.
 
-    Input `image`: float32[image, 4, y, x] with R, G, B and I in DN, 0 to 255; sides are multiples of 32 px. Outputs:
-    `masks`[image, class, y, x] and `present`[image, class] as probabilities, `severity`[image, class] from 0 to 5,
-    `usable_fraction`[image].
+    Input `image`: float32[image, 4, y, x] with R, G, B and I in DN, 0 to 255; sides are multiples of 32 px.
+    Outputs: `masks`[image, class, y, x] and `present`[image, class] as probabilities, `severity`[image, class] from
+    0 to 5, `usable_fraction`[image].
 
     Raises
     ------
@@ -159,6 +160,7 @@ class _quiet:
 def draw_training(record: Mapping[str, Any], path: Path) -> None:
     """Draw the losses and the agreement of the masks by epoch, and write the figure as PNG."""
     from matplotlib.lines import Line2D
+    from matplotlib.ticker import MaxNLocator
 
     from ..core import figures
 
@@ -187,7 +189,9 @@ def draw_training(record: Mapping[str, Any], path: Path) -> None:
             for name, colour in curves.items():
                 values = [np.nan if (v := one["val_iou"][name]) is None else v for one in epochs]
                 right.plot(number, values, color=colour, marker="o", ms=2.5)
-            right.plot(number, [one["val_mean_iou"] for one in epochs], color=figures.INK, ls="--")
+            mean = [one["val_mean_iou"] for one in epochs]
+            right.plot(number, mean, color=figures.INK, ls="--")
+            right.annotate("mean", (number[-1], mean[-1]), (4, -3), textcoords="offset points", color=figures.INK)
             right.axvline(record["best_epoch"], color=figures.MUTED, lw=0.6, ls=(0, (1, 2)))
         else:
             figures.write_message(right, "no dataset has a validation split")
@@ -195,7 +199,7 @@ def draw_training(record: Mapping[str, Any], path: Path) -> None:
         left.set_ylim(bottom=0)
         for one in (left, right):
             one.set_xlabel("epoch")
-            figures.set_linear(one.xaxis)
+            one.xaxis.set_major_locator(MaxNLocator(5, integer=True))
             one.grid(axis="y")
     write_whole(path, figures.png_bytes(figure))
 

@@ -65,11 +65,10 @@ class TrainOptions:
     classes
         Classes to find; None: those that all datasets have.
     masks
-        "footprint" or "effect": what the network learns to mark. The footprint is the default, because it is what
-        every dataset has and what the paper labels; it is where navigation must not look although nothing shows there
-        in this image (dust before the black sky, a dead pixel in a shadow), and `mask_any` unites footprints. The
-        effect of 1 DN is also less than the noise of most images, so that its rim cannot be seen; straylight, whose
-        reach no shape bounds, follows the effect in both.
+        "footprint" or "effect": what the network learns to mark. The footprint is the default: every dataset has
+        it, the paper labels it, and `mask_any`, the target of the usable fraction, unites it. A dead pixel or a grain
+        stays where it is when the scene behind it brightens, and an effect of 1 DN is less than the noise of most
+        images, so that its rim cannot be seen. Straylight, whose reach no shape bounds, is its effect in both.
     crop_px
         Side of the crops; None: 256, or the shortest side of the images if this is less.
     epochs
@@ -166,15 +165,14 @@ def train(
     run = _Run(out, options, data, what, _device(device), saved)
     with interruptible(lambda: f"{out}: interrupted; the same command continues the training"):
         run.go(progress)
-    network = new_network(options.architecture, len(data.classes))
-    network.load_state_dict(run.best)
+    run.network.load_state_dict(run.best)
     record = {
         **run.what,
         "epochs": run.history,
         "best_epoch": run.best_epoch,
         "pixel_weights": run.weights.tolist(),
     }
-    record = finish(out, network, record, onnx=onnx)
+    record = finish(out, run.network, record, onnx=onnx)
     remove(out / CHECKPOINT)
     return record
 
@@ -227,7 +225,7 @@ def _check_same(out: Path, held_there: Mapping[str, Any], what: Mapping[str, Any
 
 
 def _checkpoint_of(out: Path, what: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Return the checkpoint in a folder; None if it is new or empty. Raises InputError if it holds something else."""
+    """Return the checkpoint in a folder; None without one. Raises InputError if the folder holds something else."""
     if (file := out / CHECKPOINT).is_file():
         saved = read_weights(file, "a checkpoint")
         if not isinstance(saved, dict) or "what" not in saved:
@@ -429,8 +427,8 @@ class _Run:
             value = float(loss.detach())
             if not math.isfinite(value):
                 raise VbnfaultError(
-                    f"{self.out}: the loss of step {self.step} of epoch {self.epoch + 1} is no number; begin again in "
-                    f"another folder with a learning_rate below {options.learning_rate:g}"
+                    f"{self.out}: the loss of step {self.step} of epoch {self.epoch + 1} is no number; begin again "
+                    f"in another folder with a learning_rate below {options.learning_rate:g}"
                 )
             self.optimizer.zero_grad(set_to_none=True)
             loss.backward()
@@ -549,7 +547,7 @@ def _keyed(seed: int, name: str, device: torch.device | None = None) -> Iterator
 
 @contextlib.contextmanager
 def _deterministic(device: torch.device) -> Iterator[None]:
-    """Let a GPU choose the algorithms that give the same in every run, as far as it has such; a CPU has no others."""
+    """Let a GPU choose algorithms that give the same in every run, as far as it has such; a CPU has no others."""
     if device.type != "cuda":
         yield
         return

@@ -1,4 +1,4 @@
-"""Read stores for training: crops with their labels, mixed from several stores, in an order that is resumed anywhere.
+"""Read stores for training: crops with their labels, mixed from several stores, in an order resumed anywhere.
 
 What is not changed in an image is as much a choice as what is:
 
@@ -26,8 +26,9 @@ from ..core.errors import InputError, shown
 from ..faults import registry
 from ..scene.keyed_random import keyed_uniform
 from ..store import Store, open_store
-from ..torch import BatchDataset, Loader, SampleDataset
 from ..train import Columns
+from ..train.datasets import BatchDataset, SampleDataset
+from ..train.loader import Loader
 from .severity_labels import severity_labels
 
 Batch = dict[str, Any]
