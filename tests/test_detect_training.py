@@ -335,9 +335,10 @@ def test_the_loss_is_its_formula(monkeypatch: pytest.MonkeyPatch) -> None:
     entropy = -(w[:, None] * y * np.log(p) + (1 - y) * np.log(1 - p)).mean(1)
     dice = 1 - 2 * (0.8 + 0.6) / (2 + 1.8)
     wanted = entropy.mean() + dice / 2
-    wanted += 0.2 * -(math.log(0.9) + math.log(1 - 0.4)) / 2  # presence of the first at 0.9, the second at 0.4
-    wanted += 0.1 * 0.5 * (2.5 - 2.0) ** 2  # level 2 said, 2.5 true: half the square, below one level
-    wanted += (0.5 - 0.25) ** 2
+    presence = -(math.log(0.9) + math.log(1 - 0.4)) / 2  # the first is said to be there at 0.9, the second at 0.4
+    severity = -(0.5 * math.log(0.4) + 0.5 * math.log(0.6))  # level 2 of 5 is said, and 2.5 is true
+    usable = -(0.5 * math.log(0.25) + 0.5 * math.log(0.75))
+    wanted += 0.2 * (presence + severity + usable)
 
     def logit(value: Any) -> Any:
         return torch.logit(torch.as_tensor(value, dtype=torch.float64))
@@ -351,7 +352,7 @@ def test_the_loss_is_its_formula(monkeypatch: pytest.MonkeyPatch) -> None:
     }
     assert float(loss_of(said, batch, torch.tensor(w))) == pytest.approx(wanted, rel=1e-9)
     unknown = batch | {"severity": torch.tensor([[math.nan, 0.0]], dtype=torch.float64)}
-    assert float(loss_of(said, unknown, torch.tensor(w))) == pytest.approx(wanted - 0.1 * 0.125, rel=1e-9)
+    assert float(loss_of(said, unknown, torch.tensor(w))) == pytest.approx(wanted - 0.2 * severity, rel=1e-9)
 
 
 def test_the_rate_rises_and_falls_to_nothing() -> None:

@@ -30,9 +30,9 @@ class NetworkOptions:
         typer.Option(help="Class of fault to find; may be repeated.", show_default="all that every dataset has"),
     ] = None
     masks: Annotated[
-        Literal["footprint", "effect"],
-        typer.Option(help="What to mark: where a fault is, or where it changes the image by 1 DN."),
-    ] = "footprint"
+        Literal["effect", "footprint"],
+        typer.Option(help="What to mark: where a fault changes the image by 1 DN, or where it is."),
+    ] = "effect"
     crop_px: Annotated[
         int | None, whole(32, 16384, "Side of the crops in px.", unset="256, or the shortest side of the images")
     ] = None

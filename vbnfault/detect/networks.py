@@ -236,12 +236,16 @@ class TrainedDetector:
         Fault classes on the axes of its outputs.
     device
         Where it computes; by default on a GPU if PyTorch has one.
+    masks
+        "effect" or "footprint": what it learned to mark.
     """
 
-    def __init__(self, network: nn.Module, classes: Sequence[str], device: str | None = None) -> None:
+    def __init__(
+        self, network: nn.Module, classes: Sequence[str], device: str | None = None, masks: str = "effect"
+    ) -> None:
         self.device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
         self.network = network.to(self.device, memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
-        self._classes = tuple(classes)
+        self._classes, self.masks = tuple(classes), masks
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -291,7 +295,7 @@ def load_detector(path: str | Path, device: str | None = None) -> TrainedDetecto
         network.load_state_dict(read_weights(file))
     except (RuntimeError, TypeError, AttributeError):
         raise InputError(f"{file}: its weights are not those of {record['architecture']}") from None
-    return TrainedDetector(network, record["classes"], device)
+    return TrainedDetector(network, record["classes"], device, record["options"]["masks"])
 
 
 def read_model(path: Path) -> dict[str, Any]:

@@ -105,7 +105,7 @@ class TrainingData:
     classes
         Classes that the network is to find; by default those that all stores have, in the order of the first.
     masks
-        "footprint" or "effect": what the network learns to mark.
+        "effect" or "footprint": what the network learns to mark.
     crop_px
         Side of the crops; by default 256, or the shortest side of all images if this is less.
     batch_size
