@@ -158,37 +158,31 @@ def test_a_finished_training_returns_at_once_and_another_one_is_refused(
 # --- what is learned ----------------------------------------------------------------------------------------------
 
 
-def test_a_network_learns_a_few_images_by_heart(path: str, tmp_path: Path) -> None:
-    """Bright discs in six images: whoever marks all of it has an IoU of 0.1, whoever marks nothing has 0.
+@pytest.mark.expects_warnings
+def test_a_network_learns_three_images_by_heart(tmp_path: Path) -> None:
+    """One of them has a disc of 12 px in radius: whoever marks the whole of all has an IoU of 0.03.
 
-    The discs of fake samples are 1.5 to 13 px in radius; one pixel off at the rim of a mean one costs 0.2.
+    Who is off by 2 px everywhere at the rim has (10 / 12)² = 0.69; nothing makes 40 steps exact to a pixel.
     """
-    out = tmp_path / "model"
-    options = TrainOptions(classes=("straylight",), epochs=24, batch_size=2, patience=24, learning_rate=1e-2)
-    train([path], out, options)
-    detector, store = load_detector(out), st.open_store(path)
-    train_samples = np.flatnonzero(store.read("split") == "train")
-    images, truth = (
-        store.read("image")[train_samples],
-        store.read("mask")[train_samples, FAULTS.index("straylight")],
-    )
-    assert 0.01 < truth.mean() < 0.3
-    said = detector.predict(images)
+    store = st.open_store(made(tmp_path / "few.zarr", samples=3))  # all of the training split
+    options = TrainOptions(classes=("straylight",), epochs=40, batch_size=3, learning_rate=1e-2)
+    train([str(store.path)], tmp_path / "model", options)
+    said = load_detector(tmp_path / "model").predict(store.read("image"))
+    truth = store.read("mask_effect")[:, FAULTS.index("straylight")]
+    assert 0.01 < truth.mean() < 0.04
     marked = np.stack([one.masks[0] > 0.5 for one in said])
-    assert (marked & truth).sum() / (marked | truth).sum() > 0.7
-    there = truth.any(axis=(1, 2))
-    assert 0 < there.sum() < len(there) or len(set(there)) == 1
-    assert ((np.array([one.present[0] for one in said]) > 0.5) == there).all()
+    assert (marked & truth).sum() / (marked | truth).sum() > 0.6
+    assert [one.present[0] > 0.5 for one in said] == truth.any(axis=(1, 2)).tolist()
+    usable = 1 - store.read("mask_any").mean(axis=(1, 2))  # from 0.83 to 0.96
+    assert np.abs([one.usable_fraction for one in said] - usable).max() < 0.06
 
 
 @pytest.mark.parametrize("architecture", ARCHITECTURES)
 def test_every_architecture_trains_and_predicts_images_of_any_size(
     path: str, tmp_path: Path, architecture: str
 ) -> None:
-    if architecture != ARCHITECTURES[0]:
-        pytest.importorskip("torch").hub  # noqa: B018
-        if not has_torchvision():
-            pytest.skip("torchvision is not installed: pip install '.[torch]'")
+    if architecture != ARCHITECTURES[0] and not has_torchvision():
+        pytest.skip("torchvision is not installed: pip install '.[torch]'")
     out = tmp_path / "model"
     record = train([path], out, TrainOptions(architecture=architecture, epochs=1, batch_size=3, crop_px=32))
     assert record["parameters"] == sum(p.numel() for p in new_network(architecture, len(FAULTS)).parameters())

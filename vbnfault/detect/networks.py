@@ -123,24 +123,25 @@ class UNet(nn.Module):
 class Segmentation(nn.Module):
     """Segment with a network of torchvision, whose names of weights stay."""
 
-    def __init__(self, made: nn.Module, classes: int) -> None:
+    def __init__(self, made: Any, classes: int) -> None:
         super().__init__()
-        self.backbone: Any = made.backbone
-        self.classifier: Any = made.classifier
-        first = self.backbone["0"][0]
+        backbone: Any = made.backbone
+        first = backbone["0"][0]
         options = {name: getattr(first, name) for name in ("kernel_size", "stride", "padding")}
-        self.backbone["0"][0] = nn.Conv2d(CHANNELS, first.out_channels, bias=False, **options)
+        backbone["0"][0] = nn.Conv2d(CHANNELS, first.out_channels, bias=False, **options)
         with torch.no_grad():
-            width = self.backbone(torch.zeros(1, CHANNELS, STRIDE_PX, STRIDE_PX))
-        self._several = "high" in width  # LR-ASPP reads two maps
-        self.heads = _Heads(width["high" if self._several else "out"].shape[1], classes)
+            features = backbone(torch.zeros(1, CHANNELS, STRIDE_PX, STRIDE_PX))
+        self.backbone, self.classifier = backbone, made.classifier
+        self._several = "high" in features  # LR-ASPP reads two maps
+        self._last = "high" if self._several else "out"
+        self.heads = _Heads(features[self._last].shape[1], classes)
 
     def forward(self, images: Tensor) -> Outputs:
         """Return what the network says about images of any size."""
         features = self.backbone(images)
         maps = self.classifier(features if self._several else features["out"])
         masks = functional.interpolate(maps, size=images.shape[-2:], mode="bilinear", align_corners=False)
-        return self.heads(features["high" if self._several else "out"], masks)
+        return self.heads(features[self._last], masks)  # type: ignore[no-any-return]
 
 
 def new_network(architecture: str, classes: int) -> nn.Module:

@@ -66,8 +66,8 @@ class TrainOptions:
     masks
         "effect" or "footprint": what the network learns to mark. The effect is the default, because the rest of a
         footprint looks as if there were no fault: of the footprints of `quickstart` at 256 px, 45 % of the dust's
-        changes the image by 1 DN or more (the rest lies before the black sky), 78 % of the broken lines', 50 % of the
-        vignetting's and 33 % of the blur's. A network that is taught such pixels can only guess, and whoever marks
+        changes the image by 1 DN or more (the rest lies before the black sky), 78 % of the broken lines', 50 % of
+        the vignetting's and 33 % of the blur's. A network that is taught such pixels can only guess; whoever marks
         exactly what shows has an IoU of 0.44 for dust. For straylight both are the same.
     crop_px
         Side of the crops; None: 256, or the shortest side of the images if this is less.
