@@ -9,6 +9,7 @@ import math
 import os
 import shutil
 import signal
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -503,12 +504,29 @@ def test_a_dataset_without_validation_trains_to_the_end(
 
 
 def test_the_command_trains_and_continues(path: str, tmp_path: Path, call: Callable[..., Called]) -> None:
-    out = tmp_path / "model"
-    words = ["train", path, "--out", out, "--epochs", "1", "--batch-size", "3", "--crop-px", "32"]
+    """With every option; then again, then with another one, then with what does not exist."""
+    file, out = tmp_path / "w.pt", tmp_path / "model"
+    torch.save(new_network("unet", 2).state_dict(), file)
+    words = ["train", path, "--out", out, "--epochs", "1", "--batch-size", "3", "--crop-px", "32", "--seed", "4"]
+    words += ["--architecture", "unet", "--masks", "footprint", "--learning-rate", "0.001", "--patience", "3"]
+    words += ["--weights", file, "--workers", "1", "--device", "cpu", "--classes", "straylight", "--classes"]
     for _ in range(2):
-        done = call(*words, "--classes", "straylight", "--classes", "dust_on_optics")
+        done = call(*words, "dust_on_optics", "--no-onnx")
         assert done.code == 0, done.err
         assert "straylight" in done.out
         assert f"model of epoch 1 of 1: {out / WEIGHTS}" in done.out
-    assert load_detector(out).classes == ("straylight", "dust_on_optics")
-    assert call(*words).code == 2
+    detector = load_detector(out)
+    assert (detector.classes, detector.masks) == (("straylight", "dust_on_optics"), "footprint")
+    assert "holds a training with classes = " in call(*words, "vignetting").said
+    assert "classes: 'rain' is no fault class" in call(*words, "rain", "--onnx").said
+
+
+def test_without_torch_a_sentence_says_what_to_install(
+    path: str, tmp_path: Path, call: Callable[..., Called], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in [name for name in sys.modules if name.startswith("vbnfault.detect.")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "torch", None)
+    assert call("train", path, "--out", tmp_path / "m").said == (
+        "detectors need PyTorch, which is not installed: pip install 'vbnfault[torch]'"
+    )

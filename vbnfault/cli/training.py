@@ -74,7 +74,7 @@ def train(
     """Train a network to find faults: where, which, how severe, and how much of an image is left. It needs the
     extra torch. The same command continues an interrupted training.
     """
-    from ..detect import networks  # first: it says in a sentence that PyTorch is missing
+    from ..detect.networks import WEIGHTS  # first: it says in a sentence that PyTorch is missing
     from ..detect.training import train as run
 
     record = run(datasets, out, network.options(), workers=workers, device=device, onnx=onnx, progress=True)
@@ -85,4 +85,4 @@ def train(
         typer.echo(f"{'mean':<24}IoU {best['val_mean_iou']:.3f}")
     if "onnx" in record:
         typer.echo(f"ONNX differs from PyTorch by at most {record['onnx']['largest_difference']:.1e}")
-    typer.echo(f"model of epoch {record['best_epoch']} of {len(record['epochs'])}: {out / networks.WEIGHTS}")
+    typer.echo(f"model of epoch {record['best_epoch']} of {len(record['epochs'])}: {out / WEIGHTS}")
