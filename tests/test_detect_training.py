@@ -240,7 +240,7 @@ def test_onnx_gives_what_torch_gives(path: str, trained: Path, tmp_path: Path) -
     given = np.ascontiguousarray(image.transpose(0, 3, 1, 2)).astype(np.float32)
     masks, present, severity, usable = session.run(None, {"image": given})
     (said,) = load_detector(out, "cpu").predict(image)
-    assert np.ptp(said.masks) > 0.5
+    assert np.ptp(said.masks) > 0.3
     for ours, theirs in ((said.masks, masks[0]), (said.present, present[0]), (said.severity, severity[0])):
         assert np.abs(ours - theirs).max() <= ONNX_WITHIN
     assert abs(said.usable_fraction - usable[0]) <= ONNX_WITHIN
