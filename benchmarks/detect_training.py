@@ -19,8 +19,8 @@ import time
 import torch
 from turns import processor_s
 
+from vbnfault.detect.losses import loss_of
 from vbnfault.detect.networks import ARCHITECTURES, Outputs, as_input, new_network
-from vbnfault.detect.training import loss_of
 from vbnfault.detect.training_data import TrainingData
 
 IMAGES, EPOCHS = 1500, 5

@@ -54,6 +54,7 @@ ONLY = {  # distribution → the packages or modules that import it
     "dask": {"dataset.dask"},
     "distributed": {"dataset.dask"},
     "torch": {
+        "detect.losses",
         "detect.model_files",
         "detect.networks",
         "detect.training",

@@ -28,6 +28,7 @@ from vbnfault.faults import Levels
 torch = pytest.importorskip("torch", reason="PyTorch is not installed: pip install '.[torch]'")
 
 from vbnfault.detect import training  # noqa: E402
+from vbnfault.detect.losses import loss_of  # noqa: E402
 from vbnfault.detect.model_files import CARD, FIGURE, ONNX, ONNX_WITHIN  # noqa: E402
 from vbnfault.detect.networks import (  # noqa: E402
     ARCHITECTURES,
@@ -39,7 +40,7 @@ from vbnfault.detect.networks import (  # noqa: E402
     new_network,
     start_from,
 )
-from vbnfault.detect.training import TrainOptions, loss_of, rate_at, train  # noqa: E402
+from vbnfault.detect.training import TrainOptions, rate_at, train  # noqa: E402
 from vbnfault.detect.training_data import Labelled, TrainingData, may_be_mirrored  # noqa: E402
 
 SIZE = 64
@@ -392,7 +393,7 @@ def test_the_training_ends_where_nothing_gets_better(
     path: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     figures = iter([0.1, 0.4, 0.3, 0.2, 0.9])
-    monkeypatch.setattr(training._Figures, "values", lambda self: FIGURES | {"val_mean_iou": next(figures)})
+    monkeypatch.setattr(training.Figures, "values", lambda self: FIGURES | {"val_mean_iou": next(figures)})
     record = train([path], tmp_path / "model", TrainOptions(**{**SMALL, "epochs": 9, "patience": 2}))
     assert (len(record["epochs"]), record["best_epoch"]) == (4, 2)
 

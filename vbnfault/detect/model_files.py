@@ -1,4 +1,7 @@
-"""Write what a training made: weights, `model.json`, a card for people, a figure of the losses, and ONNX."""
+"""Write what a training made: weights, `model.json`, a card for people, a figure of the losses, and ONNX.
+
+And say whether a folder holds the training that is asked for.
+"""
 
 from __future__ import annotations
 
@@ -18,10 +21,10 @@ import torch
 from torch import Tensor, nn
 
 from .. import __version__
-from ..core.errors import InputError, VbnfaultError
+from ..core.errors import InputError, VbnfaultError, shown
 from ..core.files.whole_files import own, plain, write_json, write_whole, writing
 from ..core.html_page import rendered
-from .networks import CHANNELS, FORMAT, MODEL, STRIDE_PX, WEIGHTS
+from .networks import CHANNELS, CHECKPOINT, FORMAT, MODEL, STRIDE_PX, WEIGHTS, read_weights
 
 CARD, FIGURE, ONNX = "card.md", "training.png", "model.onnx"
 ONNX_WITHIN = 1e-4  # of probabilities, levels and fractions, between ONNX Runtime and PyTorch
@@ -64,6 +67,45 @@ def _versions() -> dict[str, str]:
         except importlib.metadata.PackageNotFoundError:
             continue
     return numbers
+
+
+# --- which training a folder holds -------------------------------------------------------------------------------
+
+
+def check_same(out: Path, held_there: Mapping[str, Any], what: Mapping[str, Any]) -> None:
+    """Raise InputError, which says what differs, unless a folder holds the training that is asked for."""
+    if not all(key in held_there for key in what):
+        raise InputError(f"{out}: holds no training of this vbnfault; choose another --out")
+    there, here = dict(held_there["options"]), dict(what["options"])
+    for key in ("architecture", "classes"):
+        there[key], here[key] = held_there[key], what[key]
+    for key, value in here.items():
+        if there.get(key) != value:
+            raise InputError(
+                f"{out}: holds a training with {key} = {shown(there.get(key))}, not {shown(value)}; choose another "
+                "--out, or the options with which it began"
+            )
+    kept = ("name", "checksums_sha256", "train", "val", "mirrored")
+    of = [[{key: one.get(key) for key in kept} for one in held["datasets"]] for held in (held_there, what)]
+    if of[0] != of[1]:
+        names = ["{name} ({train} images, {checksums_sha256:.8})".format(**one) for one in (*of[0], *of[1])]
+        then, now = ", ".join(names[: len(of[0])]), ", ".join(names[len(of[0]) :])
+        raise InputError(f"{out}: holds a training on {then}, not on {now}; choose another --out")
+
+
+def checkpoint_of(out: Path, what: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Return the checkpoint in a folder; None without one. Raises InputError if the folder holds something else."""
+    if (file := out / CHECKPOINT).is_file():
+        saved = read_weights(file, "a checkpoint")
+        if not isinstance(saved, dict) or "what" not in saved:
+            raise InputError(f"{file}: is no checkpoint of vbnfault train; choose another --out")
+        check_same(out, saved["what"], what)
+        return saved
+    if (out / MODEL).is_file():
+        return None
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f"{out}: exists and holds no training; choose another --out")
+    return None
 
 
 # --- ONNX --------------------------------------------------------------------------------------------------------

@@ -191,7 +191,7 @@ def read_weights(path: Path, what: str = "weights") -> Any:
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
     except Exception as error:  # the safe unpickler meets whatever bytes make of it
-        why = str(error).partition("\n")[0].partition(". ")[0]
+        why = first_line(error).partition(". ")[0]
         raise InputError(f"{path}: is no file of {what} that PyTorch reads safely: {why}") from None
 
 
@@ -220,6 +220,30 @@ def start_from(network: nn.Module, path: Path) -> int:
     return len(fitting)
 
 
+def chosen_device(asked: str | None) -> torch.device:
+    """Return the device to compute on: by default a GPU if PyTorch has one. Raises InputError if it has no such."""
+    try:
+        device = torch.device(asked or ("cuda" if torch.cuda.is_available() else "cpu"))
+        torch.zeros(1, device=device)
+        return device
+    except (RuntimeError, AssertionError) as error:
+        raise InputError(f"device = {shown(asked)}: PyTorch has no such device: {first_line(error)}") from None
+
+
+def first_line(error: BaseException) -> str:
+    """Return the first line of an error's message."""
+    return str(error).strip().partition("\n")[0]
+
+
+def padded(planes: Tensor) -> Tensor:
+    """Return images or masks [image, plane, y, x] grown to multiples of the stride; they go on as they end."""
+    height, width = planes.shape[-2:]
+    rim = (0, -width % STRIDE_PX, 0, -height % STRIDE_PX)
+    if not any(rim):
+        return planes
+    return functional.pad(planes.float(), rim, mode="replicate").to(planes.dtype)
+
+
 def as_input(images: Tensor, device: torch.device) -> Tensor:
     """Return images uint8[image, 4, y, x] as a network takes them, on its device."""
     moved = images.to(device, non_blocking=True)
@@ -244,7 +268,7 @@ class TrainedDetector:
     def __init__(
         self, network: nn.Module, classes: Sequence[str], device: str | None = None, masks: str = "effect"
     ) -> None:
-        self.device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+        self.device = chosen_device(device)
         self.network = network.to(self.device, memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
         self._classes, self.masks = tuple(classes), masks
 
@@ -268,10 +292,7 @@ class TrainedDetector:
         for first in range(0, len(images), step):
             part = torch.from_numpy(np.ascontiguousarray(images[first : first + step])).permute(0, 3, 1, 2)
             with torch.inference_mode():
-                given = as_input(part, self.device)
-                # at the rim the image goes on as it ends
-                rim = (0, -width % STRIDE_PX, 0, -height % STRIDE_PX)
-                said = self.network(functional.pad(given, rim, mode="replicate")).probabilities()
+                said = self.network(as_input(padded(part), self.device)).probabilities()
             masks, present, severity, usable = (value.float().cpu().numpy() for value in said)
             out += [
                 Prediction(

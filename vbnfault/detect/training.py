@@ -18,7 +18,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+import torch
+from torch import Tensor, nn
 
 from ..core.errors import InputError, VbnfaultError, shown
 from ..core.files.whole_files import remove, write_whole, writing
@@ -26,7 +27,8 @@ from ..core.process.interrupts import Stopped, held, interruptible
 from ..dataset.progress import Progress
 from ..store import digest
 from . import networks
-from .model_files import finish
+from .losses import Figures, loss_of
+from .model_files import check_same, checkpoint_of, finish
 from .networks import (
     ARCHITECTURES,
     CHECKPOINT,
@@ -34,23 +36,17 @@ from .networks import (
     UNET,
     Outputs,
     as_input,
+    chosen_device,
+    first_line,
     new_network,
     read_model,
-    read_weights,
 )
-
-import torch  # isort: skip  # behind `networks`, which says in a sentence that it is missing
-from torch import Tensor, nn  # isort: skip
-from torch.nn import functional  # isort: skip
-
-from .training_data import TrainingData  # isort: skip
+from .training_data import TrainingData
 
 _CHECKPOINT_EVERY_S = 60.0  # what a kill loses at most; an end of an epoch and an interrupt write one, too
 _WARM_UP = 0.05  # fraction of all steps in which the rate of learning rises to its full value
-_WEIGHT_DECAY = 1e-2  # the default of AdamW; a few epochs show no difference from 0
+_WEIGHT_DECAY = 1e-2  # the default of AdamW
 _LARGEST_GRADIENT = 5.0
-_THRESHOLD = 0.5  # of a mask's probability, in the figures of an epoch
-_OF_THE_IMAGE = 0.2  # weight of what is said of the whole image beside the masks
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,12 +153,12 @@ def train(
     what = _identity(options, data)
     if (out / MODEL).is_file():
         record = read_model(out)
-        _check_same(out, record, what)
+        check_same(out, record, what)
         if not onnx or "onnx" in record:
             return record
         return finish(out, networks.load_detector(out, "cpu").network, record, onnx=True)
-    saved = _checkpoint_of(out, what)
-    run = _Run(out, options, data, what, _device(device), saved)
+    saved = checkpoint_of(out, what)
+    run = _Run(out, options, data, what, chosen_device(device), saved)
     with interruptible(lambda: f"{out}: interrupted; the same command continues the training"):
         run.go(progress)
     run.network.load_state_dict(run.best)
@@ -177,7 +173,7 @@ def train(
     return record
 
 
-# --- which training a folder holds -------------------------------------------------------------------------------
+# --- a run -------------------------------------------------------------------------------------------------------
 
 
 def _identity(options: TrainOptions, data: TrainingData) -> dict[str, Any]:
@@ -201,141 +197,6 @@ def _content(path: Path) -> bytes:
         return path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
-
-
-def _check_same(out: Path, held_there: Mapping[str, Any], what: Mapping[str, Any]) -> None:
-    """Raise InputError, which says what differs, unless a folder holds the training that is asked for."""
-    if not all(key in held_there for key in what):
-        raise InputError(f"{out}: holds no training of this vbnfault; choose another --out")
-    there, here = dict(held_there["options"]), dict(what["options"])
-    for key in ("architecture", "classes"):
-        there[key], here[key] = held_there[key], what[key]
-    for key, value in here.items():
-        if there.get(key) != value:
-            raise InputError(
-                f"{out}: holds a training with {key} = {shown(there.get(key))}, not {shown(value)}; choose another "
-                "--out, or the options with which it began"
-            )
-    kept = ("name", "checksums_sha256", "train", "val", "mirrored")
-    of = [[{key: one.get(key) for key in kept} for one in held["datasets"]] for held in (held_there, what)]
-    if of[0] != of[1]:
-        names = ["{name} ({train} images, {checksums_sha256:.8})".format(**one) for one in (*of[0], *of[1])]
-        then, now = ", ".join(names[: len(of[0])]), ", ".join(names[len(of[0]) :])
-        raise InputError(f"{out}: holds a training on {then}, not on {now}; choose another --out")
-
-
-def _checkpoint_of(out: Path, what: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Return the checkpoint in a folder; None without one. Raises InputError if the folder holds something else."""
-    if (file := out / CHECKPOINT).is_file():
-        saved = read_weights(file, "a checkpoint")
-        if not isinstance(saved, dict) or "what" not in saved:
-            raise InputError(f"{file}: is no checkpoint of vbnfault train; choose another --out")
-        _check_same(out, saved["what"], what)
-        return saved
-    if (out / MODEL).is_file():
-        return None
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise InputError(f"{out}: exists and holds no training; choose another --out")
-    return None
-
-
-def _device(asked: str | None) -> torch.device:
-    """Return the device to compute on. Raises InputError if PyTorch has no such device."""
-    try:
-        device = torch.device(asked or ("cuda" if torch.cuda.is_available() else "cpu"))
-        torch.zeros(1, device=device)
-        return device
-    except (RuntimeError, AssertionError) as error:
-        raise InputError(f"device = {shown(asked)}: PyTorch has no such device: {_first_line(error)}") from None
-
-
-def _first_line(error: BaseException) -> str:
-    """Return the first line of an error's message."""
-    return str(error).strip().partition("\n")[0]
-
-
-# --- the loss ----------------------------------------------------------------------------------------------------
-
-
-def loss_of(said: Outputs, batch: Mapping[str, Tensor], weights: Tensor) -> Tensor:
-    """Return the loss of a batch.
-
-    For each class c, with the pixels' labels y and probabilities p, the sums over all pixels of the batch:
-
-        L_c = −⟨w_c y ln p + (1 − y) ln(1 − p)⟩ + 1 − 2 Σ y p / (Σ y + Σ p)
-
-    The first term is cross entropy; w_c balances rare classes (`TrainingData.pixel_weights`). The second, the Dice
-    loss (Milletari et al. 2016, doi 10.1109/3DV.2016.79), counts a thin line as much as a veil; it is left out for
-    classes that the batch does not have. The loss is the mean of L_c, plus 0.2 times the sum of three cross
-    entropies, each with a fraction as its label: presence, the level of severity over 5 of classes that are present
-    and whose level is known, and the usable fraction.
-    """
-    masks = batch["masks"].to(said.masks.dtype)
-    entropy = functional.binary_cross_entropy_with_logits(
-        said.masks, masks, pos_weight=weights[:, None, None], reduction="none"
-    ).mean((0, 2, 3))
-    guess, over = said.masks.sigmoid(), (0, 2, 3)
-    size = masks.sum(over)
-    dice = 1 - 2 * (guess * masks).sum(over) / (guess.sum(over) + size).clamp(min=1)
-    loss = entropy.mean() + (dice * (size > 0)).mean()
-    known = (batch["present"] > 0) & batch["severity"].isfinite()
-    level = torch.nan_to_num(batch["severity"]) / networks.LEVELS
-    off = functional.binary_cross_entropy_with_logits(said.severity, level, reduction="none")
-    loss_of_image = (
-        functional.binary_cross_entropy_with_logits(said.present, batch["present"])
-        + (off * known).sum() / known.sum().clamp(min=1)
-        + functional.binary_cross_entropy_with_logits(said.usable, batch["usable"])
-    )
-    return loss + _OF_THE_IMAGE * loss_of_image
-
-
-class _Figures:
-    """Add up what the figures of an epoch's validation are made of, over batches."""
-
-    def __init__(self, classes: Sequence[str]) -> None:
-        self.classes, self.images, self.loss = tuple(classes), 0, 0.0
-        self.sums: dict[str, Any] = {}
-
-    def add(self, said: Outputs, batch: Mapping[str, Tensor], loss: Tensor) -> None:
-        """Add a batch."""
-        masks, present, level, usable = said.probabilities()
-        marked, there = masks > _THRESHOLD, batch["present"] > 0
-        known = there & batch["severity"].isfinite()
-        off = (level - torch.nan_to_num(batch["severity"])).abs() * known
-        over = (0, 2, 3)
-        counts = {
-            "both": (marked & batch["masks"]).sum(over),
-            "either": (marked | batch["masks"]).sum(over),
-            "masked": batch["masks"].sum(over),
-            "right": ((present > _THRESHOLD) == there).sum(0),
-            "levels_off": off.sum(),
-            "within": ((off <= 1) & known).sum(),
-            "known": known.sum(),
-            "usable_off": (usable - batch["usable"]).abs().sum(),
-        }
-        for name, value in counts.items():
-            self.sums[name] = self.sums.get(name, 0) + value.double().cpu().numpy()
-        self.images += len(present)
-        self.loss += float(loss) * len(present)
-
-    def values(self) -> dict[str, Any]:
-        """Return the figures; nan, and null in a file, where nothing of a kind was seen."""
-        sums = self.sums
-        with np.errstate(invalid="ignore", divide="ignore"):
-            iou = np.where(sums["masked"] > 0, sums["both"] / sums["either"], np.nan)
-            levels_off, within = (float(sums[name] / sums["known"]) for name in ("levels_off", "within"))
-        return {
-            "val_loss": self.loss / self.images,
-            "val_iou": dict(zip(self.classes, iou.tolist(), strict=True)),
-            "val_mean_iou": float(np.nanmean(iou)) if np.isfinite(iou).any() else 0.0,
-            "val_presence_accuracy": float(sums["right"].mean() / self.images),
-            "val_severity_error_levels": levels_off,
-            "val_severity_within_one_level": within,
-            "val_usable_error": float(sums["usable_off"] / self.images),
-        }
-
-
-# --- a run -------------------------------------------------------------------------------------------------------
 
 
 class _Run:
@@ -400,7 +261,7 @@ class _Run:
                     raise
                 raise VbnfaultError(
                     f"batch_size = {options.batch_size}: memory is short for crops of {data.crop_px} px; choose "
-                    f"less, or a smaller crop: {_first_line(error)}"
+                    f"less, or a smaller crop: {first_line(error)}"
                 ) from None
 
     def _train_epoch(self, bar: Progress) -> None:
@@ -474,13 +335,11 @@ class _Run:
 
     def _validated(self) -> dict[str, Any]:
         """Return the figures of the validation images."""
-        figures = _Figures(self.data.classes)
+        figures = Figures(self.data.classes)
         self.network.eval()
         with torch.inference_mode():
             for batch in self.data.validation():
-                rim = [-size % networks.STRIDE_PX for size in batch["image"].shape[-2:]]
-                if any(rim):
-                    batch = _padded(batch, rim)
+                batch = batch | {name: networks.padded(batch[name]) for name in ("image", "masks")}
                 said, loss = self._judged(batch)
                 figures.add(said, {name: value.to(self.device) for name, value in batch.items()}, loss)
         return figures.values()
@@ -513,7 +372,7 @@ class _Run:
                 setattr(self, name, saved[name])
         except (KeyError, RuntimeError, ValueError) as error:
             file = self.out / CHECKPOINT
-            raise InputError(f"{file}: is a checkpoint of another version: {_first_line(error)}") from None
+            raise InputError(f"{file}: is a checkpoint of another version: {first_line(error)}") from None
         logging.getLogger("vbnfault").info(f"{self.out}: continued at epoch {self.epoch + 1}, step {self.step}")
 
 
@@ -526,16 +385,6 @@ def rate_at(step: int, steps: int) -> float:
     if step < rise:
         return (step + 1) / rise
     return 0.5 * (1 + math.cos(math.pi * (step - rise) / max(1, steps - rise)))
-
-
-def _padded(batch: Mapping[str, Tensor], rim: Sequence[int]) -> dict[str, Tensor]:
-    """Return whole images whose sides grow by `rim` in y and x: they go on as they end, and so do their masks."""
-    grown = (0, rim[1], 0, rim[0])
-    out = dict(batch)
-    for name in ("image", "masks"):
-        padded = functional.pad(batch[name].float(), grown, mode="replicate")
-        out[name] = padded.to(batch[name].dtype)
-    return out
 
 
 @contextlib.contextmanager

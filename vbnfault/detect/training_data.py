@@ -228,8 +228,8 @@ class TrainingData:
     def pixel_weights(self) -> torch.Tensor:
         """Return the weight of pixels in a mask of each class, float32[class]: √(pixels outside / inside), 1 to 10.
 
-        The square root lies between no balance, with which thin lines are never marked, and the full ratio, with
-        which a network marks whole neighbourhoods (figures: `training.loss_of`). All images of the stores count.
+        The square root lies between no balance, with which thin lines are not marked for long, and the whole ratio,
+        with which neighbourhoods are marked; `losses.loss_of` has figures. All stores count by their images.
         """
         odds = torch.stack([1 / data.pixel_weights(_COUNTED) for data in self.train])
         inside = (odds / (1 + odds) * torch.tensor([len(data) for data in self.train])[:, None]).sum(
