@@ -9,6 +9,7 @@ import hashlib
 import importlib.metadata
 import io
 import logging
+import math
 import os
 import platform
 import warnings
@@ -249,4 +250,8 @@ def draw_training(record: Mapping[str, Any], path: Path) -> None:
 def card(record: Mapping[str, Any]) -> str:
     """Return the card of a model as Markdown: what it is, what it was trained with, and what it is not for."""
     best = next((one for one in record["epochs"] if one["epoch"] == record["best_epoch"]), record["epochs"][-1])
-    return rendered("detect/card.md", record=record, best=best, stride=STRIDE_PX, within=ONNX_WITHIN)
+
+    def text(value: float | None) -> str:
+        return "none in these images" if value is None or not math.isfinite(value) else f"{value:.3f}"
+
+    return rendered("detect/card.md", record=record, best=best, text=text, stride=STRIDE_PX, within=ONNX_WITHIN)

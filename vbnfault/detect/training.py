@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import io
-import logging
 import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -22,6 +21,7 @@ import torch
 from torch import Tensor, nn
 
 from ..core.errors import InputError, VbnfaultError, shown
+from ..core.files.user_files import sha256_of_input
 from ..core.files.whole_files import remove, write_whole, writing
 from ..core.process.interrupts import Stopped, held, interruptible
 from ..dataset.progress import Progress
@@ -181,22 +181,14 @@ def _identity(options: TrainOptions, data: TrainingData) -> dict[str, Any]:
     given = asdict(options) | {"crop_px": data.crop_px}
     del given["classes"], given["architecture"]
     if options.weights is not None:
-        content = _content(options.weights)
-        given["weights"] = {"name": options.weights.name, "sha256": hashlib.sha256(content).hexdigest()}
+        content = sha256_of_input(options.weights, "weights")
+        given["weights"] = {"name": options.weights.name, "sha256": content}
     return {
         "architecture": options.architecture,
         "classes": list(data.classes),
         "options": given,
         "datasets": data.identity(),
     }
-
-
-def _content(path: Path) -> bytes:
-    """Return the content of a file. Raises InputError if it cannot be read."""
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
 
 
 class _Run:
@@ -373,7 +365,6 @@ class _Run:
         except (KeyError, RuntimeError, ValueError) as error:
             file = self.out / CHECKPOINT
             raise InputError(f"{file}: is a checkpoint of another version: {first_line(error)}") from None
-        logging.getLogger("vbnfault").info(f"{self.out}: continued at epoch {self.epoch + 1}, step {self.step}")
 
 
 _NUMBERS = ("epoch", "step", "best_epoch", "loss_sum", "waited_s", "trained_s")
