@@ -129,7 +129,7 @@ def train(
     options
         How the network is trained.
     workers
-        Processes that read; 0 reads in this process, which takes less than a hundredth of a step on a CPU.
+        Processes that read; 0 reads in this process, which takes 2 to 4 % of the time on a CPU.
     device
         Device of PyTorch; by default a GPU where there is one.
     onnx
