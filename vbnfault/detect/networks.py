@@ -191,7 +191,7 @@ def read_weights(path: Path, what: str = "weights") -> Any:
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
     except Exception as error:  # the safe unpickler meets whatever bytes make of it
-        why = first_line(error).partition(". ")[0]
+        why = first_sentence(error)
         raise InputError(f"{path}: is no file of {what} that PyTorch reads safely: {why}") from None
 
 
@@ -224,15 +224,15 @@ def chosen_device(asked: str | None) -> torch.device:
     """Return the device to compute on: by default a GPU if PyTorch has one. Raises InputError if it has no such."""
     try:
         device = torch.device(asked or ("cuda" if torch.cuda.is_available() else "cpu"))
-        torch.zeros(1, device=device)
+        torch.zeros(1, device=device).item()
         return device
     except (RuntimeError, AssertionError) as error:
-        raise InputError(f"device = {shown(asked)}: PyTorch has no such device: {first_line(error)}") from None
+        raise InputError(f"device = {shown(asked)}: PyTorch has no such device: {first_sentence(error)}") from None
 
 
-def first_line(error: BaseException) -> str:
-    """Return the first line of an error's message."""
-    return str(error).strip().partition("\n")[0]
+def first_sentence(error: BaseException) -> str:
+    """Return the first sentence of an error's message: PyTorch lists devices and advice behind it."""
+    return str(error).strip().partition("\n")[0].partition(". ")[0]
 
 
 def padded(planes: Tensor) -> Tensor:

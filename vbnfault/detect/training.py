@@ -37,7 +37,7 @@ from .networks import (
     Outputs,
     as_input,
     chosen_device,
-    first_line,
+    first_sentence,
     new_network,
     read_model,
 )
@@ -253,7 +253,7 @@ class _Run:
                     raise
                 raise VbnfaultError(
                     f"batch_size = {options.batch_size}: memory is short for crops of {data.crop_px} px; choose "
-                    f"less, or a smaller crop: {first_line(error)}"
+                    f"less, or a smaller crop: {first_sentence(error)}"
                 ) from None
 
     def _train_epoch(self, bar: Progress) -> None:
@@ -364,7 +364,7 @@ class _Run:
                 setattr(self, name, saved[name])
         except (KeyError, RuntimeError, ValueError) as error:
             file = self.out / CHECKPOINT
-            raise InputError(f"{file}: is a checkpoint of another version: {first_line(error)}") from None
+            raise InputError(f"{file}: is a checkpoint of another version: {first_sentence(error)}") from None
 
 
 _NUMBERS = ("epoch", "step", "best_epoch", "loss_sum", "waited_s", "trained_s")
