@@ -38,7 +38,13 @@ class TextureBrokenLines(Fault):
     axis = 2
     step = "rgbi"
     # measured from 256 to 512 px: of many features the strongest count, and lines are strong
-    severity = Severity(key="count", low=1, high=500, width_power=0.3)
+    severity = Severity(
+        key="count",
+        low=1,
+        high=500,
+        width_power=0.3,
+        drawn=lambda params, *_: len(params["rows"]) + len(params["columns"]),
+    )
 
     count: Interval = bounds(1, 5, limits=(0, 10_000), integer=True, doc="number of broken lines")
     white_count: int | None = number(

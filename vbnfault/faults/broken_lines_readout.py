@@ -18,7 +18,9 @@ The numbers of failures and their fractions are assumed, except that one to five
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -53,7 +55,7 @@ class ReadoutBrokenLines(Fault):
     model = "readout"
     step = "raw"
     # measured from 256 to 512 px: of many features the strongest count, and lines are strong
-    severity = Severity(key="count", low=1, high=500, width_power=0.3)
+    severity = Severity(key="count", low=1, high=500, width_power=0.3, drawn=lambda params, *_: _failures(params))
     needs_mosaic = True
 
     count: Interval = bounds(1, 5, limits=(0, 10_000), integer=True, doc="number of failures that take lines")
@@ -181,6 +183,14 @@ def _fail(
         )
         moved[:, to] = raw[index][:, of]
     raw[index] = moved
+
+
+def _failures(params: Mapping[str, Any]) -> int:
+    """Return the number of failures that took the lines; neighbouring lines of one kind failed together."""
+    keys = [(line["axis"], line["half"], line["begin"], line["kind"], line["index"]) for line in params["lines"]]
+    return sum(
+        after[:4] != before[:4] or after[4] != before[4] + 1 for before, after in pairwise([(("",) * 5), *keys])
+    )
 
 
 def _of(params: Params, kind: str, axis: str) -> list[dict[str, Any]]:

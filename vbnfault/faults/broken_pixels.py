@@ -60,7 +60,7 @@ class TextureBrokenPixels(Fault):
     axis = 1
     remark = "each defect shows as a plus of five pixels, itself and four neighbours"
     step = "rgbi"
-    severity = Severity(key="count", low=1, high=10_000, width_power=1)
+    severity = Severity(key="count", low=1, high=10_000, width_power=1, drawn=lambda params, *_: len(params["x"]))
 
     count: Interval = bounds(10, 150, limits=(0, 10_000), integer=True, doc="number of broken pixels")
     brightness_dn: Interval = bounds(

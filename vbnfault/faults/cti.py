@@ -46,7 +46,13 @@ class RadiationTraps(Fault):
     default = True
     after = "blooming"
     step = "charge"
-    severity = Severity(key="parallel_per_px", low=0.01, high=100.0, width_power=-1)
+    severity = Severity(
+        key="parallel_per_px",
+        low=0.01,
+        high=100.0,
+        width_power=-1,
+        drawn=lambda params, *_: sum(trap["density_per_px"] for trap in params["parallel"]),
+    )
     needs_mosaic = True
     needs_ccd = True
     localised = False

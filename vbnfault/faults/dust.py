@@ -47,7 +47,9 @@ class GaussianDust(Fault):
     step = "electrons"
     needs_light = True
     # the power is measured from 256 to 512 px
-    severity = Severity(key="count", low=1, high=3000, width_power=0.5)
+    severity = Severity(
+        key="count", low=1, high=3000, width_power=0.5, drawn=lambda params, *_: len(params["x_px"])
+    )
     soft_layer = "dust_opacity"
 
     count: Interval = bounds(30, 100, limits=(0, 10_000), integer=True, doc="number of grains in the image")

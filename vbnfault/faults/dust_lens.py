@@ -80,7 +80,7 @@ class DefocusedDust(LensFault):
     fault = "dust_on_optics"
     model = "defocused"
     step = "electrons"
-    severity = Severity(key="count", low=1, high=1000)
+    severity = Severity(key="count", low=1, high=1000, drawn=lambda params, *_: len(params["x_mm"]))
     localised = False
     soft_layer = "dust_opacity"
 

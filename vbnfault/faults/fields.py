@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import field
 from functools import lru_cache
 from typing import Annotated, Any, Literal, NamedTuple
@@ -64,6 +64,9 @@ class Severity:
         rises with the width, as a number of defects that each take a line.
     keys
         Other keys of the model that hold at every level, unless the scene sets them.
+    drawn
+        Called with the drawn parameters of a sample, and the shape and the focal length of its frame in px; returns
+        the key's value. By default the parameters hold it under the key's name.
     """
 
     key: str
@@ -73,6 +76,15 @@ class Severity:
     width_power: float = 0.0
     offset: float = 0.0
     keys: Mapping[str, Any] = field(default_factory=dict, hash=False)
+    drawn: Callable[[Mapping[str, Any], tuple[int, int], float], float] | None = field(default=None, compare=False)
+
+    def of_sample(self, params: Mapping[str, Any], shape: tuple[int, int], focal_length_px: float) -> float:
+        """Return the key's value in a sample; nan where its drawn parameters do not say it (see `drawn`)."""
+        try:
+            value = self.drawn(params, shape, focal_length_px) if self.drawn else params[self.key]
+            return math.nan if isinstance(value, bool) else float(value)
+        except (KeyError, TypeError, ValueError):  # of a model that keeps something else, or of another version
+            return math.nan
 
     def position(self, value: float, width_px: int = REFERENCE_WIDTH_PX) -> float:
         """Return the position of a value for frames of a width: 0 the mildest, 1 the most severe."""

@@ -79,7 +79,13 @@ class TextureStraylight(Fault):
     axis = 3
     step = "electrons"
     # small flares leave parts of the frame free, however bright they are
-    severity = Severity(key="brightness", low=0.01, high=100.0, keys={"radius": [0.3, 0.6]})
+    severity = Severity(
+        key="brightness",
+        low=0.01,
+        high=100.0,
+        keys={"radius": [0.3, 0.6]},
+        drawn=lambda params, *_: float(np.mean([r["brightness"] for r in params["flares"] or [params["glare"]]])),
+    )
     needs_sun = True
     packaged_images = "textures"
     effect_mask = True

@@ -37,7 +37,14 @@ class Cos4Vignetting(Fault):
     axis = 4
     step = "electrons"
     needs_light = True
-    severity = Severity(key="frame_illuminance_dn", low=255.0, high=2.0)
+    severity = Severity(
+        key="frame_illuminance_dn",
+        low=255.0,
+        high=2.0,
+        drawn=lambda params, shape, focal_length_px: (
+            params["on_axis_illuminance_dn"] * _mean_falloff(shape, focal_length_px)
+        ),
+    )
     localised = False
     soft_layer = "vignetting_factor"
     thin_lens_only = "images fall off as its rays do, and cos⁴ would count that twice; use model 'lens'"
@@ -89,6 +96,12 @@ def _falloff(context: FaultContext) -> NDArray[np.float32]:
     """Return the falloff of the sample's thin lens, cos⁴θ without a calibration, float32[y, x]."""
     camera = context.camera
     return natural_falloff(camera.lens.calibration, context.shape, camera.focal_length_px)
+
+
+@lru_cache(maxsize=8)
+def _mean_falloff(shape: tuple[int, int], focal_length_px: float) -> float:
+    """Return the mean over the frame of cos⁴θ behind a thin lens."""
+    return float(natural_falloff(None, shape, focal_length_px).mean(dtype=np.float64))
 
 
 @lru_cache(maxsize=2)

@@ -55,6 +55,17 @@ class Region:
     inside: NDArray[np.bool_]
 
 
+def region_labels(mask: NDArray[np.bool_], discs: NDArray[np.float64] | None = None) -> NDArray[np.int32]:
+    """Return the number of the region of each pixel of a mask, int32[y, x], 0 outside of it; see `regions`."""
+    if discs is None or not len(discs):
+        return np.asarray(cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)[1])
+    y, x = np.nonzero(mask)
+    distance = np.hypot(x[:, None] + 0.5 - discs[:, 0], y[:, None] + 0.5 - discs[:, 1]) / discs[:, 2]
+    labels = np.zeros(mask.shape, dtype=np.int32)
+    labels[y, x] = 1 + np.argmin(distance, axis=1)
+    return labels
+
+
 def regions(mask: NDArray[np.bool_], discs: NDArray[np.float64] | None = None) -> list[Region]:
     """Return the regions of a mask, bool[y, x], in the order of their first pixel down the columns.
 
@@ -62,18 +73,22 @@ def regions(mask: NDArray[np.bool_], discs: NDArray[np.float64] | None = None) -
     pixels, a region is instead all pixels that are nearest to one disc, by their distance from its centre over its
     radius.
     """
-    if discs is None or not len(discs):
-        labels = np.asarray(cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)[1])
-    else:
-        y, x = np.nonzero(mask)
-        distance = np.hypot(x[:, None] + 0.5 - discs[:, 0], y[:, None] + 0.5 - discs[:, 1]) / discs[:, 2]
-        labels = np.zeros(mask.shape, dtype=np.int32)
-        labels[y, x] = 1 + np.argmin(distance, axis=1)
+    labels = region_labels(mask, discs)
     down = labels.T.ravel()  # down the columns, as COCO counts
     pixels = np.flatnonzero(down)
     by_label = pixels[np.argsort(down[pixels], kind="stable")]
     groups = np.split(by_label, 1 + np.flatnonzero(np.diff(down[by_label]))) if len(pixels) else []
     return [_region(group, mask.shape) for group in sorted(groups, key=lambda group: int(group[0]))]
+
+
+def class_discs(
+    spec: StoreSpec, index: int, parameters: Mapping[str, Any], fault: str, sun_xy_px: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return `flare_discs` of a class of a sample. Raises InputError if its parameters are not those of vbnfault."""
+    try:
+        return flare_discs(parameters.get(fault) or {}, sun_xy_px, (spec.height, spec.width))
+    except (TypeError, ValueError, KeyError, AttributeError):  # of a store that vbnfault did not write
+        raise InputError(f"sample {index}: parameters of {fault} list no flares as vbnfault does") from None
 
 
 def instances(
@@ -87,14 +102,7 @@ def instances(
     for fault, mask in zip(spec.faults, sample.layers["mask"], strict=True):
         found: list[Region] = []
         if fault in (spec.localised_faults or ()):
-            try:
-                discs = flare_discs(
-                    parameters.get(fault) or {}, sample.scalars["sun_xy_px"], (spec.height, spec.width)
-                )
-            except (TypeError, ValueError, KeyError, AttributeError):  # of a store that vbnfault did not write
-                raise InputError(
-                    f"sample {sample.index}: parameters of {fault} list no flares as vbnfault does"
-                ) from None
+            discs = class_discs(spec, sample.index, parameters, fault, sample.scalars["sun_xy_px"])
             found = regions(mask, discs)
         elif whole_frame and mask.any():
             found = [whole(mask)]

@@ -112,7 +112,7 @@ def export_store(
         "samples": store.samples,
         "masks": masks,
         "min_area_px": min_area_px,
-        "contents_sha256": _contents_sha256(store),
+        "contents_sha256": contents_sha256(store),
     }
     with locked(target), disk.explained(target, "writing the export"):
         folder, parts = Folder(target), _parts(store, kind.samples_of_part(store.spec), min_area_px)
@@ -164,7 +164,7 @@ def _check_masks(store: Store, kind: Format, masks: str) -> None:
         raise InputError(f"--masks {masks}: {kind.name} writes every mask of the store by its name; leave it out")
 
 
-def _contents_sha256(store: Store) -> str:
+def contents_sha256(store: Store) -> str:
     """Return a digest of the stored checksums of all layers and scalars, and of the layout of the store."""
     total = hashlib.sha256(json.dumps(store.spec.data, sort_keys=True).encode())
     for number in range(store.shards):
