@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -30,7 +31,8 @@ from .scores import (
 from .severity_labels import severity_labels
 
 if TYPE_CHECKING:
-    from .scoring import Samples, Tally
+    from .scored_samples import Samples
+    from .scoring import Tally
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -60,7 +62,7 @@ def json_result(
     classes: dict[str, Any] = {}
     estimates: dict[str, list[Estimate]] = {name: [] for name in (*MEANS, "par", "pap", "pamiou", "presence_ap")}
     for c, name in enumerate(samples.classes):
-        pixels = bootstrap.figures(tally.histograms[:, c], lambda sums, t=int(thresholds[c]): _of_pixels(sums, t))
+        pixels = bootstrap.figures(tally.histograms[:, c], partial(_of_pixels, threshold=int(thresholds[c])))
         ece = pixels.pop("ece")
         artefacts = bootstrap.figures(tally.artefacts[:, c], artefact_figures)
         presence = _presence(bootstrap, injected[:, c], tally.present[:, c])
@@ -74,12 +76,19 @@ def json_result(
             "pixels": _plain(pixels),
             "artefacts": {"true": int(number[0]), "predicted": int(number[3]), **_plain(artefacts)},
             "presence": _plain(presence),
-            "calibration": {"pixel_ece": ece.plain(), "reliability": _reliability(tally.histograms[:, c].sum(axis=0))},
+            "calibration": {
+                "pixel_ece": ece.plain(),
+                "reliability": _reliability(tally.histograms[:, c].sum(axis=0)),
+            },
             "severity": _severity(bootstrap, injected[:, c], severity[:, c], tally.severity[:, c]),
             "curve": _curve(tally.histograms[:, c].sum(axis=0, dtype=np.int64)),
         }
         if has_truth:
-            for of_mean, estimate in (*pixels.items(), *artefacts.items(), ("presence_ap", presence["average_precision"])):
+            for of_mean, estimate in (
+                *pixels.items(),
+                *artefacts.items(),
+                ("presence_ap", presence["average_precision"]),
+            ):
                 if of_mean in estimates:
                     estimates[of_mean].append(estimate)
     with_truth = [name for name, one in classes.items() if one["true_pixels_fraction"] > 0]
@@ -172,7 +181,11 @@ def _curve(histograms: NDArray[Any]) -> dict[str, list[float]]:
     """Return the precision-recall curve where it changes, thresholds rising."""
     precision, recall = precision_recall(histograms)
     changes = np.flatnonzero(np.any(histograms, axis=0) & np.isfinite(recall) & np.isfinite(precision))
-    columns = {"threshold": (changes - 0.5).clip(0) / (BINS - 1), "precision": precision[changes], "recall": recall[changes]}
+    columns = {
+        "threshold": (changes - 0.5).clip(0) / (BINS - 1),
+        "precision": precision[changes],
+        "recall": recall[changes],
+    }
     return {name: [round(float(v), 6) for v in values] for name, values in columns.items()}
 
 
@@ -187,7 +200,11 @@ def _false_alarms(
     alarm = tally.predicted_px > 0
     told = (tally.present >= 0.5).any(axis=1)
     out: dict[str, Any] = {}
-    for name, chosen in (("all", nominal), ("sun_in_view", nominal & in_view), ("no_sun_in_view", nominal & ~in_view)):
+    for name, chosen in (
+        ("all", nominal),
+        ("sun_in_view", nominal & in_view),
+        ("no_sun_in_view", nominal & ~in_view),
+    ):
         number = chosen.astype(np.float64)
         out[name] = {
             "frames": int(chosen.sum()),

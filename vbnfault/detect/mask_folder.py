@@ -106,8 +106,10 @@ class MaskFolder:
                 raise InputError("a mask must be a grey PNG of 8 bits, 255 for a probability of 1")
             if numbers.shape[:2] != self._shape:
                 rows, columns = numbers.shape[:2]
-                raise InputError(f"has {columns} x {rows} pixels; must be {width} x {height}, as the store's images")
-            return numbers[..., 0] / np.float32(255)
+                raise InputError(
+                    f"has {columns} x {rows} pixels; must be {width} x {height}, as the store's images"
+                )
+            return np.asarray(numbers[..., 0], np.float32) / np.float32(255)
 
 
 def _numbered(folder: Path) -> dict[int, Path]:

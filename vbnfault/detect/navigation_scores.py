@@ -36,10 +36,11 @@ _GRID = 16  # points along each side of the frame that measure the overlap
 def frame_errors(
     clean: NDArray[np.uint8], image: NDArray[np.uint8], semantic: NDArray[np.uint8] | None, masks: Sequence[Mask]
 ) -> F64:
-    """Return what masks change in one frame, float64[variant, 3]: the limb's RMS error in px, wrong and all matches.
+    """Return what masks change in one frame, float64[variant, 3].
 
-    Matches are those of the clean twin and the image, which show one view: right ones lie within 3 px of their
-    place. The limb's error is nan where a variant leaves fewer than 8 edges, or the frame shows no limb.
+    The columns are the limb's RMS error in px, the number of wrong matches and that of all. Matches are those of the
+    clean twin and the image, which show one view: right ones lie within 3 px of their place. The limb's error is nan
+    where a variant leaves fewer than 8 edges, or the frame shows no limb.
 
     Parameters
     ----------
@@ -56,10 +57,10 @@ def frame_errors(
         if not limb.reason:
             measured = limb.xy + limb.displacements_px[:, None] * limb.normals
             for row, mask in zip(out, masks, strict=True):
-                kept = limb.displacements_px[~_inside(mask, measured)]
-                row[0] = np.sqrt(np.mean(kept**2)) if len(kept) >= _LEAST_EDGES else np.nan
+                moved_px = limb.displacements_px[~_inside(mask, measured)]
+                row[0] = np.sqrt(np.mean(moved_px**2)) if len(moved_px) >= _LEAST_EDGES else np.nan
     matches = navigation.match(clean, image)
-    wrong = np.hypot(*(matches.first_xy - matches.second_xy).T) > _RIGHT_WITHIN_PX
+    wrong = np.linalg.norm(matches.first_xy - matches.second_xy, axis=1) > _RIGHT_WITHIN_PX
     for row, mask in zip(out, masks, strict=True):
         kept = ~_inside(mask, matches.second_xy)
         row[1:] = np.count_nonzero(wrong & kept), np.count_nonzero(kept)
@@ -149,8 +150,8 @@ def sees_the_same(first: navigation.CameraView, second: navigation.CameraView, s
     ground = np.isfinite(first.depth_at(xy))
     with np.errstate(invalid="ignore"):
         moved = navigation.reprojected(xy, first, second)
-        inside = ((moved >= 0) & (moved < (width, height))).all(axis=1)
-    return bool(ground.sum() >= _GRID and inside[ground].mean() >= _LEAST_OVERLAP)
+        inside = np.all((moved >= 0) & (moved < (width, height)), axis=1)
+    return bool(ground.sum() >= _GRID and np.mean(inside[ground]) >= _LEAST_OVERLAP)
 
 
 def pair_errors(
@@ -211,6 +212,11 @@ def pair_summary(errors: F64, bootstrap: Bootstrap | None, reason: str) -> dict[
     out: dict[str, Any] = {"pairs": len(errors)}
     for k, variant in enumerate((*VARIANTS, "clean")):
         out[variant] = {
-            f"{name}_deg": bootstrap.median(errors[:, k, j]).plain() for j, name in enumerate(("rotation", "translation"))
-        } | {"without_pose_fraction": bootstrap.fraction(errors[:, k, 0] >= _NO_POSE_DEG, np.ones(len(errors))).plain()}
+            f"{name}_deg": bootstrap.median(errors[:, k, j]).plain()
+            for j, name in enumerate(("rotation", "translation"))
+        } | {
+            "without_pose_fraction": bootstrap.fraction(
+                errors[:, k, 0] >= _NO_POSE_DEG, np.ones(len(errors))
+            ).plain()
+        }
     return out

@@ -34,25 +34,27 @@ from .figures import class_iou
 from .navigation_scores import VARIANTS
 
 if TYPE_CHECKING:
-    from .scoring import Batch, Samples, Tally
+    from .scored_samples import Batch, Samples
+    from .scoring import Tally
 
 U8 = NDArray[np.uint8]
 
-# Heading and place in the result of a class, of the columns of the tables.
-COLUMNS = {
-    "IoU": ("pixels", "iou"),
-    "precision": ("pixels", "precision"),
-    "recall": ("pixels", "recall"),
-    "F1": ("pixels", "f1"),
-    "AP": ("pixels", "average_precision"),
-    "PaR": ("artefacts", "par"),
-    "PaP": ("artefacts", "pap"),
-    "PamIoU": ("artefacts", "pamiou"),
-    "ECE": ("calibration", "pixel_ece"),
-    "presence AP": ("presence", "average_precision"),
-    "ROC AUC": ("presence", "roc_auc"),
+# Heading, place in the result of a class, and name among the means, of the columns of both tables of classes.
+PIXELS = {
+    "IoU": ("pixels", "iou", "iou"),
+    "precision": ("pixels", "precision", "precision"),
+    "recall": ("pixels", "recall", "recall"),
+    "F1": ("pixels", "f1", "f1"),
+    "AP": ("pixels", "average_precision", "average_precision"),
+    "ECE": ("calibration", "pixel_ece", ""),
 }
-_OF_MEAN = ("iou", "precision", "recall", "f1", "average_precision", "par", "pap", "pamiou")
+ARTEFACTS = {
+    "PaR": ("artefacts", "par", "par"),
+    "PaP": ("artefacts", "pap", "pap"),
+    "PamIoU": ("artefacts", "pamiou", "pamiou"),
+    "presence AP": ("presence", "average_precision", "presence_ap"),
+    "presence ROC AUC": ("presence", "roc_auc", ""),
+}
 _GROUPS = {"all": "all", "sun_in_view": "Sun in view", "no_sun_in_view": "no Sun in view"}
 _MASKS = {"without": "no mask", "predicted": "predicted mask", "true": "true mask", "clean": "clean twins"}
 _CASES, _SIDE_PX, _GAP_PX = 3, 320, 6
@@ -64,32 +66,34 @@ def write_pages(folder: Path, result: Mapping[str, Any], samples: Samples, tally
     """Write `score.md` and `score.html` to a folder. Raises OSError if a file cannot be written."""
     from .scoring import PAGE, TABLE
 
-    table, facts, navigation = _class_rows(result), _facts(result), _navigation_rows(result["navigation"])
+    navigation = result["navigation"]
     shared = {
         "result": result,
-        "facts": facts,
+        "facts": _facts(result),
         "notes": _notes(result),
-        "reasons": _reasons(result["navigation"]),
+        "classes": [(["class", *columns], _class_rows(result, columns)) for columns in (PIXELS, ARTEFACTS)],
         "false_alarms": _alarm_rows(result),
         "severity": _severity_rows(result),
-        "navigation": navigation,
+        "kept": with_interval(navigation["good_pixels_kept"], percent=True),
+        "let": with_interval(navigation["bad_pixels_let_through"], percent=True),
+        "navigation": _navigation_rows(navigation),
         "masks": list(_MASKS.values()),
-        "columns": ["class", *COLUMNS],
-        "kept": with_interval(result["navigation"]["good_pixels_kept"], percent=True),
-        "let": with_interval(result["navigation"]["bad_pixels_let_through"], percent=True),
+        "reasons": _reasons(navigation),
     }
-    text = rendered("detect/score.md", table=table, as_table=lambda head, rows: "\n".join(markdown_table([head, *rows])), **shared)
-    write_whole(own(folder / TABLE), text)
+
+    def as_table(head: list[str], rows: list[list[str]]) -> str:
+        return "\n".join(markdown_table([head, *rows]))
+
+    write_whole(own(folder / TABLE), rendered("detect/score.md", as_table=as_table, **shared))
     write_page(
         own(folder / PAGE),
         "detect/score.html",
-        table=table,
         drawings=[
             ("curves", "Precision and recall", _curves(result)),
             ("reliability", "Reliability", _reliability(result)),
             ("presence", "Presence", _presence(result)),
-            ("alarms", "False alarms", _alarms(result)),
         ],
+        alarms=_alarms(result),
         cases=_cases(samples, tally, thresholds),
         **shared,
     )
@@ -103,28 +107,31 @@ def with_interval(figure: Mapping[str, Any], percent: bool = False) -> str:
     value, low, high = (figure.get(name) for name in ("value", "low", "high"))
     if value is None:
         return "–"
-    factor, end = (100.0, "\N{NO-BREAK SPACE}%") if percent else (1.0, "")
-    text = number_text(factor * value) + end
-    return text if low is None or high is None else f"{text} ({number_text(factor * low)} to {number_text(factor * high)})"
+    values = [value] if low is None or high is None else [value, low, high]
+    if percent:
+        texts = [number_text(100 * one) for one in values]
+        texts[0] += "\N{NO-BREAK SPACE}%"
+    else:
+        texts = [f"{one:.3f}" for one in values]
+    return texts[0] if len(texts) == 1 else f"{texts[0]} ({texts[1]} to {texts[2]})"
 
 
-def _class_rows(result: Mapping[str, Any]) -> list[list[str]]:
-    """Return the table of classes, the last row of which is their mean."""
+def _class_rows(result: Mapping[str, Any], columns: Mapping[str, tuple[str, str, str]]) -> list[list[str]]:
+    """Return a table of classes, the last row of which is their mean."""
     rows = [
-        [name, *(with_interval(one[part][key]) for part, key in COLUMNS.values())]
+        [name, *(with_interval(one[part][key]) for part, key, _ in columns.values())]
         for name, one in result["classes"].items()
     ]
-    means = [with_interval(result["mean"][key]) if key in _OF_MEAN else "" for _, key in list(COLUMNS.values())[:8]]
-    presence = with_interval(result["mean"]["presence_ap"])
-    return [*rows, ["mean", *means, "", presence, ""]]
+    means = [with_interval(result["mean"][key]) if key else "" for *_, key in columns.values()]
+    return [*rows, ["mean", *means]]
 
 
 def _facts(result: Mapping[str, Any]) -> dict[str, str]:
     """Return what the head of the page says."""
     dataset, options = result["dataset"], result["options"]
     return {
-        "Model": f"{result['model']['name']} ({result['model']['sha256'][:12] or 'no file'})",
-        "Dataset": f"{dataset['name']} ({dataset['sha256'][:12]})",
+        "Model": f"{result['model']['name']} ({result['model']['sha256'][:8] or 'no file'})",
+        "Dataset": f"{dataset['name']} ({dataset['sha256'][:8]})",
         "Split": f"{options['split']}, {result['samples']} samples of {result['views']} views",
         "Size": f"{dataset['width_px']} × {dataset['height_px']} px",
         "True masks": options["masks"],
@@ -184,9 +191,14 @@ def _navigation_rows(navigation: Mapping[str, Any]) -> list[list[str]]:
     limb, matches, poses = (navigation.get(name) for name in ("limb_rms_px", "matches", "relative_pose"))
     rows: list[list[str]] = []
     if limb and limb["frames"]:
-        rows.append([f"limb, RMS, median of {limb['frames']} frames / px", *(with_interval(limb[v]) for v in VARIANTS), ""])
+        rows.append(
+            [f"limb, RMS, median of {limb['frames']} frames / px", *(with_interval(limb[v]) for v in VARIANTS), ""]
+        )
     if matches and matches["frames"]:
-        for key, text in (("wrong_fraction", "wrong ORB matches"), ("right_kept_fraction", "right ORB matches kept")):
+        for key, text in (
+            ("wrong_fraction", "wrong ORB matches"),
+            ("right_kept_fraction", "right ORB matches kept"),
+        ):
             cells = [with_interval(matches[v][key], percent=True) for v in VARIANTS]
             rows.append([f"{text}, {matches['frames']} frames", *cells, ""])
     if poses and poses["pairs"]:
@@ -297,7 +309,8 @@ def _dots(axes: Any, figures: Sequence[Mapping[str, Any]], offset: float, series
 def _series(names: Sequence[str]) -> list[Line2D]:
     """Return the legend of series of dots."""
     return [
-        Line2D([], [], color=SERIES_COLOURS[k], marker=SERIES_MARKERS[k], label=name) for k, name in enumerate(names)
+        Line2D([], [], color=SERIES_COLOURS[k], marker=SERIES_MARKERS[k], label=name)
+        for k, name in enumerate(names)
     ]
 
 
@@ -335,7 +348,9 @@ def _alarms(result: Mapping[str, Any]) -> Markup:
 # --- worst cases --------------------------------------------------------------------------------------------------
 
 
-def _cases(samples: Samples, tally: Tally, thresholds: NDArray[np.int64]) -> list[tuple[str, list[tuple[str, str]]]]:
+def _cases(
+    samples: Samples, tally: Tally, thresholds: NDArray[np.int64]
+) -> list[tuple[str, list[tuple[str, str]]]]:
     """Return the worst frames of each class: heading, and caption and image of each."""
     iou, names = class_iou(tally, thresholds), samples.classes
     nominal = ~samples.column("injected").astype(bool).any(axis=1)
@@ -365,7 +380,9 @@ def _cases(samples: Samples, tally: Tally, thresholds: NDArray[np.int64]) -> lis
 def _drawn(samples: Samples, wanted: Sequence[tuple[int, int]], thresholds: NDArray[np.int64]) -> Any:
     """Yield each wanted row and class with its image: the frame, the true mask and the predicted one beside it."""
     rows = sorted({row for row, _ in wanted})
-    of_row = {row: [c for _, c in group] for row, group in itertools.groupby(sorted(wanted), key=lambda pair: pair[0])}
+    of_row = {
+        row: [c for _, c in group] for row, group in itertools.groupby(sorted(wanted), key=lambda pair: pair[0])
+    }
     for batch in samples.batches(rows, ["masks"]):
         for k, row in enumerate(batch.rows.tolist()):
             for c in of_row[row]:
@@ -373,7 +390,7 @@ def _drawn(samples: Samples, wanted: Sequence[tuple[int, int]], thresholds: NDAr
 
 
 def _side_by_side(samples: Samples, batch: Batch, k: int, c: int, thresholds: NDArray[np.int64]) -> U8:
-    """Return a frame, the same with the true mask, and with the predicted one; `c` = -1: the masks of all classes."""
+    """Return a frame, the same with the true mask, and with the predicted one; `c` = -1: masks of all classes."""
     spec, rgb = samples.store.spec, batch.layers["image"][k][..., :3]
     predicted = batch.predictions[k][0] >= thresholds[:, None, None]
     truth = next(batch.layers[name] for name in batch.layers if name != "image")[k]
@@ -381,6 +398,6 @@ def _side_by_side(samples: Samples, batch: Batch, k: int, c: int, thresholds: ND
     localised = [spec.faults[i] in (spec.localised_faults or ()) for i in chosen]
     shown = [rgb]
     for masks in (truth[chosen], predicted[chosen]):
-        shown.append(overlay(rgb, masks, masks.any(axis=(1, 2)).tolist(), localised))
+        shown.append(overlay(rgb, masks, [bool(mask.any()) for mask in masks], localised))
     gap = np.full((len(rgb), max(1, rgb.shape[1] * _GAP_PX // _SIDE_PX), 3), 128, np.uint8)
     return np.hstack([shown[0], gap, shown[1], gap, shown[2]])
