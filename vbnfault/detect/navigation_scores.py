@@ -38,9 +38,9 @@ def frame_errors(
 ) -> F64:
     """Return what masks change in one frame, float64[variant, 3].
 
-    The columns are the limb's RMS error in px, the number of wrong matches and that of all. Matches are those of the
-    clean twin and the image, which show one view: right ones lie within 3 px of their place. The limb's error is nan
-    where a variant leaves fewer than 8 edges, or the frame shows no limb.
+    The columns are the limb's RMS error in px, the number of wrong matches and that of all. Matches are those of
+    the clean twin and the image, which show one view: right ones lie within 3 px of their place. The limb's error
+    is nan where a variant leaves fewer than 8 edges, or the frame shows no limb.
 
     Parameters
     ----------

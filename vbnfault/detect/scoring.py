@@ -69,7 +69,7 @@ def score(
     model: str | os.PathLike[str] | Detector,
     dataset: str | os.PathLike[str] | Store,
     out: Path,
-    options: ScoreOptions = ScoreOptions(),
+    options: ScoreOptions | None = None,
     advance: Callable[[int, int], Any] = lambda done, of: None,
 ) -> dict[str, Any]:
     """Score a model on a dataset, and write `score.json`, `score.md` and `score.html` to a folder.
@@ -99,7 +99,7 @@ def score(
     """
     from .score_page import write_pages  # matplotlib is loaded only for the pages
 
-    store = open_store(dataset)
+    options, store = options or ScoreOptions(), open_store(dataset)
     check_folder(out)
     if is_store(out):
         raise InputError(f"{out}: is a store, in which no other file may lie; choose another --out")
