@@ -1,7 +1,8 @@
 """Measure what predicted masks buy navigation: its errors without a mask, with the predicted one and with the true.
 
-The metrics are those of `vbnfault.navigation`. A mask is applied as a navigator would: an edge or a feature that
-was measured in a masked pixel is left out. The masks are unions over the classes of the store's `mask_any`.
+The metrics are those of `vbnfault.navigation`. A mask is applied as a navigator would: no feature is detected in a
+masked pixel, and an edge that was measured in one is left out. The masks are unions over the classes of the store's
+`mask_any`.
 """
 
 from __future__ import annotations
@@ -59,11 +60,10 @@ def frame_errors(
             for row, mask in zip(out, masks, strict=True):
                 moved_px = limb.displacements_px[~_inside(mask, measured)]
                 row[0] = np.sqrt(np.mean(moved_px**2)) if len(moved_px) >= _LEAST_EDGES else np.nan
-    matches = navigation.match(clean, image)
-    wrong = np.linalg.norm(matches.first_xy - matches.second_xy, axis=1) > _RIGHT_WITHIN_PX
     for row, mask in zip(out, masks, strict=True):
-        kept = ~_inside(mask, matches.second_xy)
-        row[1:] = np.count_nonzero(wrong & kept), np.count_nonzero(kept)
+        matches = navigation.match(clean, image, unused=(None, mask))
+        moved_px = np.linalg.norm(matches.first_xy - matches.second_xy, axis=1)
+        row[1:] = np.count_nonzero(moved_px > _RIGHT_WITHIN_PX), len(matches)
     return out
 
 
@@ -96,7 +96,7 @@ def frame_summary(errors: F64, bootstrap: Bootstrap, reason: str = "") -> dict[s
         limb[variant] = of_limb.plain()
         matches[variant] = {
             "wrong_fraction": bootstrap.fraction(counts[:, k, 0], counts[:, k, 1]).plain(),
-            "right_kept_fraction": bootstrap.fraction(right[:, k], right[:, 0]).plain(),
+            "right_fraction_of_unmasked": bootstrap.fraction(right[:, k], right[:, 0]).plain(),
         }
     if not compared.any():
         limb["reason"] = reason or "no frame with a fault shows a lit limb that each mask leaves"
@@ -127,7 +127,7 @@ def candidate_pairs(columns: Mapping[str, NDArray[Any]]) -> list[tuple[int, list
     """
     position, attitude = columns["camera_position_T_m"], columns["camera_from_T"]
     sun, site = columns["sun_direction_T"], columns["site"]
-    known = np.isfinite(position).all(axis=1) & np.isfinite(attitude).all(axis=1) & np.isfinite(sun).all(axis=1)
+    known = np.isfinite(np.concatenate([position, attitude, sun], axis=1)).all(axis=1)
     pairs = []
     for i in np.flatnonzero(known & columns["injected"].any(axis=1)).tolist():
         distance = np.linalg.norm(position - position[i], axis=1)
@@ -172,16 +172,12 @@ def pair_errors(
     masks
         The masks of each variant, of both samples.
     """
-    truth = _pose_error(navigation.match(*cleans), views)
+    truth = _pose_error(navigation.match(cleans[0], cleans[1]), views)
     if not np.isfinite(truth[0]):
         return None
-    matches = navigation.match(*images)
     rows = []
     for first, second in masks:
-        kept = ~(_inside(first, matches.first_xy) | _inside(second, matches.second_xy))
-        found = _pose_error(
-            navigation.Matches(first_xy=matches.first_xy[kept], second_xy=matches.second_xy[kept]), views
-        )
+        found = _pose_error(navigation.match(images[0], images[1], unused=(first, second)), views)
         rows.append(np.where(np.isfinite(found) | ~np.isfinite(truth), found, _NO_POSE_DEG))
     return np.array([*rows, truth])
 

@@ -197,7 +197,7 @@ def _navigation_rows(navigation: Mapping[str, Any]) -> list[list[str]]:
     if matches and matches["frames"]:
         for key, text in (
             ("wrong_fraction", "wrong ORB matches"),
-            ("right_kept_fraction", "right ORB matches kept"),
+            ("right_fraction_of_unmasked", "right ORB matches, of those without mask"),
         ):
             cells = [with_interval(matches[v][key], percent=True) for v in VARIANTS]
             rows.append([f"{text}, {matches['frames']} frames", *cells, ""])
