@@ -25,8 +25,12 @@ def score(
     ] = None,
     split: Annotated[Literal["train", "val", "test", "all"], typer.Option(help="Samples to score.")] = "test",
     masks: Annotated[
-        Literal["footprint", "effect"], typer.Option(help="Which masks of the dataset are the truth.")
-    ] = "footprint",
+        Literal["footprint", "effect"] | None,
+        typer.Option(
+            help="Which masks of the dataset are the truth.",
+            show_default="what the detector learned; footprint for a folder of masks",
+        ),
+    ] = None,
     calibrate: Annotated[
         bool, typer.Option("--calibrate", help="Take each class's threshold with the best F1 on val, not 0.5.")
     ] = False,
@@ -44,7 +48,13 @@ def score(
     from ..detect.scoring import score as compare
 
     options = ScoreOptions(
-        split=split, masks=masks, calibrate=calibrate, navigation=navigation, name=name, batch=batch, seed=seed
+        split=split,
+        masks=masks or "",
+        calibrate=calibrate,
+        navigation=navigation,
+        name=name,
+        batch=batch,
+        seed=seed,
     )
     folder = out or model.absolute().parent / f"{model.absolute().name}_on_{Path(dataset.rstrip('/')).stem}"
     with contextlib.ExitStack() as stack:

@@ -231,14 +231,14 @@ def _navigation(
 ) -> dict[str, Any]:
     """Return what the union of the predicted masks leaves a navigator, and the errors with it."""
     hit, wrong, missed, left = tally.union.T
-    truth = (left + wrong) / tally.union.sum(axis=1)
-    known = np.isfinite(tally.usable)
+    predicted, usable = tally.usable.T
+    known = np.isfinite(predicted)
     out = {
         "classes": list(samples.store.spec.mask_any_faults),
         "good_pixels_kept": bootstrap.fraction(left, left + wrong).plain(),
         "bad_pixels_let_through": bootstrap.fraction(missed, hit + missed).plain(),
         "usable_fraction_mean_absolute_error": bootstrap.fraction(
-            np.where(known, np.abs(np.nan_to_num(tally.usable) - truth), 0.0), known
+            np.where(known, np.abs(np.nan_to_num(predicted) - usable), 0.0), known
         ).plain(),
     }
     if not samples.options.navigation:

@@ -52,6 +52,7 @@ class MaskFolder:
         splits: Sequence[str],
         masks: str = "footprint",
     ) -> None:
+        self.masks = masks
         self.path, self._shape = path, (store.spec.height, store.spec.width)
         inside = {split: path / split / MASK_RULES[masks] for split in dict.fromkeys(splits)}
         self._root = {split: folder if folder.is_dir() else path for split, folder in inside.items()}

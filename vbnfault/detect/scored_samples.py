@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import InputError, VbnfaultError, shown
-from ..store import SPLITS, Store
+from ..store import MASK_RULES, SPLITS, Store
 from ..train import Columns, SampleReader, Targets
 from .prediction import Detector, Prediction
 from .scores import binned
 
 I64 = NDArray[np.int64]
 
-ALL = "all"
+ALL, FOOTPRINT, EFFECT = "all", "footprint", "effect"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,7 +29,8 @@ class ScoreOptions:
     split
         "train", "val", "test" or "all".
     masks
-        "footprint" or "effect": which masks of the store are the truth.
+        "footprint" or "effect": which masks of the store are the truth; "": those that the detector learned, and
+        footprints for a folder of masks.
     calibrate
         Take the threshold of each class that has the best F1 on the split val, instead of 0.5.
     navigation
@@ -43,7 +44,7 @@ class ScoreOptions:
     """
 
     split: str = "test"
-    masks: str = "footprint"
+    masks: str = ""
     calibrate: bool = False
     navigation: bool = True
     name: str = ""
@@ -53,6 +54,8 @@ class ScoreOptions:
     def __post_init__(self) -> None:
         if self.split not in (*SPLITS, ALL):
             raise InputError(f"split = {shown(self.split)}: must be one of {', '.join((*SPLITS, ALL))}")
+        if self.masks not in ("", *MASK_RULES):
+            raise InputError(f"masks = {shown(self.masks)}: must be one of {', '.join(MASK_RULES)}")
         if self.calibrate and self.split in ("val", ALL):
             raise InputError(
                 f"calibrate: the thresholds are chosen on the split val, so split = {self.split} cannot be scored "
@@ -62,6 +65,11 @@ class ScoreOptions:
 
 class Predictor(Protocol):
     """Describe what is scored: a detector or a folder of masks."""
+
+    @property
+    def masks(self) -> str:
+        """Return which masks the predictions mean, "footprint" or "effect"."""
+        ...
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -84,6 +92,11 @@ class OfImages:
 
     detector: Detector
     sha256: str = ""
+
+    @property
+    def masks(self) -> str:
+        """Return what the detector learned to mark."""
+        return str(getattr(self.detector, "masks", FOOTPRINT))
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -114,9 +127,15 @@ class Samples:
         What is scored, and how.
     indices
         The samples, int64[n].
+
+    Attributes
+    ----------
+    masks
+        "footprint" or "effect": which masks of the store are the truth.
     """
 
     def __init__(self, store: Store, predictor: Predictor, options: ScoreOptions, indices: I64) -> None:
+        self.masks = options.masks or predictor.masks
         self.store, self.predictor, self.options, self.indices = store, predictor, options, indices
         self.columns = Columns(store)
         self.place = np.searchsorted(self.columns.samples, indices)
@@ -135,7 +154,7 @@ class Samples:
 
         `size`: samples of a batch, by default those of the options; `predict`: whether predictions are needed.
         """
-        targets = Targets(self.store, names, masks=self.options.masks)
+        targets = Targets(self.store, names, masks=self.masks)
         reader, wanted = SampleReader(self.store, targets, threads=2), np.asarray(rows, dtype=np.int64)
         size = max(1, min(size or self.options.batch, len(wanted)))
         buffers = reader.buffers(size)

@@ -7,6 +7,7 @@ pages read the few samples again that they show.
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -19,14 +20,14 @@ from .. import __version__
 from ..core.errors import InputError
 from ..core.files.path_checks import check_folder
 from ..core.files.whole_files import own, write_json, writing
-from ..store import Store, is_store, open_store
-from ..train import Columns, Targets, select
+from ..store import MASK_RULES, Store, is_store, open_store
+from ..train import Columns, select
 from . import navigation_scores as nav
 from .artefacts import artefact_counts, artefact_labels, flares_of
 from .figures import json_result
 from .mask_folder import MODEL_FILE, MaskFolder
 from .prediction import Detector
-from .scored_samples import ALL, OfImages, Samples, ScoreOptions
+from .scored_samples import ALL, EFFECT, FOOTPRINT, OfImages, Samples, ScoreOptions
 from .scores import BINS, HALF, best_threshold, histogram
 
 I64 = NDArray[np.int64]
@@ -46,10 +47,13 @@ class Tally:
     predicted_px
         int64[sample, class + 1]: pixels of each predicted mask, and of the union of all.
     union
-        int64[sample, 4]: true positives, false positives, false negatives and true negatives of the union over the
-        classes of `mask_any`.
-    present, severity, usable
-        What the predictions say: float32[sample, class] each, float64[sample].
+        int64[sample, 4]: true positives, false positives, false negatives and true negatives of the union of the
+        predicted masks over the classes of `mask_any`. The truth is `mask_any`, or the union of their effects if
+        the masks are effects.
+    present, severity
+        What the predictions say, float32[sample, class] each.
+    usable
+        float64[sample, 2]: usable fraction as predicted, and outside `mask_any`.
     errors
         float64[sample, variant, 3]: `navigation_scores.frame_errors`; nan where no fault is injected.
     """
@@ -61,7 +65,7 @@ class Tally:
         self.union = np.zeros((samples, 4), np.int64)
         self.present = np.zeros((samples, classes), np.float32)
         self.severity = np.full((samples, classes), np.nan, np.float32)
-        self.usable = np.full(samples, np.nan)
+        self.usable = np.full((samples, 2), np.nan)
         self.errors = np.full((samples, len(nav.VARIANTS), 3), np.nan)
 
 
@@ -129,7 +133,7 @@ def score(
         "dataset": _described(store),
         "options": {
             "split": options.split,
-            "masks": options.masks,
+            "masks": samples.masks,
             "calibrate": options.calibrate,
             "seed": options.seed,
         },
@@ -156,20 +160,14 @@ def _samples(store: Store, model: Any, options: ScoreOptions, split: str) -> Sam
     if (path / MODEL_FILE).is_file():
         from .networks import load_detector  # type: ignore[import-not-found]  # only this needs PyTorch
 
-        return Samples(store, OfImages(load_detector(path), folder_sha256(path)), options, indices)
+        detector = load_detector(path)  # refuses a damaged file
+        record = (path / MODEL_FILE).read_bytes()
+        digest = json.loads(record).get("weights_sha256") or hashlib.sha256(record).hexdigest()
+        return Samples(store, OfImages(detector, digest), options, indices)
     columns = Columns(store)
     splits = columns["split"][np.searchsorted(columns.samples, indices)].tolist()
-    return Samples(store, MaskFolder(path, store, indices.tolist(), splits, options.masks), options, indices)
-
-
-def folder_sha256(folder: Path) -> str:
-    """Return a digest of the names and the contents of the files in a folder (hex)."""
-    total = hashlib.sha256()
-    for file in sorted(file for file in folder.rglob("*") if file.is_file()):
-        total.update(
-            f"{file.relative_to(folder).as_posix()}\0".encode() + hashlib.sha256(file.read_bytes()).digest()
-        )
-    return total.hexdigest()
+    masks = MaskFolder(path, store, indices.tolist(), splits, options.masks or FOOTPRINT)
+    return Samples(store, masks, options, indices)
 
 
 def _name(model: Any) -> str:
@@ -204,8 +202,7 @@ def _tally(
     has_semantic = "semantic" in spec.pixel_layers
     flares = [] if only_histograms else flares_of(samples.store, samples.indices)
     names = ["masks"] if only_histograms else ["masks", "mask_any", "clean", *["semantic"] * has_semantic]
-    mask_layer = Targets(samples.store, ["masks"], masks=samples.options.masks).layers[-1]
-    done = 0
+    mask_layer, done = MASK_RULES[samples.masks], 0
     for batch in samples.batches(np.arange(len(samples.indices)), names):
         for k, row in enumerate(batch.rows.tolist()):
             bins, prediction = batch.predictions[k]
@@ -219,10 +216,11 @@ def _tally(
                 tally.artefacts[row, c] = artefact_counts(labels, predicted[c])
             tally.predicted_px[row] = [*predicted.sum(axis=(1, 2)), predicted.any(axis=0).sum()]
             union, bad = predicted[in_any].any(axis=0), batch.layers["mask_any"][k]
+            tally.usable[row] = prediction.usable_fraction, 1 - bad.mean()
+            bad = truth[in_any].any(axis=0) if samples.masks == EFFECT else bad
             hit, wrong, missed = (np.count_nonzero(m) for m in (union & bad, union & ~bad, ~union & bad))
             tally.union[row] = hit, wrong, missed, bad.size - hit - wrong - missed
             tally.present[row], tally.severity[row] = prediction.present, prediction.severity
-            tally.usable[row] = prediction.usable_fraction
             if samples.options.navigation and injected[row].any():
                 semantic = batch.layers["semantic"][k] if has_semantic else None
                 masks = [np.zeros_like(bad), np.asarray(union), bad]
@@ -250,12 +248,14 @@ def _pairs(samples: Samples, thresholds: I64) -> tuple[tuple[NDArray[np.float64]
             views = view, nav.view_of(spec, scalars, j, None)
             if not nav.sees_the_same(*views, (spec.height, spec.width)):
                 continue
-            (pair,) = samples.batches([i, j], ["clean", "mask_any"], size=2)
+            (pair,) = samples.batches([i, j], ["clean", "masks", "mask_any"], size=2)
             unions = [np.any((bins >= thresholds[:, None, None])[in_any], axis=0) for bins, _ in pair.predictions]
             masks: list[list[Any]] = [
                 [np.zeros_like(mask) for mask in unions],
                 unions,
-                list(pair.layers["mask_any"]),
+                [layers[in_any].any(axis=0) for layers in pair.layers[MASK_RULES[EFFECT]]]
+                if samples.masks == EFFECT
+                else list(pair.layers["mask_any"]),
             ]
             found = nav.pair_errors(views, list(pair.layers["image"]), list(pair.layers["clean"]), masks)
             if found is not None:
