@@ -313,6 +313,7 @@ def test_an_empty_prediction_finds_nothing(labelled: Path, tmp_path: Path) -> No
     assert value(found["navigation"]["bad_pixels_let_through"]) == 1
     limb = found["navigation"]["limb_rms_px"]
     assert limb["predicted"] == limb["without"]
+    assert value(limb["without"]["hidden_fraction"]) in (0, None)
 
 
 def test_pixel_figures_are_those_of_all_pixels_together(labelled: Path, tmp_path: Path) -> None:
@@ -579,7 +580,7 @@ def test_a_bad_folder_is_refused_in_one_sentence(labelled: Path, tmp_path: Path)
 
 def test_the_command_writes_a_score(labelled: Path, tmp_path: Path, call: Any) -> None:
     folder = masks_of(labelled, tmp_path / "masks")
-    done = call("score", folder, labelled, "--name", "truth")
+    done = call("score", folder, labelled, "--name", "truth", "--navigation")
     assert done.code == 0, done.err
     out = tmp_path / "masks_on_labelled"
     assert f"page: {out / 'score.html'}" in done.out
@@ -592,7 +593,11 @@ def test_the_command_writes_a_score(labelled: Path, tmp_path: Path, call: Any) -
     page = (out / "score.html").read_text()
     assert page.count("<svg") == 4
     assert page.count("<img") >= len(FAULTS)
-    assert "| mean | 1.000 (1.000 to 1.000)" in (out / "score.md").read_text()
+    text = (out / "score.md").read_text()
+    assert "| mean | 1.000 (1.000 to 1.000)" in text
+    assert "wrong ORB matches" in text
+    assert call("score", folder, labelled, "--no-navigation").code == 0
+    assert "wrong ORB matches" not in (out / "score.md").read_text()
 
 
 def test_the_command_refuses_in_one_sentence(

@@ -309,6 +309,7 @@ def case_options(seeds: Seeds, rng: random.Random, here: Path) -> Case:
             "550",
         ],
         "list": ["list", "scenes"],
+        "score": ["score", out, str(seeds.store), "--split", "all", "--batch", "2"],
         "shape": ["shape", "Bennu", "--out", out, "--url", "http://127.0.0.1:9/bennu.bds"],  # nobody listens there
     }
     name = rng.choice(list(sound))
@@ -330,6 +331,7 @@ def case_options(seeds: Seeds, rng: random.Random, here: Path) -> Case:
         "report": ["--samples", "--pixels", "--out"],
         "export": ["--format", "--out", "--workers"],
         "merge": ["--out", "--move"],
+        "score": ["--out", "--split", "--masks", "--calibrate", "--batch", "--seed", "--name"],
         "lens": ["--vary-seed", "--spread", "--json", "--toml", "--out"],
         "flare": [
             "--sun-deg",

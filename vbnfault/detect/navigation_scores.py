@@ -91,9 +91,12 @@ def frame_summary(errors: F64, bootstrap: Bootstrap, reason: str = "") -> dict[s
     right = counts[..., 1] - counts[..., 0]
     limb: dict[str, Any] = {"frames": int(compared.sum())}
     matches: dict[str, Any] = {"frames": int(np.isfinite(errors[:, 0, 1]).sum())}
+    shown = np.isfinite(errors[:, 0, 0])
     for k, variant in enumerate(VARIANTS):
-        of_limb = bootstrap.median(np.where(compared, errors[:, k, 0], np.nan))
-        limb[variant] = of_limb.plain()
+        limb[variant] = {
+            "median": bootstrap.median(np.where(compared, errors[:, k, 0], np.nan)).plain(),
+            "hidden_fraction": bootstrap.fraction(shown & ~np.isfinite(errors[:, k, 0]), shown).plain(),
+        }
         matches[variant] = {
             "wrong_fraction": bootstrap.fraction(counts[:, k, 0], counts[:, k, 1]).plain(),
             "right_fraction_of_unmasked": bootstrap.fraction(right[:, k], right[:, 0]).plain(),

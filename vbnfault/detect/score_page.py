@@ -191,9 +191,10 @@ def _navigation_rows(navigation: Mapping[str, Any]) -> list[list[str]]:
     limb, matches, poses = (navigation.get(name) for name in ("limb_rms_px", "matches", "relative_pose"))
     rows: list[list[str]] = []
     if limb and limb["frames"]:
-        rows.append(
-            [f"limb, RMS, median of {limb['frames']} frames / px", *(with_interval(limb[v]) for v in VARIANTS), ""]
-        )
+        cells = [with_interval(limb[v]["median"]) for v in VARIANTS]
+        rows.append([f"limb, RMS, median of {limb['frames']} frames / px", *cells, ""])
+        cells = [with_interval(limb[v]["hidden_fraction"], percent=True) for v in VARIANTS]
+        rows.append(["limbs that the mask hides", *cells, ""])
     if matches and matches["frames"]:
         for key, text in (
             ("wrong_fraction", "wrong ORB matches"),
