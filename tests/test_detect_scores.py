@@ -397,7 +397,7 @@ def test_a_class_that_the_model_does_not_know_is_never_predicted(labelled: Path,
     assert [found["classes"][name]["predicted_by_model"] for name in FAULTS] == [True] * 3 + [False]
     assert value(found["classes"][FAULTS[3]]["pixels"]["iou"]) == 0
     assert value(found["mean"]["iou"]) == 0.75
-    assert f"does not know {FAULTS[3]}" in (tmp_path / "s/score.md").read_text()
+    assert f"count as never predicted: {FAULTS[3]}." in (tmp_path / "s/score.md").read_text()
 
 
 def test_a_class_that_the_store_does_not_have_is_left_out(labelled: Path, tmp_path: Path) -> None:

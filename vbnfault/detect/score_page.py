@@ -25,6 +25,7 @@ from ..core.figures import (
     row_height,
     svg_text,
     wrapped,
+    write_message,
 )
 from ..core.files.whole_files import own, write_whole
 from ..core.html_page import image_url, number_text, rendered, write_page
@@ -144,7 +145,7 @@ def _notes(result: Mapping[str, Any]) -> list[str]:
     """Return sentences on classes that are no matter of course."""
     notes = []
     if unknown := [name for name, one in result["classes"].items() if not one["predicted_by_model"]]:
-        notes.append(f"The model does not know {', '.join(unknown)}, which count as never predicted.")
+        notes.append(f"Classes that the model does not know count as never predicted: {', '.join(unknown)}.")
     if left_out := [name for name in result["classes"] if name not in result["classes_in_means"]]:
         notes.append(f"No pixel of {', '.join(left_out)} is in the split, so that the means leave them out.")
     if ignored := [name for name in result["model"]["classes"] if name not in result["classes"]]:
@@ -246,7 +247,10 @@ def _curves(result: Mapping[str, Any]) -> Markup:
     with panels("", _grid(len(classes)), _PANEL, legend=legend) as (figure, axes):
         for k, (one, (name, of_class)) in enumerate(zip(axes, classes.items(), strict=False)):
             curve, pixels = of_class["curve"], of_class["pixels"]
-            one.step(curve["recall"], curve["precision"], color=BLUE, where="pre")
+            if of_class["predicted_by_model"] and curve["recall"]:
+                one.step(curve["recall"], curve["precision"], color=BLUE, where="pre")
+            else:
+                write_message(one, "never predicted" if curve["recall"] else "not in the split")
             if pixels["precision"]["value"] is not None and pixels["recall"]["value"] is not None:
                 one.plot(pixels["recall"]["value"], pixels["precision"]["value"], "o", color=INK, ms=5, zorder=4)
             _unit_square(one)

@@ -217,17 +217,13 @@ class Bootstrap:
         statistic
             Gets histograms float64[n, 2, bin] and returns float64[n].
         """
-        scores, place = np.unique(np.asarray(score, dtype=np.float64), return_inverse=True)
-        weight = np.concatenate([np.ones((1, len(truth))), self._drawn[:, self.view]])
-        out = np.empty(len(weight))
-        one_hot = np.zeros((len(truth), len(scores)))
-        one_hot[np.arange(len(truth)), place] = 1
-        for first in range(0, len(weight), 64):  # a part at a time keeps the memory small
-            part = weight[first : first + 64]
-            out[first : first + 64] = statistic(
-                np.stack([(part * ~truth) @ one_hot, (part * truth) @ one_hot], axis=1)
-            )
-        return Estimate(float(out[0]), out[1:])
+        order = np.argsort(score, kind="stable")
+        ranked = np.asarray(score, dtype=np.float64)[order]
+        first = np.flatnonzero(np.diff(ranked, prepend=-np.inf))  # of each score that occurs
+        weight = np.concatenate([np.ones((1, len(truth))), self._drawn[:, self.view]])[:, order]
+        parts = [weight * ~truth[order], weight * truth[order]]
+        out = statistic(np.stack([np.add.reduceat(part, first, axis=1) for part in parts], axis=1))
+        return Estimate(float(out[0]), np.asarray(out[1:]))
 
     def median(self, values: NDArray[Any]) -> Estimate:
         """Return the median of the finite values, float[sample] with nan where a sample has none."""
