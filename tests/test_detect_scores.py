@@ -8,6 +8,7 @@ import math
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -23,6 +24,7 @@ from vbnfault.core.errors import InputError, VbnfaultError
 from vbnfault.core.quantities import BODY
 from vbnfault.detect import Prediction
 from vbnfault.detect.artefacts import artefact_counts, artefact_figures
+from vbnfault.detect.figures import view_numbers
 from vbnfault.detect.navigation_scores import VARIANTS, candidate_pairs, frame_errors, pair_errors
 from vbnfault.detect.scores import (
     BINS,
@@ -221,7 +223,8 @@ def labelled(tmp_path_factory: pytest.TempPathFactory) -> Path:
             if injected[k] and not mask[k].any():
                 mask[k, 8 + 4 * k : 16 + 4 * k, 5 + i : 11 + i] = True
                 mask[k] |= name not in LOCALISED
-        layers = made.layers | {"mask": mask, "mask_effect": mask, "mask_any": mask[:3].any(axis=0)}
+        effect = mask & (np.arange(56) % 2 == 0)
+        layers = made.layers | {"mask": mask, "mask_effect": effect, "mask_any": mask[:3].any(axis=0)}
         layers["image"] = np.where(mask.any(axis=0)[..., None], 200, made.layers["clean"]).astype(np.uint8)
         layers["image"][0, 0, 0] = i  # each image is another one
         scalars = made.scalars | {
@@ -316,6 +319,21 @@ def test_an_empty_prediction_finds_nothing(labelled: Path, tmp_path: Path) -> No
     assert value(limb["without"]["hidden_fraction"]) in (0, None)
 
 
+def test_a_detector_is_scored_by_what_it_learned(labelled: Path, tmp_path: Path) -> None:
+    detector, store = Known(labelled), st.open_store(labelled)
+    detector.masks = "effect"  # type: ignore[attr-defined]
+    found = score(detector, labelled, tmp_path / "s", ScoreOptions(navigation=False))
+    assert found["options"]["masks"] == "effect"
+    both = [store.read_sample(i, ("mask", "mask_effect")).layers for i in range(8)]
+    all_px, seen_px = (np.sum([one[name][:3].any(axis=0) for one in both]) for name in ("mask", "mask_effect"))
+    assert value(found["classes"][FAULTS[3]]["pixels"]["precision"]) == 0.5
+    assert value(found["classes"][FAULTS[3]]["pixels"]["recall"]) == 1
+    kept = 1 - (all_px - seen_px) / (8 * 48 * 56 - seen_px)
+    assert value(found["navigation"]["good_pixels_kept"]) == pytest.approx(kept)
+    again = score(detector, labelled, tmp_path / "s", ScoreOptions(navigation=False, masks="footprint"))
+    assert value(again["mean"]["iou"]) == 1
+
+
 def test_pixel_figures_are_those_of_all_pixels_together(labelled: Path, tmp_path: Path) -> None:
     def noisy(masks: np.ndarray, index: int) -> np.ndarray:
         rng = np.random.default_rng(index)
@@ -360,13 +378,13 @@ def test_false_alarms_with_the_sun_in_view_and_without(labelled: Path, tmp_path:
 
 def test_thresholds_are_calibrated_on_val_alone(labelled: Path, tmp_path: Path) -> None:
     def timid(masks: np.ndarray, index: int) -> np.ndarray:
-        return 0.1 + (0.2 if index >= 8 else 0.3) * masks
+        return 0.2 + 0.2 * masks if index >= 8 else 0.1 + 0.3 * masks
 
     assert value(scored(labelled, tmp_path, timid)["mean"]["iou"]) == 0
     found = scored(labelled, tmp_path, timid, calibrate=True)
     assert value(found["mean"]["iou"]) == 1
-    # the lowest threshold that tells 0.3 from 0.1 = 25.5/255, which rounds to bin 26
-    assert found["classes"][FAULTS[0]]["threshold"] == pytest.approx(26.5 / 255)
+    # the lowest that tells 0.4 from 0.2 = 51/255, which samples of val alone have
+    assert found["classes"][FAULTS[0]]["threshold"] == pytest.approx(51.5 / 255)
 
 
 def test_severity_is_compared_in_levels(labelled: Path, tmp_path: Path) -> None:
@@ -405,7 +423,7 @@ def test_a_class_that_the_store_does_not_have_is_left_out(labelled: Path, tmp_pa
         return np.concatenate([np.ones_like(masks[:1]), masks])
 
     found = scored(labelled, tmp_path, more, classes=("of_a_plug_in", *FAULTS), navigation=False)
-    assert value(found["mean"]["iou"]) == 1
+    assert value(found["mean"]["iou"]) == value(found["classes"][FAULTS[0]]["presence"]["roc_auc"]) == 1
     assert "does not have of_a_plug_in" in (tmp_path / "s/score.md").read_text()
 
 
@@ -500,6 +518,28 @@ def test_a_mask_saves_the_pose_from_defects_that_do_not_move() -> None:
     lost = pair_errors(views, blank, cleans, [nothing])
     assert lost is not None
     assert lost[0].tolist() == [180, 180]
+
+
+def test_no_feature_is_detected_in_a_masked_pixel() -> None:
+    """Patches that hide the ground cost right matches; a mask gives their features to the ground again."""
+    clean = np.repeat(textured(4)[:256, :256, None], 4, axis=2)
+    image, mask, rng = clean.copy(), np.zeros((256, 256), bool), np.random.default_rng(8)
+    for x, y in rng.integers(16, 230, (120, 2)):
+        mask[y : y + 7, x : x + 7] = True
+        image[y : y + 7, x : x + 7] = rng.integers(0, 2, (7, 7, 1)).astype(np.uint8) * 255
+    (_, *without), (_, *masked) = frame_errors(clean, image, None, [np.zeros_like(mask), mask])
+    assert masked[1] - masked[0] > 1.2 * (without[1] - without[0])
+
+
+def test_samples_of_one_pose_are_of_one_view_and_those_without_are_their_own() -> None:
+    columns = {
+        "camera_position_T_m": np.array([[0.0, 0, 0], [0, 0, 0], [1, 0, 0], [np.nan] * 3, [np.nan] * 3]),
+        "camera_from_T": np.tile([1.0, 0, 0, 0], (5, 1)),
+        "sun_direction_T": np.tile([1.0, 0, 0], (5, 1)),
+    }
+    number = view_numbers(SimpleNamespace(column=columns.__getitem__))  # type: ignore[arg-type]
+    assert number[0] == number[1]
+    assert len(set(number.tolist())) == 4
 
 
 def test_pairs_are_of_one_site_under_one_sun() -> None:
@@ -660,3 +700,20 @@ def test_a_value_milder_than_the_mildest_is_level_0() -> None:
     """A blur by 3 px in a frame of 256 px is less than none in one of 1024 px, whose logarithm does not exist."""
     params = {"model": "gaussian", "filter_size_px": 3}
     assert severity_level("optics_degradation", params, (256, 256), 200.0, Levels().table) == 0
+
+
+def test_a_level_is_linear_in_the_logarithm_of_its_value() -> None:
+    """Half way from the mildest value, 1 in a frame of 1024 px, to the first level, and then to the second."""
+    values = np.array(Levels().table.levels["broken_pixels"]["texture"].values)
+    values *= 4  # the table's frames have 256 px
+
+    def level(count: float) -> float:
+        params = {"model": "texture", "x": [0] * round(count)}
+        return severity_level("broken_pixels", params, (1024, 1024), 900.0, Levels().table)
+
+    # a count is rounded to a whole number of about 14 and 270
+    assert level(math.sqrt(values[0])) == pytest.approx(0.5, abs=0.5 / 14 / math.log(values[0]) + 1e-9)
+    assert level(math.sqrt(values[0] * values[1])) == pytest.approx(
+        1.5, abs=0.5 / 270 / math.log(values[1] / values[0])
+    )
+    assert level(9999) == 5
