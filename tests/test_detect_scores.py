@@ -295,7 +295,10 @@ def test_a_perfect_prediction_scores_one_everywhere(labelled: Path, tmp_path: Pa
     assert {value(figure) for figure in found["mean"].values()} == {1.0}
     for of_class in found["classes"].values():
         assert {value(of_class["pixels"][name]) for name in ("iou", "precision", "recall", "f1")} == {1.0}
-        assert value(of_class["calibration"]["pixel_ece"]) == 0
+        assert value(of_class["calibration"]["pixel_ece"]) == value(of_class["calibration"]["presence_ece"]) == 0
+        frames = of_class["calibration"]["presence_reliability"]
+        assert [(b["frequency"], b["mean_probability"]) for b in frames] == [(0, 0), (1, 1)]
+        assert sum(b["count"] for b in frames) == 8
         assert value(of_class["presence"]["roc_auc"]) == 1
     alarms = found["false_alarms"]
     assert (alarms["all"]["frames"], alarms["sun_in_view"]["frames"]) == (2, 2)

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
-MEANS = ("iou", "precision", "recall", "f1", "average_precision")
+MEANS = ("iou", "precision", "recall", "f1", "average_precision", "par", "pap", "pamiou", "presence_ap")
 _WITHIN = 1.0  # level of severity
 
 
@@ -60,42 +60,38 @@ def json_result(
     injected = samples.column("injected").astype(bool)
     severity = severity_labels(samples.store, samples.indices)
     classes: dict[str, Any] = {}
-    estimates: dict[str, list[Estimate]] = {name: [] for name in (*MEANS, "par", "pap", "pamiou", "presence_ap")}
+    estimates: dict[str, list[Estimate]] = {name: [] for name in MEANS}
     for c, name in enumerate(samples.classes):
+        counted = tally.histograms[:, c].sum(axis=0, dtype=np.int64)
         pixels = bootstrap.figures(tally.histograms[:, c], partial(_of_pixels, threshold=int(thresholds[c])))
-        ece = pixels.pop("ece")
         artefacts = bootstrap.figures(tally.artefacts[:, c], artefact_figures)
-        presence = _presence(bootstrap, injected[:, c], tally.present[:, c])
+        presence, of_frames = _presence(bootstrap, injected[:, c], tally.present[:, c])
         number = tally.artefacts[:, c].sum(axis=0)
-        has_truth = bool(tally.histograms[:, c, 1].any())
+        eces = {"pixel_ece": pixels.pop("ece"), "presence_ece": presence.pop("ece")}
         classes[name] = {
             "predicted_by_model": c in samples.known,
             "threshold": (int(thresholds[c]) - 0.5) / (BINS - 1),
             "frames": int(injected[:, c].sum()),
-            "true_pixels_fraction": float(ratio(tally.histograms[:, c, 1].sum(), tally.histograms[:, c].sum())),
+            "true_pixels_fraction": float(ratio(counted[1].sum(), counted.sum())),
             "pixels": _plain(pixels),
             "artefacts": {"true": int(number[0]), "predicted": int(number[3]), **_plain(artefacts)},
             "presence": _plain(presence),
             "calibration": {
-                "pixel_ece": ece.plain(),
-                "reliability": _reliability(tally.histograms[:, c].sum(axis=0)),
+                **_plain(eces),
+                "pixel_reliability": _reliability(counted),
+                "presence_reliability": _reliability(of_frames),
             },
             "severity": _severity(bootstrap, injected[:, c], severity[:, c], tally.severity[:, c]),
-            "curve": _curve(tally.histograms[:, c].sum(axis=0, dtype=np.int64)),
+            "curve": _curve(counted),
         }
-        if has_truth:
-            for of_mean, estimate in (
-                *pixels.items(),
-                *artefacts.items(),
-                ("presence_ap", presence["average_precision"]),
-            ):
-                if of_mean in estimates:
-                    estimates[of_mean].append(estimate)
-    with_truth = [name for name, one in classes.items() if one["true_pixels_fraction"] > 0]
+        if counted[1].any():
+            found = {**pixels, **artefacts, "presence_ap": presence["average_precision"]}
+            for of_mean in MEANS:
+                estimates[of_mean].append(found[of_mean])
     return {
         "samples": len(samples.indices),
         "views": bootstrap.views,
-        "classes_in_means": with_truth,
+        "classes_in_means": [name for name, one in classes.items() if one["true_pixels_fraction"] > 0],
         "mean": {name: Estimate.mean(values).plain() for name, values in estimates.items()},
         "classes": classes,
         "severity": _severity(bootstrap, injected, severity, tally.severity),
@@ -132,18 +128,18 @@ def _of_pixels(sums: F64, threshold: int) -> dict[str, F64]:
     }
 
 
-def _presence(bootstrap: Bootstrap, truth: NDArray[np.bool_], present: NDArray[np.float32]) -> dict[str, Estimate]:
-    """Return how well a class is told present or not, frame by frame."""
+def _presence(
+    bootstrap: Bootstrap, truth: NDArray[np.bool_], present: NDArray[np.float32]
+) -> tuple[dict[str, Estimate], I64]:
+    """Return how well a class is told present or not, and a histogram of the frames, int64[2, 256]."""
     bins = binned(present)
     histograms = np.stack([histogram(t, b) for t, b in zip(truth[:, None], bins[:, None], strict=True)])
     figures = bootstrap.figures(
         histograms, lambda sums: {"f1": pixel_figures(sums, HALF)["f1"], "ece": calibration_error(sums)}
     )
-    return {
-        "average_precision": bootstrap.ranked(truth, present, average_precision),
-        "roc_auc": bootstrap.ranked(truth, present, roc_auc),
-        **figures,
-    }
+    areas = {"average_precision": average_precision, "roc_auc": roc_auc}
+    ranked = {name: bootstrap.ranked(truth, present, area) for name, area in areas.items()}
+    return {**ranked, **figures}, histograms.sum(axis=0)
 
 
 def _severity(
@@ -163,13 +159,13 @@ def _severity(
 
 
 def _reliability(histograms: NDArray[Any]) -> list[dict[str, Any]]:
-    """Return the bins of a reliability diagram with at least one pixel."""
+    """Return the bins of a reliability diagram that hold a pixel, or a frame."""
     number, expected, positive = reliability(histograms)
     return [
         {
             "from": k / RELIABILITY_BINS,
             "to": (k + 1) / RELIABILITY_BINS,
-            "pixels": int(number[k]),
+            "count": int(number[k]),
             "mean_probability": float(expected[k] / number[k]),
             "frequency": float(positive[k] / number[k]),
         }

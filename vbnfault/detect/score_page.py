@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -229,23 +230,33 @@ def _grid(count: int) -> tuple[int, int]:
     return -(-count // across), across
 
 
-def _unit_square(axes: Any) -> None:
-    """Give a panel axes from 0 to 1, and room for marks at its rim."""
-    axes.set_xlim(-0.03, 1.03)
-    axes.set_ylim(-0.03, 1.03)
-    axes.set_xticks((0, 0.5, 1))
-    axes.set_yticks((0, 0.5, 1))
+@contextlib.contextmanager
+def _panel_of_each(
+    classes: Mapping[str, Any], below: str, left: str, legend: Sequence[Any] = ()
+) -> Iterator[tuple[Any, list[tuple[Any, Any]]]]:
+    """Give a figure, and a labelled panel with axes from 0 to 1 for each class, with its result."""
+    rows, across = _grid(len(classes))
+    with panels("", (rows, across), _PANEL, legend=legend) as (figure, axes):
+        yield figure, list(zip(axes, classes.values(), strict=False))
+        for k, (one, name) in enumerate(zip(axes, classes, strict=False)):
+            one.set(xlim=(-0.03, 1.03), ylim=(-0.03, 1.03), xticks=(0, 0.5, 1), yticks=(0, 0.5, 1))
+            one.set_title(wrapped(name, 24))
+            if k % across == 0:
+                one.set_ylabel(left)
+            if k + across >= len(classes):
+                one.set_xlabel(below)
+        for one in axes[len(classes) :]:
+            one.set_axis_off()
 
 
 def _curves(result: Mapping[str, Any]) -> Markup:
     """Return precision over recall of each class, with a mark at its threshold."""
-    classes = result["classes"]
     legend = [
         Line2D([], [], color=BLUE, label="any threshold"),
         Line2D([], [], color=INK, marker="o", ls="", label="threshold of the score"),
     ]
-    with panels("", _grid(len(classes)), _PANEL, legend=legend) as (figure, axes):
-        for k, (one, (name, of_class)) in enumerate(zip(axes, classes.items(), strict=False)):
+    with _panel_of_each(result["classes"], "recall", "precision", legend) as (figure, axes):
+        for one, of_class in axes:
             curve, pixels = of_class["curve"], of_class["pixels"]
             if of_class["predicted_by_model"] and curve["recall"]:
                 one.step(curve["recall"], curve["precision"], color=BLUE, where="pre")
@@ -253,44 +264,20 @@ def _curves(result: Mapping[str, Any]) -> Markup:
                 write_message(one, "never predicted" if curve["recall"] else "not in the split")
             if pixels["precision"]["value"] is not None and pixels["recall"]["value"] is not None:
                 one.plot(pixels["recall"]["value"], pixels["precision"]["value"], "o", color=INK, ms=5, zorder=4)
-            _unit_square(one)
-            one.set_title(wrapped(name, 24))
-            _label(one, k, len(classes), "recall", "precision")
-        _hide_rest(axes, len(classes))
     return inline_svg(svg_text(figure), "curves", "Precision over recall of each class")
 
 
 def _reliability(result: Mapping[str, Any]) -> Markup:
     """Return frequency over mean probability of each class; larger dots stand for more pixels."""
-    classes = result["classes"]
-    with panels("", _grid(len(classes)), _PANEL) as (figure, axes):
-        for k, (one, (name, of_class)) in enumerate(zip(axes, classes.items(), strict=False)):
-            bins = of_class["calibration"]["reliability"]
-            size = np.log10([b["pixels"] + 1.0 for b in bins])
+    with _panel_of_each(result["classes"], "probability", "frequency") as (figure, axes):
+        for one, of_class in axes:
+            bins = of_class["calibration"]["pixel_reliability"]
+            size = np.log10([b["count"] + 1.0 for b in bins])
             one.plot((0, 1), (0, 1), color=MUTED, lw=0.8, ls=(0, (3, 2)))
             x, y = ([b[key] for b in bins] for key in ("mean_probability", "frequency"))
             one.plot(x, y, color=BLUE, lw=0.8)
             one.scatter(x, y, s=3.5 * size**2, color=BLUE, zorder=3, linewidths=0, clip_on=False)
-            _unit_square(one)
-            one.set_title(wrapped(name, 24))
-            _label(one, k, len(classes), "probability", "frequency")
-        _hide_rest(axes, len(classes))
     return inline_svg(svg_text(figure), "reliability", "Frequency over probability of each class")
-
-
-def _label(axes: Any, k: int, count: int, below: str, left: str) -> None:
-    """Label the axes of panel `k` at the left and at the bottom of the grid."""
-    across = _grid(count)[1]
-    if k % across == 0:
-        axes.set_ylabel(left)
-    if k + across >= count:
-        axes.set_xlabel(below)
-
-
-def _hide_rest(axes: Sequence[Any], count: int) -> None:
-    """Hide the panels that no class needs."""
-    for one in axes[count:]:
-        one.set_axis_off()
 
 
 def _dots(axes: Any, figures: Sequence[Mapping[str, Any]], offset: float, series: int) -> None:
