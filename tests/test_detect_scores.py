@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 from sklearn import metrics
-from synthetic import FAULTS, LOCALISED, fake_sample, make_spec
+from synthetic import FAULTS, LOCALISED, fake_sample, filled, make_spec
 from test_faults_kit import make_context, with_mosaic
 
 from vbnfault import navigation
@@ -641,6 +641,20 @@ def test_the_command_writes_a_score(labelled: Path, tmp_path: Path, call: Any) -
     assert "wrong ORB matches" in text
     assert call("score", folder, labelled, "--no-navigation").code == 0
     assert "wrong ORB matches" not in (out / "score.md").read_text()
+
+
+def test_a_trained_detector_is_scored(tmp_path: Path, call: Any) -> None:
+    pytest.importorskip("torch", reason="PyTorch is not installed: pip install '.[torch]'")
+    model, store = tmp_path / "detector", filled(tmp_path / "made.zarr", size=40).path
+    done = call("train", store, "--out", model, "--epochs", 1, "--crop-px", 32, "--batch-size", 2)
+    assert done.code == 0, done.err
+    done = call("score", model, store, "--no-navigation")
+    assert done.code == 0, done.err
+    found = json.loads((tmp_path / "detector_on_made/score.json").read_text())
+    record = json.loads((model / "model.json").read_text())
+    assert found["model"]["sha256"] == record["weights_sha256"]
+    assert found["options"]["masks"] == record["options"]["masks"]
+    assert found["severity"]["truth_unknown"] > 0  # the models of the store are made up
 
 
 def test_the_command_refuses_in_one_sentence(

@@ -47,6 +47,7 @@ SAMPLES_OF_PAGES = {
 SMALLER = {
     "detector": ["--pixels", "64", "--points", "12", "--stack", "4"],
     "flare": ["--pixels", "64", "--wavelength-nm", "550"],
+    "train": ["--epochs", "1", "--batch-size", "2"],
 }
 BASE_SAMPLES = 8  # of a study
 RAYS_ACROSS = 96  # of a ghost

@@ -4,7 +4,7 @@ The commands stand in one file per group. They hold no physics and no checks bey
 options, and they import the library only when they run, so that `vbnfault --help` stays fast.
 """
 
-from . import datasets, instruments, realism, scores, studies, support  # each registers its commands
+from . import datasets, instruments, realism, scores, studies, support, training  # each registers its commands
 from .app import app, main
 
-__all__ = ["app", "datasets", "instruments", "main", "realism", "scores", "studies", "support"]
+__all__ = ["app", "datasets", "instruments", "main", "realism", "scores", "studies", "support", "training"]

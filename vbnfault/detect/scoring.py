@@ -158,7 +158,7 @@ def _samples(store: Store, model: Any, options: ScoreOptions, split: str) -> Sam
     if not path.is_dir():
         raise InputError(f"{path}: there is no such folder; a model is a folder with {MODEL_FILE}, or one of masks")
     if (path / MODEL_FILE).is_file():
-        from .networks import load_detector  # type: ignore[import-not-found]  # only this needs PyTorch
+        from .networks import load_detector  # only this needs PyTorch
 
         detector = load_detector(path)  # refuses a damaged file
         record = (path / MODEL_FILE).read_bytes()

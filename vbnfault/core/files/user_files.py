@@ -40,6 +40,7 @@ LIMIT_BYTES: dict[str, int] = {
     "plug-in": 64 * MIB,
     "SPICE kernel": 8192 * MIB,
     "star catalogue": 64 * MIB,
+    "weights": 4096 * MIB,
     "SPICE text kernel": 256 * MIB,
 }
 
