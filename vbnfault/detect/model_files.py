@@ -227,7 +227,9 @@ def draw_training(record: Mapping[str, Any], path: Path) -> None:
             if name in epochs[-1]:
                 values = [one[name] for one in epochs]
                 left.plot(number, values, color=colour, marker="o", ms=2.5)
-                left.annotate(text, (number[-1], values[-1]), (4, 0), textcoords="offset points", color=colour)
+                above = values[-1] >= max(epochs[-1]["train_loss"], epochs[-1].get("val_loss", 0.0))
+                place = (4, 2 if above else -9)  # points; the curves may end at one place
+                left.annotate(text, (number[-1], values[-1]), place, textcoords="offset points", color=colour)
         if validated:
             for name, colour in curves.items():
                 values = [np.nan if (v := one["val_iou"][name]) is None else v for one in epochs]
