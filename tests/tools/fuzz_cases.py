@@ -309,6 +309,7 @@ def case_options(seeds: Seeds, rng: random.Random, here: Path) -> Case:
             "550",
         ],
         "list": ["list", "scenes"],
+        "score": ["score", out, str(seeds.store), "--split", "all", "--batch", "2"],
         "train": ["train", str(seeds.store), "--out", out, "--epochs", "1", "--crop-px", "32"],
         "shape": ["shape", "Bennu", "--out", out, "--url", "http://127.0.0.1:9/bennu.bds"],  # nobody listens there
     }
@@ -331,6 +332,7 @@ def case_options(seeds: Seeds, rng: random.Random, here: Path) -> Case:
         "report": ["--samples", "--pixels", "--out"],
         "export": ["--format", "--out", "--workers"],
         "merge": ["--out", "--move"],
+        "score": ["--out", "--split", "--masks", "--calibrate", "--batch", "--seed", "--name"],
         "train": ["--out", "--classes", "--crop-px", "--batch-size", "--learning-rate", "--weights", "--device"],
         "lens": ["--vary-seed", "--spread", "--json", "--toml", "--out"],
         "flare": [

@@ -4,7 +4,7 @@ The commands stand in one file per group. They hold no physics and no checks bey
 options, and they import the library only when they run, so that `vbnfault --help` stays fast.
 """
 
-from . import benchmark, datasets, instruments, realism, studies, support, training  # each registers its commands
+from . import datasets, detectors, instruments, realism, studies, support  # each registers its commands
 from .app import app, main
 
-__all__ = ["app", "benchmark", "datasets", "instruments", "main", "realism", "studies", "support", "training"]
+__all__ = ["app", "datasets", "detectors", "instruments", "main", "realism", "studies", "support"]

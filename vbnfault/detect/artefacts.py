@@ -1,20 +1,20 @@
 """Count artefacts: single grains, defects, lines, flares and tracks that a predicted mask finds, misses or invents.
 
-The follow-up of Gallon et al. (arXiv 2602.20709) reports a precision, a recall and a mean IoU per artefact (PaP, PaR,
-PamIoU). Its definitions are known here at third hand only, so that those below are this package's own, under the
-same names:
+The follow-up of Gallon et al. (arXiv 2602.20709) reports a precision, a recall and a mean IoU per artefact (PaP,
+PaR, PamIoU). Its definitions are known here at third hand only, so that those below are this package's own, under
+the same names:
 
 - A *true artefact* is a connected region of the true mask (8 neighbours), of flares all pixels of the mask that are
   nearest to one flare; a class that is not localised, such as a blur, has one, its whole mask.
 - A *predicted artefact* is a connected region of the predicted mask.
 - **PaR** = (true artefacts of which the predicted mask covers at least half of the pixels) / (true artefacts).
-- **PaP** = (predicted artefacts that lie with at least half of their pixels in the true mask) / (predicted artefacts).
-- **PamIoU** = mean over the true artefacts T of |T ∩ P| / |T ∪ (R \\ M)|, P being the predicted mask, R the predicted
-  artefacts that touch T, and M the true mask: pixels of another true artefact count neither for nor against T. A
-  missed one counts 0.
+- **PaP** = (predicted artefacts of which at least half of the pixels are in the true mask) / (predicted artefacts).
+- **PamIoU** = mean over the true artefacts T of |T ∩ P| / |T ∪ (R \\ M)|, P being the predicted mask, R the
+  predicted artefacts that touch T, and M the true mask: pixels of another true artefact count neither for nor
+  against T. A missed one counts 0.
 
-Coverage, not a one-to-one assignment, decides, so that a region that joins two flares finds both, and a flare that a
-prediction breaks into two counts once.
+Coverage, not a one-to-one assignment, decides, so that a region that joins two flares finds both, and a flare that
+a prediction breaks into two counts once.
 """
 
 from __future__ import annotations
@@ -94,21 +94,20 @@ def artefact_labels(
             yield mask.astype(np.int32)
 
 
-def flares_of(
-    store: Store, samples: Sequence[int] | NDArray[np.int64]
-) -> list[dict[str, NDArray[np.float64]]]:
+def flares_of(store: Store, samples: Sequence[int] | NDArray[np.int64]) -> list[dict[str, NDArray[np.float64]]]:
     """Return the flares of each class of samples, as `artefact_labels` wants them.
 
     Raises InputError or VbnfaultError if the parameters of a sample are damaged, or not those of vbnfault.
     """
     reader, out = ShardReader(store, ()), []
-    held, parameters, sun = -1, None, None
+    held = -1
     for i in map(int, samples):
         number, k = divmod(i, store.spec.shard_samples)
         if number != held:
             held, parameters, sun = number, *(reader.column(name, number) for name in ("parameters", "sun_xy_px"))
-        assert parameters is not None and sun is not None
         drawn = store.table(i, "parameters", parameters[k])
-        discs = {name: class_discs(store.spec, i, drawn, name, sun[k]) for name in drawn if name in store.spec.faults}
+        discs = {
+            name: class_discs(store.spec, i, drawn, name, sun[k]) for name in drawn if name in store.spec.faults
+        }
         out.append({name: of_class for name, of_class in discs.items() if len(of_class)})
     return out

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -30,12 +31,13 @@ from .scores import (
 from .severity_labels import severity_labels
 
 if TYPE_CHECKING:
-    from .scoring import Samples, Tally
+    from .scored_samples import Samples
+    from .scoring import Tally
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
-MEANS = ("iou", "precision", "recall", "f1", "average_precision")
+MEANS = ("iou", "precision", "recall", "f1", "average_precision", "par", "pap", "pamiou", "presence_ap")
 _WITHIN = 1.0  # level of severity
 
 
@@ -58,35 +60,38 @@ def json_result(
     injected = samples.column("injected").astype(bool)
     severity = severity_labels(samples.store, samples.indices)
     classes: dict[str, Any] = {}
-    estimates: dict[str, list[Estimate]] = {name: [] for name in (*MEANS, "par", "pap", "pamiou", "presence_ap")}
+    estimates: dict[str, list[Estimate]] = {name: [] for name in MEANS}
     for c, name in enumerate(samples.classes):
-        pixels = bootstrap.figures(tally.histograms[:, c], lambda sums, t=int(thresholds[c]): _of_pixels(sums, t))
-        ece = pixels.pop("ece")
+        counted = tally.histograms[:, c].sum(axis=0, dtype=np.int64)
+        pixels = bootstrap.figures(tally.histograms[:, c], partial(_of_pixels, threshold=int(thresholds[c])))
         artefacts = bootstrap.figures(tally.artefacts[:, c], artefact_figures)
-        presence = _presence(bootstrap, injected[:, c], tally.present[:, c])
+        presence, of_frames = _presence(bootstrap, injected[:, c], tally.present[:, c])
         number = tally.artefacts[:, c].sum(axis=0)
-        has_truth = bool(tally.histograms[:, c, 1].any())
+        eces = {"pixel_ece": pixels.pop("ece"), "presence_ece": presence.pop("ece")}
         classes[name] = {
             "predicted_by_model": c in samples.known,
             "threshold": (int(thresholds[c]) - 0.5) / (BINS - 1),
             "frames": int(injected[:, c].sum()),
-            "true_pixels_fraction": float(ratio(tally.histograms[:, c, 1].sum(), tally.histograms[:, c].sum())),
+            "true_pixels_fraction": float(ratio(counted[1].sum(), counted.sum())),
             "pixels": _plain(pixels),
             "artefacts": {"true": int(number[0]), "predicted": int(number[3]), **_plain(artefacts)},
             "presence": _plain(presence),
-            "calibration": {"pixel_ece": ece.plain(), "reliability": _reliability(tally.histograms[:, c].sum(axis=0))},
+            "calibration": {
+                **_plain(eces),
+                "pixel_reliability": _reliability(counted),
+                "presence_reliability": _reliability(of_frames),
+            },
             "severity": _severity(bootstrap, injected[:, c], severity[:, c], tally.severity[:, c]),
-            "curve": _curve(tally.histograms[:, c].sum(axis=0, dtype=np.int64)),
+            "curve": _curve(counted),
         }
-        if has_truth:
-            for of_mean, estimate in (*pixels.items(), *artefacts.items(), ("presence_ap", presence["average_precision"])):
-                if of_mean in estimates:
-                    estimates[of_mean].append(estimate)
-    with_truth = [name for name, one in classes.items() if one["true_pixels_fraction"] > 0]
+        if counted[1].any():
+            found = {**pixels, **artefacts, "presence_ap": presence["average_precision"]}
+            for of_mean in MEANS:
+                estimates[of_mean].append(found[of_mean])
     return {
         "samples": len(samples.indices),
         "views": bootstrap.views,
-        "classes_in_means": with_truth,
+        "classes_in_means": [name for name, one in classes.items() if one["true_pixels_fraction"] > 0],
         "mean": {name: Estimate.mean(values).plain() for name, values in estimates.items()},
         "classes": classes,
         "severity": _severity(bootstrap, injected, severity, tally.severity),
@@ -123,18 +128,18 @@ def _of_pixels(sums: F64, threshold: int) -> dict[str, F64]:
     }
 
 
-def _presence(bootstrap: Bootstrap, truth: NDArray[np.bool_], present: NDArray[np.float32]) -> dict[str, Estimate]:
-    """Return how well a class is told present or not, frame by frame."""
+def _presence(
+    bootstrap: Bootstrap, truth: NDArray[np.bool_], present: NDArray[np.float32]
+) -> tuple[dict[str, Estimate], I64]:
+    """Return how well a class is told present or not, and a histogram of the frames, int64[2, 256]."""
     bins = binned(present)
     histograms = np.stack([histogram(t, b) for t, b in zip(truth[:, None], bins[:, None], strict=True)])
     figures = bootstrap.figures(
         histograms, lambda sums: {"f1": pixel_figures(sums, HALF)["f1"], "ece": calibration_error(sums)}
     )
-    return {
-        "average_precision": bootstrap.ranked(truth, present, average_precision),
-        "roc_auc": bootstrap.ranked(truth, present, roc_auc),
-        **figures,
-    }
+    areas = {"average_precision": average_precision, "roc_auc": roc_auc}
+    ranked = {name: bootstrap.ranked(truth, present, area) for name, area in areas.items()}
+    return {**ranked, **figures}, histograms.sum(axis=0)
 
 
 def _severity(
@@ -154,13 +159,13 @@ def _severity(
 
 
 def _reliability(histograms: NDArray[Any]) -> list[dict[str, Any]]:
-    """Return the bins of a reliability diagram with at least one pixel."""
+    """Return the bins of a reliability diagram that hold a pixel, or a frame."""
     number, expected, positive = reliability(histograms)
     return [
         {
             "from": k / RELIABILITY_BINS,
             "to": (k + 1) / RELIABILITY_BINS,
-            "pixels": int(number[k]),
+            "count": int(number[k]),
             "mean_probability": float(expected[k] / number[k]),
             "frequency": float(positive[k] / number[k]),
         }
@@ -172,7 +177,11 @@ def _curve(histograms: NDArray[Any]) -> dict[str, list[float]]:
     """Return the precision-recall curve where it changes, thresholds rising."""
     precision, recall = precision_recall(histograms)
     changes = np.flatnonzero(np.any(histograms, axis=0) & np.isfinite(recall) & np.isfinite(precision))
-    columns = {"threshold": (changes - 0.5).clip(0) / (BINS - 1), "precision": precision[changes], "recall": recall[changes]}
+    columns = {
+        "threshold": (changes - 0.5).clip(0) / (BINS - 1),
+        "precision": precision[changes],
+        "recall": recall[changes],
+    }
     return {name: [round(float(v), 6) for v in values] for name, values in columns.items()}
 
 
@@ -187,7 +196,11 @@ def _false_alarms(
     alarm = tally.predicted_px > 0
     told = (tally.present >= 0.5).any(axis=1)
     out: dict[str, Any] = {}
-    for name, chosen in (("all", nominal), ("sun_in_view", nominal & in_view), ("no_sun_in_view", nominal & ~in_view)):
+    for name, chosen in (
+        ("all", nominal),
+        ("sun_in_view", nominal & in_view),
+        ("no_sun_in_view", nominal & ~in_view),
+    ):
         number = chosen.astype(np.float64)
         out[name] = {
             "frames": int(chosen.sum()),
@@ -214,14 +227,14 @@ def _navigation(
 ) -> dict[str, Any]:
     """Return what the union of the predicted masks leaves a navigator, and the errors with it."""
     hit, wrong, missed, left = tally.union.T
-    truth = (left + wrong) / tally.union.sum(axis=1)
-    known = np.isfinite(tally.usable)
+    predicted, usable = tally.usable.T
+    known = np.isfinite(predicted)
     out = {
         "classes": list(samples.store.spec.mask_any_faults),
         "good_pixels_kept": bootstrap.fraction(left, left + wrong).plain(),
         "bad_pixels_let_through": bootstrap.fraction(missed, hit + missed).plain(),
         "usable_fraction_mean_absolute_error": bootstrap.fraction(
-            np.where(known, np.abs(np.nan_to_num(tally.usable) - truth), 0.0), known
+            np.where(known, np.abs(np.nan_to_num(predicted) - usable), 0.0), known
         ).plain(),
     }
     if not samples.options.navigation:

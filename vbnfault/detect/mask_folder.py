@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 
 from ..core.errors import InputError, in_file
 from ..core.files.images import png_numbers
+from ..core.files.user_files import read_input
 from ..store import MASK_RULES, Store
 from .prediction import Prediction
 
 MODEL_FILE = "model.json"  # a folder with it holds a detector
+_MOST_REST_BYTES = 1 << 20  # of a PNG besides its pixels
 
 
 class MaskFolder:
@@ -52,6 +54,7 @@ class MaskFolder:
         splits: Sequence[str],
         masks: str = "footprint",
     ) -> None:
+        self.masks = masks
         self.path, self._shape = path, (store.spec.height, store.spec.width)
         inside = {split: path / split / MASK_RULES[masks] for split in dict.fromkeys(splits)}
         self._root = {split: folder if folder.is_dir() else path for split, folder in inside.items()}
@@ -80,7 +83,7 @@ class MaskFolder:
         """Return a digest of the masks of the needed samples, whatever their folders are called (hex)."""
         total = hashlib.sha256()
         for (sample, name), file in sorted(self._files.items()):
-            total.update(f"{name}/{sample}\0".encode() + hashlib.sha256(file.read_bytes()).digest())
+            total.update(f"{name}/{sample}\0".encode() + hashlib.sha256(read_input(file, "image")).digest())
         return total.hexdigest()
 
     def predicted(self, samples: Sequence[int], images: NDArray[np.uint8]) -> list[Prediction]:
@@ -98,16 +101,16 @@ class MaskFolder:
         """Return the probabilities in a file, float32[y, x]."""
         height, width = self._shape
         with in_file(str(file)):
-            try:
-                numbers = png_numbers(file.read_bytes(), 4 * height * width)
-            except OSError as error:
-                raise InputError(f"cannot be read: {error.strerror}") from None
+            data = read_input(file, "image", limit_bytes=8 * height * width + _MOST_REST_BYTES)
+            numbers = png_numbers(data, 4 * height * width)
             if numbers.shape[2] != 1 or numbers.dtype != np.uint8:
                 raise InputError("a mask must be a grey PNG of 8 bits, 255 for a probability of 1")
             if numbers.shape[:2] != self._shape:
                 rows, columns = numbers.shape[:2]
-                raise InputError(f"has {columns} x {rows} pixels; must be {width} x {height}, as the store's images")
-            return numbers[..., 0] / np.float32(255)
+                raise InputError(
+                    f"has {columns} x {rows} pixels; must be {width} x {height}, as the store's images"
+                )
+            return np.asarray(numbers[..., 0], np.float32) / np.float32(255)
 
 
 def _numbered(folder: Path) -> dict[int, Path]:

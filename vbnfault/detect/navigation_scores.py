@@ -1,7 +1,8 @@
 """Measure what predicted masks buy navigation: its errors without a mask, with the predicted one and with the true.
 
-The metrics are those of `vbnfault.navigation`. A mask is applied as a navigator would: an edge or a feature that
-was measured in a masked pixel is left out. The masks are unions over the classes of the store's `mask_any`.
+The metrics are those of `vbnfault.navigation`. A mask is applied as a navigator would: no feature is detected in a
+masked pixel, and an edge that was measured in one is left out. The masks are unions over the classes of the store's
+`mask_any`.
 """
 
 from __future__ import annotations
@@ -36,10 +37,11 @@ _GRID = 16  # points along each side of the frame that measure the overlap
 def frame_errors(
     clean: NDArray[np.uint8], image: NDArray[np.uint8], semantic: NDArray[np.uint8] | None, masks: Sequence[Mask]
 ) -> F64:
-    """Return what masks change in one frame, float64[variant, 3]: the limb's RMS error in px, wrong and all matches.
+    """Return what masks change in one frame, float64[variant, 3].
 
-    Matches are those of the clean twin and the image, which show one view: right ones lie within 3 px of their
-    place. The limb's error is nan where a variant leaves fewer than 8 edges, or the frame shows no limb.
+    The columns are the limb's RMS error in px, the number of wrong matches and that of all. Matches are those of
+    the clean twin and the image, which show one view: right ones lie within 3 px of their place. The limb's error
+    is nan where a variant leaves fewer than 8 edges, or the frame shows no limb.
 
     Parameters
     ----------
@@ -56,13 +58,12 @@ def frame_errors(
         if not limb.reason:
             measured = limb.xy + limb.displacements_px[:, None] * limb.normals
             for row, mask in zip(out, masks, strict=True):
-                kept = limb.displacements_px[~_inside(mask, measured)]
-                row[0] = np.sqrt(np.mean(kept**2)) if len(kept) >= _LEAST_EDGES else np.nan
-    matches = navigation.match(clean, image)
-    wrong = np.hypot(*(matches.first_xy - matches.second_xy).T) > _RIGHT_WITHIN_PX
+                moved_px = limb.displacements_px[~_inside(mask, measured)]
+                row[0] = np.sqrt(np.mean(moved_px**2)) if len(moved_px) >= _LEAST_EDGES else np.nan
     for row, mask in zip(out, masks, strict=True):
-        kept = ~_inside(mask, matches.second_xy)
-        row[1:] = np.count_nonzero(wrong & kept), np.count_nonzero(kept)
+        matches = navigation.match(clean, image, unused=(None, mask))
+        moved_px = np.linalg.norm(matches.first_xy - matches.second_xy, axis=1)
+        row[1:] = np.count_nonzero(moved_px > _RIGHT_WITHIN_PX), len(matches)
     return out
 
 
@@ -90,12 +91,15 @@ def frame_summary(errors: F64, bootstrap: Bootstrap, reason: str = "") -> dict[s
     right = counts[..., 1] - counts[..., 0]
     limb: dict[str, Any] = {"frames": int(compared.sum())}
     matches: dict[str, Any] = {"frames": int(np.isfinite(errors[:, 0, 1]).sum())}
+    shown = np.isfinite(errors[:, 0, 0])
     for k, variant in enumerate(VARIANTS):
-        of_limb = bootstrap.median(np.where(compared, errors[:, k, 0], np.nan))
-        limb[variant] = of_limb.plain()
+        limb[variant] = {
+            "median": bootstrap.median(np.where(compared, errors[:, k, 0], np.nan)).plain(),
+            "hidden_fraction": bootstrap.fraction(shown & ~np.isfinite(errors[:, k, 0]), shown).plain(),
+        }
         matches[variant] = {
             "wrong_fraction": bootstrap.fraction(counts[:, k, 0], counts[:, k, 1]).plain(),
-            "right_kept_fraction": bootstrap.fraction(right[:, k], right[:, 0]).plain(),
+            "right_fraction_of_unmasked": bootstrap.fraction(right[:, k], right[:, 0]).plain(),
         }
     if not compared.any():
         limb["reason"] = reason or "no frame with a fault shows a lit limb that each mask leaves"
@@ -126,7 +130,7 @@ def candidate_pairs(columns: Mapping[str, NDArray[Any]]) -> list[tuple[int, list
     """
     position, attitude = columns["camera_position_T_m"], columns["camera_from_T"]
     sun, site = columns["sun_direction_T"], columns["site"]
-    known = np.isfinite(position).all(axis=1) & np.isfinite(attitude).all(axis=1) & np.isfinite(sun).all(axis=1)
+    known = np.isfinite(np.concatenate([position, attitude, sun], axis=1)).all(axis=1)
     pairs = []
     for i in np.flatnonzero(known & columns["injected"].any(axis=1)).tolist():
         distance = np.linalg.norm(position - position[i], axis=1)
@@ -149,8 +153,8 @@ def sees_the_same(first: navigation.CameraView, second: navigation.CameraView, s
     ground = np.isfinite(first.depth_at(xy))
     with np.errstate(invalid="ignore"):
         moved = navigation.reprojected(xy, first, second)
-        inside = ((moved >= 0) & (moved < (width, height))).all(axis=1)
-    return bool(ground.sum() >= _GRID and inside[ground].mean() >= _LEAST_OVERLAP)
+        inside = np.all((moved >= 0) & (moved < (width, height)), axis=1)
+    return bool(ground.sum() >= _GRID and np.mean(inside[ground]) >= _LEAST_OVERLAP)
 
 
 def pair_errors(
@@ -171,16 +175,12 @@ def pair_errors(
     masks
         The masks of each variant, of both samples.
     """
-    truth = _pose_error(navigation.match(*cleans), views)
+    truth = _pose_error(navigation.match(cleans[0], cleans[1]), views)
     if not np.isfinite(truth[0]):
         return None
-    matches = navigation.match(*images)
     rows = []
     for first, second in masks:
-        kept = ~(_inside(first, matches.first_xy) | _inside(second, matches.second_xy))
-        found = _pose_error(
-            navigation.Matches(first_xy=matches.first_xy[kept], second_xy=matches.second_xy[kept]), views
-        )
+        found = _pose_error(navigation.match(images[0], images[1], unused=(first, second)), views)
         rows.append(np.where(np.isfinite(found) | ~np.isfinite(truth), found, _NO_POSE_DEG))
     return np.array([*rows, truth])
 
@@ -211,6 +211,11 @@ def pair_summary(errors: F64, bootstrap: Bootstrap | None, reason: str) -> dict[
     out: dict[str, Any] = {"pairs": len(errors)}
     for k, variant in enumerate((*VARIANTS, "clean")):
         out[variant] = {
-            f"{name}_deg": bootstrap.median(errors[:, k, j]).plain() for j, name in enumerate(("rotation", "translation"))
-        } | {"without_pose_fraction": bootstrap.fraction(errors[:, k, 0] >= _NO_POSE_DEG, np.ones(len(errors))).plain()}
+            f"{name}_deg": bootstrap.median(errors[:, k, j]).plain()
+            for j, name in enumerate(("rotation", "translation"))
+        } | {
+            "without_pose_fraction": bootstrap.fraction(
+                errors[:, k, 0] >= _NO_POSE_DEG, np.ones(len(errors))
+            ).plain()
+        }
     return out

@@ -2,8 +2,8 @@
 
 A count is a sum over pixels or frames, so that a figure of any resample of the views follows from sums of counts,
 and no pixel is looked at twice. Probabilities are counted in 256 bins: bin k holds those that round to k/255, as an
-8 bit image stores them. A class is predicted in a pixel where the bin is at least the threshold's; the threshold 0.5
-is bin 128, since 127.5 rounds to it.
+8 bit image stores them. A class is predicted in a pixel where the bin is at least the threshold's; the threshold
+0.5 is bin 128, since 127.5 rounds to it.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ def roc_auc(histograms: NDArray[Any]) -> F64:
 
 
 def best_threshold(histograms: NDArray[Any]) -> int:
-    """Return the lowest threshold's bin, from 1 on, with the best F1, and so the best IoU; 128 without a positive."""
+    """Return the lowest bin, from 1 on, with the best F1, and so the best IoU; 128 without a positive."""
     precision, recall = precision_recall(histograms)
     f1 = np.nan_to_num(ratio(2 * precision * recall, precision + recall))[1:]
     return int(np.argmax(f1)) + 1 if f1.max() > 0 else HALF
@@ -183,7 +183,9 @@ class Bootstrap:
         drawn = rng.integers(self.views, size=(RESAMPLES, self.views)) + self.views * np.arange(RESAMPLES)[:, None]
         return np.bincount(drawn.ravel(), minlength=drawn.size).reshape(drawn.shape).astype(np.float64)
 
-    def figures(self, of_sample: NDArray[Any], statistic: Callable[[F64], Mapping[str, F64]]) -> dict[str, Estimate]:
+    def figures(
+        self, of_sample: NDArray[Any], statistic: Callable[[F64], Mapping[str, F64]]
+    ) -> dict[str, Estimate]:
         """Return figures by name.
 
         Parameters
@@ -200,14 +202,12 @@ class Bootstrap:
         found = statistic(sums.reshape(-1, *values.shape[1:]))
         return {name: Estimate(float(v[0]), np.asarray(v[1:])) for name, v in found.items()}
 
-    def fraction(self, above: NDArray[Any], below: NDArray[Any]) -> Estimate:
+    def fraction(self, above: Any, below: Any) -> Estimate:
         """Return Σ above / Σ below of counts of each sample, [sample] each."""
         both = np.stack([np.asarray(above, np.float64), np.asarray(below, np.float64)], axis=1)
         return self.figures(both, lambda sums: {"": ratio(sums[:, 0], sums[:, 1])})[""]
 
-    def ranked(
-        self, truth: NDArray[np.bool_], score: NDArray[Any], statistic: Callable[[F64], F64]
-    ) -> Estimate:
+    def ranked(self, truth: NDArray[np.bool_], score: NDArray[Any], statistic: Callable[[F64], F64]) -> Estimate:
         """Return a figure of a histogram [2, bin] of frames with a bin for each score that occurs.
 
         Parameters
@@ -217,15 +217,13 @@ class Bootstrap:
         statistic
             Gets histograms float64[n, 2, bin] and returns float64[n].
         """
-        scores, place = np.unique(np.asarray(score, dtype=np.float64), return_inverse=True)
-        weight = np.concatenate([np.ones((1, len(truth))), self._drawn[:, self.view]])
-        out = np.empty(len(weight))
-        one_hot = np.zeros((len(truth), len(scores)))
-        one_hot[np.arange(len(truth)), place] = 1
-        for first in range(0, len(weight), 64):  # a part at a time keeps the memory small
-            part = weight[first : first + 64]
-            out[first : first + 64] = statistic(np.stack([(part * ~truth) @ one_hot, (part * truth) @ one_hot], axis=1))
-        return Estimate(float(out[0]), out[1:])
+        order = np.argsort(score, kind="stable")
+        ranked = np.asarray(score, dtype=np.float64)[order]
+        first = np.flatnonzero(np.diff(ranked, prepend=-np.inf))  # of each score that occurs
+        weight = np.concatenate([np.ones((1, len(truth))), self._drawn[:, self.view]])[:, order]
+        parts = [weight * ~truth[order], weight * truth[order]]
+        out = statistic(np.stack([np.add.reduceat(part, first, axis=1) for part in parts], axis=1))
+        return Estimate(float(out[0]), np.asarray(out[1:]))
 
     def median(self, values: NDArray[Any]) -> Estimate:
         """Return the median of the finite values, float[sample] with nan where a sample has none."""

@@ -7,191 +7,32 @@ pages read the few samples again that they show.
 from __future__ import annotations
 
 import hashlib
+import json
 import os
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .. import __version__
-from ..core.errors import InputError, VbnfaultError, shown
+from ..core.errors import InputError
+from ..core.files.path_checks import check_folder
 from ..core.files.whole_files import own, write_json, writing
-from ..store import SPLITS, Store, open_store
-from ..train import Columns, SampleReader, Targets, select
+from ..store import MASK_RULES, Store, is_store, open_store
+from ..train import Columns, select
 from . import navigation_scores as nav
 from .artefacts import artefact_counts, artefact_labels, flares_of
 from .figures import json_result
 from .mask_folder import MODEL_FILE, MaskFolder
-from .prediction import Detector, Prediction
-from .scores import BINS, HALF, best_threshold, binned, histogram
+from .prediction import Detector
+from .scored_samples import ALL, EFFECT, FOOTPRINT, OfImages, Samples, ScoreOptions
+from .scores import BINS, HALF, best_threshold, histogram
 
 I64 = NDArray[np.int64]
 
 FILE, TABLE, PAGE = "score.json", "score.md", "score.html"
-ALL = "all"
-
-
-@dataclass(frozen=True, kw_only=True)
-class ScoreOptions:
-    """Say how a detector is scored.
-
-    Attributes
-    ----------
-    split
-        "train", "val", "test" or "all".
-    masks
-        "footprint" or "effect": which masks of the store are the truth.
-    calibrate
-        Take the threshold of each class that has the best F1 on the split val, instead of 0.5.
-    navigation
-        Whether to measure the errors of navigation, which takes longest.
-    name
-        Name in the score; "": that of the model's file or folder.
-    batch
-        Samples that are held at once.
-    seed
-        Of the bootstrap.
-    """
-
-    split: str = "test"
-    masks: str = "footprint"
-    calibrate: bool = False
-    navigation: bool = True
-    name: str = ""
-    batch: int = 4
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        if self.split not in (*SPLITS, ALL):
-            raise InputError(f"split = {shown(self.split)}: must be one of {', '.join((*SPLITS, ALL))}")
-        if self.calibrate and self.split in ("val", ALL):
-            raise InputError(
-                f"calibrate: the thresholds are chosen on the split val, so split = {self.split} cannot be scored "
-                "with them; score test"
-            )
-
-
-class Predictor(Protocol):
-    """Describe what is scored: a detector or a folder of masks."""
-
-    @property
-    def classes(self) -> tuple[str, ...]:
-        """Return the classes of its predictions."""
-        ...
-
-    @property
-    def sha256(self) -> str:
-        """Return a digest of the files that it was made from (hex)."""
-        ...
-
-    def predicted(self, samples: Sequence[int], images: NDArray[np.uint8]) -> list[Prediction]:
-        """Return the predictions for samples with these images, uint8[sample, y, x, 4]."""
-        ...
-
-
-@dataclass(frozen=True)
-class OfImages:
-    """Make a predictor of a detector, which sees only the images."""
-
-    detector: Detector
-    sha256: str = ""
-
-    @property
-    def classes(self) -> tuple[str, ...]:
-        """Return the classes of the detector."""
-        return tuple(self.detector.classes)
-
-    def predicted(self, samples: Sequence[int], images: NDArray[np.uint8]) -> list[Prediction]:
-        """Return the detector's predictions for images."""
-        return self.detector.predict(images)
-
-
-class Batch(NamedTuple):
-    """Hold some samples: their rows among all that are scored, their layers, scalars and predictions."""
-
-    rows: I64
-    samples: list[int]
-    layers: dict[str, NDArray[Any]]
-    scalars: dict[str, NDArray[Any]]
-    predictions: list[tuple[NDArray[np.uint8], Prediction]]
-
-
-class Samples:
-    """Read samples with their predictions, whose classes are brought to those of the store.
-
-    Parameters
-    ----------
-    store, predictor, options
-        What is scored, and how.
-    indices
-        The samples, int64[n].
-    """
-
-    def __init__(self, store: Store, predictor: Predictor, options: ScoreOptions, indices: I64) -> None:
-        self.store, self.predictor, self.options, self.indices = store, predictor, options, indices
-        self.columns = Columns(store)
-        self.place = np.searchsorted(self.columns.samples, indices)
-        self.classes = store.spec.faults
-        self.known = [self.classes.index(name) for name in predictor.classes if name in self.classes]
-        self._given = [k for k, name in enumerate(predictor.classes) if name in self.classes]
-
-    def column(self, name: str) -> NDArray[Any]:
-        """Return a scalar of all samples."""
-        return self.columns[name][self.place]
-
-    def batches(
-        self, rows: Sequence[int] | I64, names: Sequence[str], *, size: int | None = None, predict: bool = True
-    ) -> Iterator[Batch]:
-        """Yield batches of some rows with named targets; their arrays hold until the next one.
-
-        `size`: samples of a batch, by default those of the options; `predict`: whether predictions are needed.
-        """
-        targets = Targets(self.store, names, masks=self.options.masks)
-        reader, wanted = SampleReader(self.store, targets, threads=2), np.asarray(rows, dtype=np.int64)
-        size = max(1, min(size or self.options.batch, len(wanted)))
-        buffers = reader.buffers(size)
-        try:
-            for first in range(0, len(wanted), size):
-                part = wanted[first : first + size]
-                samples = self.indices[part].tolist()
-                layers = {name: buffer[: len(part)] for name, buffer in buffers.items()}
-                scalars = reader.fill(samples, layers, self.indices[wanted[first + size : first + 2 * size]])
-                found = self._predictions(samples, layers["image"]) if predict else []
-                yield Batch(part, samples, layers, scalars, found)
-        finally:
-            reader.close()
-
-    def _predictions(
-        self, samples: list[int], images: NDArray[np.uint8]
-    ) -> list[tuple[NDArray[np.uint8], Prediction]]:
-        """Return what `_of_store` makes of the predictions for samples."""
-        predictions = self.predictor.predicted(samples, images)
-        if len(predictions) != len(samples):
-            raise VbnfaultError(f"the detector gives {len(predictions)} predictions for {len(samples)} images")
-        return [self._of_store(*pair) for pair in zip(samples, predictions, strict=True)]
-
-    def _of_store(self, sample: int, given: Prediction) -> tuple[NDArray[np.uint8], Prediction]:
-        """Return the bins of the masks of the store's classes, uint8[class, y, x], and the same prediction."""
-        shape, count = (self.store.spec.height, self.store.spec.width), len(self.predictor.classes)
-        expected = {"masks": (count, *shape), "present": (count,), "severity": (count,)}
-        for name, wanted in expected.items():
-            values = getattr(given, name)
-            if values.shape != wanted:
-                raise VbnfaultError(f"sample {sample}: {name} has the shape {values.shape}; must be {wanted}")
-            if name != "severity" and not (np.min(values, initial=0) >= 0 and np.max(values, initial=0) <= 1):
-                raise VbnfaultError(f"sample {sample}: {name} must be probabilities from 0 to 1")
-        bins = np.zeros((len(self.classes), *shape), np.uint8)
-        present = np.zeros(len(self.classes), np.float32)
-        severity = np.full(len(self.classes), np.nan, np.float32)
-        bins[self.known] = binned(given.masks[self._given])
-        present[self.known], severity[self.known] = given.present[self._given], given.severity[self._given]
-        whole = Prediction(
-            masks=given.masks, present=present, severity=severity, usable_fraction=given.usable_fraction
-        )
-        return bins, whole
 
 
 class Tally:
@@ -206,10 +47,13 @@ class Tally:
     predicted_px
         int64[sample, class + 1]: pixels of each predicted mask, and of the union of all.
     union
-        int64[sample, 4]: true positives, false positives, false negatives and true negatives of the union over the
-        classes of `mask_any`.
-    present, severity, usable
-        What the predictions say: float32[sample, class] each, float64[sample].
+        int64[sample, 4]: true positives, false positives, false negatives and true negatives of the union of the
+        predicted masks over the classes of `mask_any`. The truth is `mask_any`, or the union of their effects if
+        the masks are effects.
+    present, severity
+        What the predictions say, float32[sample, class] each.
+    usable
+        float64[sample, 2]: usable fraction as predicted, and outside `mask_any`.
     errors
         float64[sample, variant, 3]: `navigation_scores.frame_errors`; nan where no fault is injected.
     """
@@ -221,7 +65,7 @@ class Tally:
         self.union = np.zeros((samples, 4), np.int64)
         self.present = np.zeros((samples, classes), np.float32)
         self.severity = np.full((samples, classes), np.nan, np.float32)
-        self.usable = np.full(samples, np.nan)
+        self.usable = np.full((samples, 2), np.nan)
         self.errors = np.full((samples, len(nav.VARIANTS), 3), np.nan)
 
 
@@ -229,7 +73,7 @@ def score(
     model: str | os.PathLike[str] | Detector,
     dataset: str | os.PathLike[str] | Store,
     out: Path,
-    options: ScoreOptions = ScoreOptions(),
+    options: ScoreOptions | None = None,
     advance: Callable[[int, int], Any] = lambda done, of: None,
 ) -> dict[str, Any]:
     """Score a model on a dataset, and write `score.json`, `score.md` and `score.html` to a folder.
@@ -259,7 +103,10 @@ def score(
     """
     from .score_page import write_pages  # matplotlib is loaded only for the pages
 
-    store = open_store(dataset)
+    options, store = options or ScoreOptions(), open_store(dataset)
+    check_folder(out)
+    if is_store(out):
+        raise InputError(f"{out}: is a store, in which no other file may lie; choose another --out")
     if not store.spec.faults:
         raise InputError(f"{store.path}: it has no fault class, so there is nothing to detect")
     samples = _samples(store, model, options, options.split)
@@ -278,9 +125,18 @@ def score(
         "version": 1,
         "vbnfault": __version__,
         "name": options.name or _name(model),
-        "model": {"name": _name(model), "sha256": samples.predictor.sha256, "classes": list(samples.predictor.classes)},
+        "model": {
+            "name": _name(model),
+            "sha256": samples.predictor.sha256,
+            "classes": list(samples.predictor.classes),
+        },
         "dataset": _described(store),
-        "options": {"split": options.split, "masks": options.masks, "calibrate": options.calibrate, "seed": options.seed},
+        "options": {
+            "split": options.split,
+            "masks": samples.masks,
+            "calibrate": options.calibrate,
+            "seed": options.seed,
+        },
         **json_result(samples, tally, thresholds, pairs, reason),
     }
     with writing(out, within=True):
@@ -302,20 +158,16 @@ def _samples(store: Store, model: Any, options: ScoreOptions, split: str) -> Sam
     if not path.is_dir():
         raise InputError(f"{path}: there is no such folder; a model is a folder with {MODEL_FILE}, or one of masks")
     if (path / MODEL_FILE).is_file():
-        from .networks import load_detector  # type: ignore[import-not-found]  # only this needs PyTorch
+        from .networks import load_detector  # only this needs PyTorch
 
-        return Samples(store, OfImages(load_detector(path), folder_sha256(path)), options, indices)
+        detector = load_detector(path)  # refuses a damaged file
+        record = (path / MODEL_FILE).read_bytes()
+        digest = json.loads(record).get("weights_sha256") or hashlib.sha256(record).hexdigest()
+        return Samples(store, OfImages(detector, digest), options, indices)
     columns = Columns(store)
     splits = columns["split"][np.searchsorted(columns.samples, indices)].tolist()
-    return Samples(store, MaskFolder(path, store, indices.tolist(), splits, options.masks), options, indices)
-
-
-def folder_sha256(folder: Path) -> str:
-    """Return a digest of the names and the contents of the files in a folder (hex)."""
-    total = hashlib.sha256()
-    for file in sorted(file for file in folder.rglob("*") if file.is_file()):
-        total.update(f"{file.relative_to(folder).as_posix()}\0".encode() + hashlib.sha256(file.read_bytes()).digest())
-    return total.hexdigest()
+    masks = MaskFolder(path, store, indices.tolist(), splits, options.masks or FOOTPRINT)
+    return Samples(store, masks, options, indices)
 
 
 def _name(model: Any) -> str:
@@ -350,8 +202,7 @@ def _tally(
     has_semantic = "semantic" in spec.pixel_layers
     flares = [] if only_histograms else flares_of(samples.store, samples.indices)
     names = ["masks"] if only_histograms else ["masks", "mask_any", "clean", *["semantic"] * has_semantic]
-    mask_layer = Targets(samples.store, ["masks"], masks=samples.options.masks).layers[-1]
-    done = 0
+    mask_layer, done = MASK_RULES[samples.masks], 0
     for batch in samples.batches(np.arange(len(samples.indices)), names):
         for k, row in enumerate(batch.rows.tolist()):
             bins, prediction = batch.predictions[k]
@@ -365,13 +216,14 @@ def _tally(
                 tally.artefacts[row, c] = artefact_counts(labels, predicted[c])
             tally.predicted_px[row] = [*predicted.sum(axis=(1, 2)), predicted.any(axis=0).sum()]
             union, bad = predicted[in_any].any(axis=0), batch.layers["mask_any"][k]
+            tally.usable[row] = prediction.usable_fraction, 1 - bad.mean()
+            bad = truth[in_any].any(axis=0) if samples.masks == EFFECT else bad
             hit, wrong, missed = (np.count_nonzero(m) for m in (union & bad, union & ~bad, ~union & bad))
             tally.union[row] = hit, wrong, missed, bad.size - hit - wrong - missed
             tally.present[row], tally.severity[row] = prediction.present, prediction.severity
-            tally.usable[row] = prediction.usable_fraction
             if samples.options.navigation and injected[row].any():
                 semantic = batch.layers["semantic"][k] if has_semantic else None
-                masks = (np.zeros_like(bad), union, bad)
+                masks = [np.zeros_like(bad), np.asarray(union), bad]
                 images = batch.layers["clean"][k], batch.layers["image"][k]
                 tally.errors[row] = nav.frame_errors(*images, semantic, masks)
         done += len(batch.rows)
@@ -380,7 +232,7 @@ def _tally(
 
 
 def _pairs(samples: Samples, thresholds: I64) -> tuple[tuple[NDArray[np.float64], I64] | None, str]:
-    """Return errors of relative poses, with the row of each pair's first sample; None and why if there is no pair."""
+    """Return errors of relative poses with the row of each pair's first sample, or None and why there are none."""
     spec = samples.store.spec
     if "depth_m" not in spec.pixel_layers:
         return None, "the store has no layer depth_m"
@@ -396,9 +248,15 @@ def _pairs(samples: Samples, thresholds: I64) -> tuple[tuple[NDArray[np.float64]
             views = view, nav.view_of(spec, scalars, j, None)
             if not nav.sees_the_same(*views, (spec.height, spec.width)):
                 continue
-            (pair,) = samples.batches([i, j], ["clean", "mask_any"], size=2)
-            unions = [(bins >= thresholds[:, None, None])[in_any].any(axis=0) for bins, _ in pair.predictions]
-            masks = [[np.zeros_like(mask) for mask in unions], unions, list(pair.layers["mask_any"])]
+            (pair,) = samples.batches([i, j], ["clean", "masks", "mask_any"], size=2)
+            unions = [np.any((bins >= thresholds[:, None, None])[in_any], axis=0) for bins, _ in pair.predictions]
+            masks: list[list[Any]] = [
+                [np.zeros_like(mask) for mask in unions],
+                unions,
+                [layers[in_any].any(axis=0) for layers in pair.layers[MASK_RULES[EFFECT]]]
+                if samples.masks == EFFECT
+                else list(pair.layers["mask_any"]),
+            ]
             found = nav.pair_errors(views, list(pair.layers["image"]), list(pair.layers["clean"]), masks)
             if found is not None:
                 errors.append(found)
@@ -406,7 +264,7 @@ def _pairs(samples: Samples, thresholds: I64) -> tuple[tuple[NDArray[np.float64]
             break
     if not errors:
         return None, (
-            "no faulty sample shares half of its ground with another one of its site, under a Sun within 10 degrees, "
-            "so that their clean twins give a pose"
+            "no faulty sample shares half of its ground with another one of its site, under a Sun within 10 "
+            "degrees of its own, so that their clean twins give a pose"
         )
     return (np.array(errors), np.array(rows)), ""

@@ -26,6 +26,12 @@ from .contract import Fault
 from .fields import Interval, Severity, bounds, number
 
 
+@lru_cache(maxsize=8)
+def _mean_falloff(shape: tuple[int, int], focal_length_px: float) -> float:
+    """Return the mean over the frame of cos⁴θ behind a thin lens."""
+    return float(natural_falloff(None, shape, focal_length_px).mean(dtype=np.float64))
+
+
 @dataclass(frozen=True, kw_only=True)
 class Cos4Vignetting(Fault):
     """Darken the image by the cos⁴ law (Gallon et al., table of vignetting parameters)."""
@@ -96,12 +102,6 @@ def _falloff(context: FaultContext) -> NDArray[np.float32]:
     """Return the falloff of the sample's thin lens, cos⁴θ without a calibration, float32[y, x]."""
     camera = context.camera
     return natural_falloff(camera.lens.calibration, context.shape, camera.focal_length_px)
-
-
-@lru_cache(maxsize=8)
-def _mean_falloff(shape: tuple[int, int], focal_length_px: float) -> float:
-    """Return the mean over the frame of cos⁴θ behind a thin lens."""
-    return float(natural_falloff(None, shape, focal_length_px).mean(dtype=np.float64))
 
 
 @lru_cache(maxsize=2)

@@ -192,7 +192,13 @@ def _repeatability(clean: F64, image: F64, tolerance: float) -> Repeatability:
 # --- matches -------------------------------------------------------------------------------------------------
 
 
-def match(first: NDArray[Any], second: NDArray[Any], *, white: float | None = None) -> Matches:
+def match(
+    first: NDArray[Any],
+    second: NDArray[Any],
+    *,
+    white: float | None = None,
+    unused: tuple[NDArray[np.bool_] | None, NDArray[np.bool_] | None] = (None, None),
+) -> Matches:
     """Return matched ORB features of two images, which may show different views.
 
     A match are two descriptors that are each other's nearest by Hamming distance, the distance being at most 0.8
@@ -204,11 +210,14 @@ def match(first: NDArray[Any], second: NDArray[Any], *, white: float | None = No
         Images (`intensity`).
     white
         Signal that counts as 255; default: 255 for uint8, else the largest of the first image.
+    unused
+        Masks of the images, bool[y, x] or None each: no feature is detected in their pixels, so that others count
+        among the strongest.
 
     Raises
     ------
     InputError
-        An array is no image.
+        An array is no image, or a mask has another size.
 
     References
     ----------
@@ -217,7 +226,8 @@ def match(first: NDArray[Any], second: NDArray[Any], *, white: float | None = No
     """
     level = white_level(first) if white is None else white
     (xy_a, _, a), (xy_b, _, b) = (
-        _orb(eight_bit(image, level, name)) for image, name in ((first, "first"), (second, "second"))
+        _orb(eight_bit(image, level, name), mask)
+        for image, name, mask in ((first, "first", unused[0]), (second, "second", unused[1]))
     )
     nothing = Matches(first_xy=np.empty((0, 2)), second_xy=np.empty((0, 2)))
     if len(a) < 2 or len(b) < 2:
@@ -231,16 +241,19 @@ def match(first: NDArray[Any], second: NDArray[Any], *, white: float | None = No
     return Matches(first_xy=xy_a[chosen], second_xy=xy_b[nearest[chosen, 0]])
 
 
-def _orb(grey: U8) -> tuple[F64, NDArray[np.int64], U8]:
+def _orb(grey: U8, unused: NDArray[np.bool_] | None = None) -> tuple[F64, NDArray[np.int64], U8]:
     """Return positions float64[n, 2], pyramid levels int64[n] and descriptors uint8[n, 32] of ORB features."""
+    if unused is not None:
+        same_shape(grey, unused, "image", "unused")
     if min(grey.shape) < _LEAST_SIZE_PX:
         return np.empty((0, 2)), np.empty(0, dtype=np.int64), np.empty((0, 32), dtype=np.uint8)
-    return _orb_of((grey.shape[0], grey.shape[1]), grey.tobytes())
+    used = None if unused is None else np.logical_not(unused).tobytes()
+    return _orb_of((grey.shape[0], grey.shape[1]), grey.tobytes(), used)
 
 
 @lru_cache(maxsize=_IMAGES_KEPT)
-def _orb_of(shape: tuple[int, int], pixels: bytes) -> tuple[F64, NDArray[np.int64], U8]:
-    """Return `_orb` of an image's shape and pixels, read-only."""
+def _orb_of(shape: tuple[int, int], pixels: bytes, used: bytes | None) -> tuple[F64, NDArray[np.int64], U8]:
+    """Return `_orb` of an image's shape, pixels and used pixels, read-only."""
     detector = cv2.ORB_create(
         nfeatures=ORB_FEATURES,
         scaleFactor=_ORB_SCALE,
@@ -248,7 +261,10 @@ def _orb_of(shape: tuple[int, int], pixels: bytes) -> tuple[F64, NDArray[np.int6
         edgeThreshold=_ORB_BORDER_PX,
         fastThreshold=_ORB_FAST_DN,
     )
-    points, descriptors = detector.detectAndCompute(np.frombuffer(pixels, dtype=np.uint8).reshape(shape), None)
+    image, mask = (
+        None if data is None else np.frombuffer(data, dtype=np.uint8).reshape(shape) for data in (pixels, used)
+    )
+    points, descriptors = detector.detectAndCompute(image, mask)
     xy = np.array([point.pt for point in points], dtype=np.float64).reshape(-1, 2) + 0.5
     level = np.array([point.octave for point in points], dtype=np.int64)
     described = np.empty((0, 32), dtype=np.uint8) if descriptors is None else np.asarray(descriptors)

@@ -84,7 +84,7 @@ def regions(mask: NDArray[np.bool_], discs: NDArray[np.float64] | None = None) -
 def class_discs(
     spec: StoreSpec, index: int, parameters: Mapping[str, Any], fault: str, sun_xy_px: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return `flare_discs` of a class of a sample. Raises InputError if its parameters are not those of vbnfault."""
+    """Return `flare_discs` of a class of a sample. Raises InputError if vbnfault did not write its parameters."""
     try:
         return flare_discs(parameters.get(fault) or {}, sun_xy_px, (spec.height, spec.width))
     except (TypeError, ValueError, KeyError, AttributeError):  # of a store that vbnfault did not write
