@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -13,6 +15,7 @@ from vbnfault.core.errors import InputError
 from vbnfault.core.files import resources
 from vbnfault.dataset import verify
 from vbnfault.detect.benchmark import load_benchmark, make_benchmark, read_manifest, scene_of
+from vbnfault.detect.leaderboard import read_leaderboard
 from vbnfault.store import open_store
 
 FILE = """
@@ -83,6 +86,33 @@ def test_one_command_makes_all_parts_and_continues(file: Path, tmp_path: Path) -
         assert f"{name}: 4 samples" in both.output
     assert manifest["parts"]["train"]["purpose"] == "train"
     assert not open_store(out / "nominal.zarr").read("injected").any()
+
+
+def test_a_model_is_scored_on_all_tests_and_listed(file: Path, tmp_path: Path) -> None:
+    out, masks = tmp_path / "made", tmp_path / "nothing"
+    for _ in make_benchmark(file, out, fraction=0.1):
+        pass
+    (masks / "broken_pixels").mkdir(parents=True)
+    for k in range(4):
+        cv2.imwrite(str(masks / "broken_pixels" / f"{k}.png"), np.full((64, 64), 255 * (k == 1), np.uint8))
+    for name in ("first", "second", "first"):
+        scored = CliRunner().invoke(app, ["score", str(masks), str(out), "--name", name])
+        assert scored.exit_code == 0, scored.output
+    assert (tmp_path / "nothing_on_made" / "nominal" / "score.html").is_file()
+    table = read_leaderboard(out)
+    assert list(table) == ["first", "second"]
+    assert table["first"] == table["second"]
+    (part,) = table["first"]["parts"].values()  # the other dataset is for training
+    assert part["nominal_frames_with_alarm"]["all"]["value"] == 0.25  # one of four is marked
+    assert part["good_pixels_kept"]["value"] == 0.75
+    (out / "leaderboard.json").write_text("[]")
+    with pytest.raises(InputError, match="is no leaderboard"):
+        read_leaderboard(out)
+    for _ in make_benchmark(file, tmp_path / "train", fraction=0.1, only=["train"]):
+        pass
+    none = CliRunner().invoke(app, ["score", str(masks), str(tmp_path / "train")])
+    assert none.exit_code == 2 or isinstance(none.exception, InputError)
+    assert "lists no dataset for a test" in none.output + str(none.exception)
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -95,7 +96,13 @@ def score(
     model: Annotated[
         Path, typer.Argument(help="Folder of a detector, or of masks CLASS/SAMPLE.png of any other program.")
     ],
-    dataset: Annotated[str, typer.Argument(help="Path or URL (s3://, gs://, az://, file://) of a Zarr store.")],
+    dataset: Annotated[
+        str,
+        typer.Argument(
+            help="Path or URL (s3://, gs://, az://, file://) of a Zarr store; or the folder of a benchmark, whose "
+            "tests are all scored and added to its leaderboard.json."
+        ),
+    ],
     out: Annotated[
         Path | None, local_path("Folder for the score.", unset="MODEL_on_DATASET, beside the model")
     ] = None,
@@ -120,6 +127,7 @@ def score(
     """Compare a detector, or the masks of any other program, with the labels of a dataset: by pixel, artefact and
     frame, and by what navigation gains. Writes score.json, score.md and score.html.
     """
+    from ..detect.leaderboard import is_benchmark, score_benchmark
     from ..detect.scoring import PAGE, ScoreOptions
     from ..detect.scoring import score as compare
 
@@ -133,20 +141,39 @@ def score(
         seed=seed,
     )
     folder = out or model.absolute().parent / f"{model.absolute().name}_on_{Path(dataset.rstrip('/')).stem}"
+    if not is_benchmark(dataset):
+        with _advancing() as advance:
+            result = compare(model, dataset, folder, options, advance=advance)
+        _say_means(result)
+        typer.echo(f"page: {folder / PAGE}")
+        return
+    with _advancing() as advance:
+        for part, result in score_benchmark(model, Path(dataset), folder, options, advance):
+            _say_means(result, f"{part}: ")
+            typer.echo(f"page: {folder / part / PAGE}")
+
+
+@contextlib.contextmanager
+def _advancing() -> Iterator[Callable[[int, int], None]]:
+    """Yield a function that shows how many of how many samples are done; a smaller number begins a new bar."""
     with contextlib.ExitStack() as stack:
         bars: list[Any] = []
 
         def advance(done: int, count: int) -> None:
-            if not bars:
+            if not bars or done < bars[-1].pos:
+                stack.close()
                 bars.append(stack.enter_context(progress_bar(count, "samples")))
-            bars[0].update(done - bars[0].pos)
+            bars[-1].update(done - bars[-1].pos)
 
-        result = compare(model, dataset, folder, options, advance=advance)
+        yield advance
+
+
+def _say_means(result: Mapping[str, Any], where: str = "") -> None:
+    """Print the means of a score."""
     for key, text in (("iou", "mean IoU"), ("f1", "mean F1"), ("par", "mean PaR"), ("pap", "mean PaP")):
         figure = result["mean"][key]
         if figure["value"] is not None:
-            typer.echo(f"{text}: {figure['value']:.3f} ({figure['low']:.3f} to {figure['high']:.3f})")
-    typer.echo(f"page: {folder / PAGE}")
+            typer.echo(f"{where}{text}: {figure['value']:.3f} ({figure['low']:.3f} to {figure['high']:.3f})")
 
 
 @app.command(rich_help_panel=_PANEL)
