@@ -57,7 +57,7 @@ def score_benchmark(
 
 
 def figures_of(result: dict[str, Any]) -> dict[str, Any]:
-    """Return what a leaderboard says of one score: means, IoU and F1 by class, false alarms, good and bad pixels."""
+    """Return what a leaderboard says of one score: means, IoU and F1 by class, false alarms, pixels kept."""
     classes, alarms, navigation = result["classes"], result["false_alarms"], result["navigation"]
     return {
         "samples": result["samples"],
