@@ -98,6 +98,7 @@ def test_a_model_is_scored_on_all_tests_and_listed(file: Path, tmp_path: Path) -
     for name in ("first", "second", "first"):
         scored = CliRunner().invoke(app, ["score", str(masks), str(out), "--name", name])
         assert scored.exit_code == 0, scored.output
+        assert "nominal: false alarms: in 25.0% of 4 nominal frames" in scored.output
     assert (tmp_path / "nothing_on_made" / "nominal" / "score.html").is_file()
     table = read_leaderboard(out)
     assert list(table) == ["first", "second"]

@@ -174,6 +174,10 @@ def _say_means(result: Mapping[str, Any], where: str = "") -> None:
         figure = result["mean"][key]
         if figure["value"] is not None:
             typer.echo(f"{where}{text}: {figure['value']:.3f} ({figure['low']:.3f} to {figure['high']:.3f})")
+    alarms = result["false_alarms"]["all"]
+    if alarms["frames"]:
+        fraction = alarms["frames_with_alarm"]["value"]
+        typer.echo(f"{where}false alarms: in {fraction:.1%} of {alarms['frames']} nominal frames")
 
 
 @app.command(rich_help_panel=_PANEL)
