@@ -1,0 +1,120 @@
+"""Compare networks that were trained on painted faults, on physical ones, and on both, on the tests of a benchmark.
+
+    vbnfault bench --out bench --workers 2
+    python benchmarks/physics_against_paint.py bench --out trained --seeds 3 --epochs 15
+
+Network, number of images, optimiser and steps are the same: "paint" has the two training parts with faults of the
+paper's models, "physics" the same views with physical faults, "both" one part of each. Each is trained with every
+seed and scored on every test; what exists in the folder is not made again. The table has the mean over the seeds of
+mean IoU and F1, their range, and the fraction of nominal frames with an alarm. `physics_against_paint.md` and a
+figure of the IoU by class are written to the folder.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.lines import Line2D
+
+from vbnfault.core import figures
+from vbnfault.detect.benchmark import read_manifest
+from vbnfault.detect.leaderboard import figures_of
+from vbnfault.detect.scored_samples import ALL, ScoreOptions
+from vbnfault.detect.scoring import FILE, score
+from vbnfault.detect.training import TrainOptions, train
+
+ARMS = {
+    "paint": ("train_paint_a", "train_paint_b"),
+    "physics": ("train_physics_a", "train_physics_b"),
+    "both": ("train_paint_a", "train_physics_b"),
+}
+Results = dict[str, dict[str, list[dict[str, Any]]]]
+
+
+def scored(bench: Path, out: Path, options: argparse.Namespace) -> Results:
+    """Return the figures by arm and test, a dictionary for each seed; train and score what does not exist."""
+    parts = read_manifest(bench)["parts"]
+    tests = {name: part for name, part in parts.items() if part["purpose"] == "test"}
+    results: Results = {arm: {name: [] for name in tests} for arm in ARMS}
+    for seed in range(options.seeds):
+        for arm, names in ARMS.items():
+            stores = [str(bench / parts[name]["store"]) for name in names if name in parts]
+            model = out / f"{arm}_{seed}"
+            how = TrainOptions(epochs=options.epochs, patience=options.epochs, seed=seed)
+            train(stores, model, how, progress=True)
+            for name, part in tests.items():
+                folder = out / f"{arm}_{seed}_on_{name}"
+                if not (folder / FILE).exists():
+                    score(model, bench / part["store"], folder, ScoreOptions(split=ALL, navigation=False))
+                results[arm][name].append(figures_of(json.loads((folder / FILE).read_text())))
+    return results
+
+
+def of_seeds(values: list[float | None]) -> str:
+    """Return mean and range of a figure over the seeds."""
+    known = [v for v in values if v is not None]
+    if not known:
+        return "–"
+    return f"{np.mean(known):.3f} ({min(known):.3f} to {max(known):.3f})"
+
+
+def table(results: Results) -> list[str]:
+    """Return the lines of a Markdown table."""
+    tests = next(iter(results.values()))
+    lines = ["| test | figure | " + " | ".join(results) + " |", "|---|---|" + "---|" * len(results)]
+    for test in tests:
+        for figure, read in (
+            ("mean IoU", lambda one: one["mean"]["iou"]["value"]),
+            ("mean F1", lambda one: one["mean"]["f1"]["value"]),
+            ("nominal frames with an alarm", lambda one: one["nominal_frames_with_alarm"]["all"]["value"]),
+        ):
+            cells = [of_seeds([read(one) for one in results[arm][test]]) for arm in results]
+            if set(cells) != {"–"}:
+                lines.append(f"| {test} | {figure} | " + " | ".join(cells) + " |")
+    return lines
+
+
+def draw(results: Results, path: Path) -> None:
+    """Draw the IoU of each class on each test with faults, the mean over the seeds, with its range."""
+    by_test = next(iter(results.values()))
+    tests = [name for name, ones in by_test.items() if ones[0]["mean"]["iou"]["value"] is not None]
+    classes = list(by_test[tests[0]][0]["iou"])
+    panel = (110.0, figures.row_height(classes) * len(classes))
+    legend = [
+        Line2D([], [], ls="", marker=marker, color=colour, label=arm)
+        for arm, marker, colour in zip(results, figures.SERIES_MARKERS, figures.SERIES_COLOURS, strict=False)
+    ]
+    with figures.panels("trained on", (1, len(tests)), panel, legend=legend, heads=tests) as (figure, axes):
+        for axis, test in zip(axes, tests, strict=True):
+            for k, (scores, line) in enumerate(zip(results.values(), legend, strict=True)):
+                iou = np.array([[one["iou"][name]["value"] or 0.0 for one in scores[test]] for name in classes])
+                middle = iou.mean(axis=1)
+                reach = np.abs(np.stack([iou.min(axis=1), iou.max(axis=1)]) - middle)
+                place = np.arange(len(classes)) + 0.24 * (k - 1)
+                axis.errorbar(middle, place, xerr=reach, fmt=line.get_marker(), color=line.get_color(), ms=4)
+            axis.set(xlim=(0, 1), xlabel="IoU")
+        figures.label_rows(axes, classes)
+        path.write_bytes(figures.png_bytes(figure))
+
+
+def main() -> None:
+    """Train, score, and write the table and the figure."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("bench", type=Path)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--epochs", type=int, default=15)
+    options = parser.parse_args()
+    results = scored(options.bench, options.out, options)
+    lines = table(results)
+    (options.out / "physics_against_paint.md").write_text("\n".join(lines) + "\n")
+    draw(results, options.out / "physics_against_paint.png")
+    print("\n".join(lines))
+
+
+if __name__ == "__main__":
+    main()
