@@ -372,7 +372,9 @@ def _clocked(image: F32, volume: F32, traps: Sequence[tuple[float, float]]) -> F
         left = dr.maximum(dr.gather(Float, packets, here, leaves) - Float(now - before), 0)
         dr.scatter(out, left, here, leaves)
         for memory, value in zip(stack, (cloud, begins), strict=True):
-            memory.write(value, depth, leaves)
+            # The bound holds in any case. As a literal it gives each size of the stack a kernel of its own: Dr.Jit
+            # 1.5 takes kernels that differ in the size of local memory alone for one.
+            memory.write(value, dr.minimum(depth, deep - 1), leaves)
         depth, row = dr.select(leaves, depth + 1, depth - 1), dr.select(leaves, row + 1, row)
         new = dr.gather(Float, clouds, row * columns + column, leaves & (row < rows))
         moved = []
