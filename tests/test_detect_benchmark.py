@@ -70,6 +70,10 @@ def test_every_part_of_a_packaged_benchmark_has_a_scene(name: str) -> None:
 def test_one_command_makes_all_parts_and_continues(file: Path, tmp_path: Path) -> None:
     out = tmp_path / "made"
     arguments = ["bench", "--out", str(out), "--benchmark", str(file), "--fraction", "0.1"]
+    planned = CliRunner().invoke(app, [*arguments, "--dry-run"])
+    assert planned.exit_code == 0, planned.output
+    assert "nominal: no fault" in planned.output
+    assert not out.exists()
     first = CliRunner().invoke(app, [*arguments, "--only", "nominal"])
     assert first.exit_code == 0, first.output
     assert list(read_manifest(out)["parts"]) == ["nominal"]

@@ -6,11 +6,12 @@ import dataclasses
 import itertools
 import json
 import math
-import os
 import shutil
 import signal
 import sys
+import threading
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -118,10 +119,27 @@ def test_a_training_that_was_stopped_goes_on_to_the_same_weights(
         trained = tmp_path / "whole"
         train([path], trained, options)
 
+    now, sent = threading.Event(), threading.Event()
+
+    def send() -> None:
+        if now.wait(60):
+            signal.raise_signal(signal.SIGINT)
+        sent.set()
+
+    def judged(run: Any, batch: Any) -> Any:
+        """Interrupt a step between its halves; the signal reaches another thread, as it may with many threads."""
+        said = type(run)._judged(run, batch)
+        now.set()
+        assert sent.wait(60)
+        return said
+
+    if how == "interrupted":
+        threading.Thread(target=send).start()
+
     def stop(run: Any, batch: Any) -> None:
         steps.append(run.step)
         if len(steps) == 3 and how == "interrupted":
-            os.kill(os.getpid(), signal.SIGINT)
+            run._judged = partial(judged, run)
         update(run, batch)
         if len(steps) == 4 and how.startswith("killed"):
             raise RuntimeError("killed")
@@ -222,6 +240,16 @@ def has_torchvision() -> bool:
     except InputError:
         return False
     return True
+
+
+def test_crops_of_any_size_train(tmp_path: Path) -> None:
+    store = made(tmp_path / "odd.zarr", size=50)
+    train([store], tmp_path / "model", TrainOptions(epochs=1, batch_size=2, crop_px=37))
+    (said,) = load_detector(tmp_path / "model").predict(np.zeros((1, 50, 58, 4), np.uint8))
+    assert said.masks.shape[1:] == (50, 58)
+    small = made(tmp_path / "small.zarr", size=24)
+    with pytest.raises(InputError, match="images of 24 px: the shortest side must be at least 32 px"):
+        train([small], tmp_path / "none", TrainOptions(epochs=1))
 
 
 def test_onnx_gives_what_torch_gives(path: str, trained: Path, tmp_path: Path) -> None:

@@ -189,7 +189,7 @@ def bench(
         str, typer.Option(help="Path of a benchmark's file, or name of a packaged one.", metavar="BENCHMARK")
     ] = "unseen",
     fraction: Annotated[
-        float, number(0.0, 1.0, "Fraction of the samples of each dataset to make, for a trial.")
+        float, number(1e-6, 1.0, "Fraction of the samples of each dataset to make, for a trial.")
     ] = 1.0,
     only: Annotated[
         list[str] | None,
@@ -201,5 +201,8 @@ def bench(
     from ..detect.benchmark import make_benchmark
 
     how = dataset.BuildOptions(**vars(work))
-    for name, part in make_benchmark(benchmark, out, how, fraction=fraction, only=only or ()):
-        typer.echo(f"{name}: {part.samples} samples, {part.size_bytes / 1e6:.0f} MB, digest {part.digest}")
+    for name, part, lines in make_benchmark(benchmark, out, how, fraction=fraction, only=only or ()):
+        if work.dry_run:
+            typer.echo("\n".join([f"{name}: {part.description}", *lines]))
+        else:
+            typer.echo(f"{name}: {part.samples} samples, {part.size_bytes / 1e6:.0f} MB, digest {part.digest}")

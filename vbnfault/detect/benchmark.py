@@ -56,7 +56,7 @@ class BuiltPart:
     description: str
     samples: int
     size_bytes: int
-    digest: str
+    digest: str | None
 
 
 def load_benchmark(name_or_path: str | Path) -> tuple[Benchmark, Path]:
@@ -89,10 +89,12 @@ def make_benchmark(
     *,
     fraction: float = 1.0,
     only: Sequence[str] = (),
-) -> Iterator[tuple[str, BuiltPart]]:
-    """Build the parts of a benchmark, or those of the names `only`, and yield name and result of each.
+) -> Iterator[tuple[str, BuiltPart, list[str]]]:
+    """Build the parts of a benchmark, or those of the names `only`, and yield the name, the result and lines
+    that say what was done, or is to be done, of each.
 
-    A `fraction` of the samples of each part is made, for a trial. The same call continues what was begun.
+    A `fraction` of the samples of each part is made, for a trial. The same call, with the same fraction, continues
+    what was begun. With `options.dry_run`, nothing is written.
 
     Raises
     ------
@@ -107,8 +109,10 @@ def make_benchmark(
             known = ", ".join(benchmark.parts)
             raise InputError(f"{path}: has no part {name!r}{suggestion(name, benchmark.parts)}; {known}")
     scenes = {name: scene_of(benchmark, name, path) for name in only or benchmark.parts}
-    with writing(out):
-        out.mkdir(parents=True, exist_ok=True)
+    dry_run = options is not None and options.dry_run
+    if not dry_run:
+        with writing(out):
+            out.mkdir(parents=True, exist_ok=True)
     for name, scene in scenes.items():
         part, store, variants = benchmark.parts[name], out / f"{name}.zarr", scene.dataset.variants_per_view
         summary = dataset.build_scene(
@@ -124,11 +128,12 @@ def make_benchmark(
             description=part.description,
             samples=summary.samples,
             size_bytes=sum(file.stat().st_size for file in store.rglob("*") if file.is_file()),
-            digest=str(summary.digest),
+            digest=summary.digest,
         )
-        with writing(out / MANIFEST):
-            write_json(out / MANIFEST, _manifest(benchmark, out, {name: built}))
-        yield name, built
+        if not dry_run:
+            with writing(out / MANIFEST):
+                write_json(out / MANIFEST, _manifest(benchmark, out, {name: built}))
+        yield name, built, summary.lines()
 
 
 def _manifest(benchmark: Benchmark, out: Path, built: Mapping[str, BuiltPart]) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from ..store import MASK_RULES, Store
 from .prediction import Prediction
 
 MODEL_FILE = "model.json"  # a folder with it holds a detector
+CHECKPOINT_FILE = "checkpoint.pt"  # and one with this a training
 _MOST_REST_BYTES = 1 << 20  # of a PNG besides its pixels
 
 
@@ -61,6 +62,8 @@ class MaskFolder:
         self.classes = tuple(
             name for name in store.spec.faults if any((root / name).is_dir() for root in self._root.values())
         )
+        if not self.classes and (path / CHECKPOINT_FILE).is_file():
+            raise InputError(f"{path}: holds a training that is not finished; the same command continues it")
         if not self.classes:
             raise InputError(
                 f"{path}: is no detector, for it has no {MODEL_FILE}, and no folder of masks; masks are files "
@@ -69,6 +72,12 @@ class MaskFolder:
         files = {
             (split, name): _numbered(root / name) for split, root in self._root.items() for name in self.classes
         }
+        for of_class in files.values():
+            if of_class and max(of_class) >= store.samples:
+                raise InputError(
+                    f"{of_class[max(of_class)]}: {store.path} has the samples 0 to {store.samples - 1} only; these "
+                    "are masks of another dataset"
+                )
         self._files: dict[tuple[int, str], Path] = {}
         for sample, split in zip(samples, splits, strict=True):
             for name in self.classes:

@@ -259,7 +259,9 @@ def _curves(result: Mapping[str, Any]) -> Markup:
         for one, of_class in axes:
             curve, pixels = of_class["curve"], of_class["pixels"]
             if of_class["predicted_by_model"] and curve["recall"]:
-                one.step(curve["recall"], curve["precision"], color=BLUE, where="pre")
+                # the precision of a threshold holds from the recall of the next higher one, or 0, to its own
+                recall, precision = [*curve["recall"], 0.0], [*curve["precision"], curve["precision"][-1]]
+                one.step(recall, precision, color=BLUE, where="post")
             else:
                 write_message(one, "never predicted" if curve["recall"] else "not in the split")
             if pixels["precision"]["value"] is not None and pixels["recall"]["value"] is not None:

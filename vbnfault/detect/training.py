@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from ..core.errors import InputError, VbnfaultError, shown
 from ..core.files.user_files import sha256_of_input
 from ..core.files.whole_files import remove, write_whole, writing
-from ..core.process.interrupts import Stopped, held, interruptible
+from ..core.process.interrupts import Stopped, finishing, interruptible
 from ..dataset.progress import Progress
 from ..store import digest
 from . import networks
@@ -263,7 +263,7 @@ class _Run:
             began = time.perf_counter()
             batch = next(batches)
             self.waited_s += time.perf_counter() - began
-            with held():
+            with finishing():
                 self._update(batch)
             self.trained_s += time.perf_counter() - began
             bar.advance(built=True)
@@ -294,6 +294,7 @@ class _Run:
 
     def _judged(self, batch: Mapping[str, Tensor]) -> tuple[Outputs, Tensor]:
         """Return what the network says about a batch, and its loss; in bfloat16 where a GPU has it."""
+        batch = dict(batch) | {name: networks.padded(batch[name]) for name in ("image", "masks")}
         on_device = {name: value.to(self.device, non_blocking=True) for name, value in batch.items()}
         mixed = self.device.type == "cuda" and torch.cuda.is_bf16_supported()
         with torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=mixed):
@@ -313,7 +314,7 @@ class _Run:
         if data.val:
             bar.stage("validation")
             figures |= self._validated()
-        with held():
+        with finishing():
             self.epoch, self.step = self.epoch + 1, 0
             self.loss_sum = self.waited_s = self.trained_s = 0.0
             best = max((one["val_mean_iou"] for one in self.history if "val_mean_iou" in one), default=-1.0)
@@ -331,8 +332,8 @@ class _Run:
         self.network.eval()
         with torch.inference_mode():
             for batch in self.data.validation():
-                batch = batch | {name: networks.padded(batch[name]) for name in ("image", "masks")}
                 said, loss = self._judged(batch)
+                batch["masks"] = networks.padded(batch["masks"])
                 figures.add(said, {name: value.to(self.device) for name, value in batch.items()}, loss)
         return figures.values()
 

@@ -142,6 +142,8 @@ class TrainingData:
         self.stores, self.batch_size, self.seed, self.workers = opened, batch_size, seed, workers
         self.classes, self.masks = _classes(opened, classes), masks
         shortest = min(min(store.spec.height, store.spec.width) for store in opened)
+        if shortest < LEAST_CROP_PX:
+            raise InputError(f"images of {shortest} px: the shortest side must be at least {LEAST_CROP_PX} px")
         self.crop_px = min(CROP_PX, shortest) if crop_px is None else crop_px
         if not LEAST_CROP_PX <= self.crop_px <= shortest:
             raise InputError(
