@@ -88,5 +88,4 @@ def _delay(exposure: Exposure, species: tuple[TrapSpecies, ...], transfer_s: flo
     cloud = sensor.transfer.cloud
     if cloud is None:
         cloud = ChargeCloud(full_well_e=sensor.readout.full_well_e)
-
     return partial(_delayed, species=species, cloud=cloud, transfer_s=transfer_s)
