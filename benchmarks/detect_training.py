@@ -20,9 +20,10 @@ import torch
 from turns import processor_s
 
 from vbnfault.detect.losses import loss_of
-from vbnfault.detect.networks import ARCHITECTURES, Outputs, as_input, new_network
+from vbnfault.detect.networks import ARCHITECTURES, Outputs, as_input, new_network, reduced_precision
 from vbnfault.detect.training_data import TrainingData
 
+CPU = torch.device("cpu")
 IMAGES, EPOCHS = 1500, 5
 WARM_UP = 2
 
@@ -63,7 +64,9 @@ def measured(
         before, began = processor_s(), time.perf_counter()
         batch = next(batches)
         read = time.perf_counter()
-        said: Outputs = network(as_input(batch["image"], torch.device("cpu")))
+        with reduced_precision(CPU, architecture):
+            said: Outputs = network(as_input(batch["image"], CPU))
+        said = Outputs(*(value.float() for value in said))
         loss = loss_of(said, batch, weights)
         optimizer.zero_grad(set_to_none=True)
         loss.backward()

@@ -64,7 +64,7 @@ def test_every_part_of_a_packaged_benchmark_has_a_scene(name: str) -> None:
     assert train.isdisjoint(seeds.values())  # so their sites and individuals are others
     for part, scene in scenes.items():
         assert set(scene.faults) == set(benchmark.faults[benchmark.parts[part].faults])
-        assert benchmark.parts[part].samples % scene.dataset.variants_per_view == 0
+        assert (benchmark.parts[part].samples or 0) % scene.dataset.variants_per_view == 0
 
 
 def test_one_command_makes_all_parts_and_continues(file: Path, tmp_path: Path) -> None:
@@ -90,6 +90,48 @@ def test_one_command_makes_all_parts_and_continues(file: Path, tmp_path: Path) -
         assert f"{name}: 4 samples" in both.output
     assert manifest["parts"]["train"]["purpose"] == "train"
     assert not open_store(out / "nominal.zarr").read("injected").any()
+
+
+def test_faults_are_put_into_the_images_of_a_folder(file: Path, tmp_path: Path) -> None:
+    frames = tmp_path / "frames"
+    frames.mkdir()
+    for k in range(3):
+        cv2.imwrite(str(frames / f"{k}.png"), np.full((48, 80), 60 + k, np.uint8))
+    part = '[parts.mine]\nscene = "quickstart"\nfaults = "few"\nframes = true\n'
+    part += 'set = {"dataset.variants_per_view" = 1}\n'
+    file.write_text(FILE.replace("[parts.train]", f"{part}[parts.train]"))
+    out = tmp_path / "made"
+    arguments = ["bench", "--out", str(out), "--benchmark", str(file), "--only", "mine"]
+    with pytest.raises(InputError, match=r"parts.mine.frames = true: needs a folder of images \(--frames\)"):
+        list(make_benchmark(file, out, only=["mine"]))
+    assert [name for name, *_ in make_benchmark(file, out, fraction=0.05)] == ["train", "nominal"]
+    made = CliRunner().invoke(app, [*arguments, "--frames", str(frames)])
+    assert made.exit_code == 0, made.output
+    entry = read_manifest(out)["parts"]["mine"]
+    store = open_store(out / entry["store"])
+    assert entry["samples"] == store.samples == 3
+    assert entry["digest"] == verify(store).digest
+    assert store.read("clean")[:, 0, 0, 0].tolist() == [60, 61, 62]
+    assert store.read("injected").any()
+    file.write_text(file.read_text().replace("frames = true", "frames = true\nsamples = 3"))
+    with pytest.raises(InputError, match=r"parts.mine.samples: must be .* left out with frames = true"):
+        load_benchmark(file)
+
+
+def test_a_path_starts_from_the_file_of_the_benchmark(file: Path, tmp_path: Path) -> None:
+    table = tmp_path / "poses.csv"
+    table.write_text(
+        "name,julian_date,camera_x_T_m,camera_y_T_m,camera_z_T_m,camera_from_T_w,camera_from_T_x,camera_from_T_y,"
+        "camera_from_T_z,sun_x_T,sun_y_T,sun_z_T,sun_distance_au\n"
+        "a,2457000.5,0,0,30000,0,1,0,0,0.6,0,0.8,2.5\n"
+    )
+    set_keys = 'set = {"dataset.variants_per_view" = 1, "trajectory.file" = "poses.csv"}'
+    part = f'[parts.flown]\nscene = "quickstart"\nfaults = "few"\nsamples = 1\n{set_keys}\n'
+    file.write_text(FILE.replace("[parts.train]", f"{part}[parts.train]"))
+    benchmark, path = load_benchmark(file)
+    scene = scene_of(benchmark, "flown", path)
+    assert scene.trajectory is not None
+    assert Path(scene.trajectory.file) == table
 
 
 def test_a_model_is_scored_on_all_tests_and_listed(file: Path, tmp_path: Path) -> None:

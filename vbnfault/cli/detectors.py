@@ -195,13 +195,23 @@ def bench(
         list[str] | None,
         typer.Option(metavar="PART", help="Dataset to make; may be repeated.", show_default="all of the benchmark"),
     ] = None,
+    frames: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="Images of your own for the parts that put faults into such.",
+            show_default="those parts are left out",
+        ),
+    ] = None,
 ) -> None:
     """Build the datasets of a benchmark: some to train on, and tests that differ from them in one thing each."""
     from .. import dataset
     from ..detect.benchmark import make_benchmark
 
     how = dataset.BuildOptions(**vars(work))
-    for name, part, lines in make_benchmark(benchmark, out, how, fraction=fraction, only=only or ()):
+    for name, part, lines in make_benchmark(
+        benchmark, out, how, fraction=fraction, only=only or (), frames=frames or ""
+    ):
         if work.dry_run:
             typer.echo("\n".join([f"{name}: {part.description}", *lines]))
         else:

@@ -293,11 +293,10 @@ class _Run:
         self.loss_sum += value
 
     def _judged(self, batch: Mapping[str, Tensor]) -> tuple[Outputs, Tensor]:
-        """Return what the network says about a batch, and its loss; in bfloat16 where a GPU has it."""
+        """Return what the network says about a batch, and its loss."""
         batch = dict(batch) | {name: networks.padded(batch[name]) for name in ("image", "masks")}
         on_device = {name: value.to(self.device, non_blocking=True) for name, value in batch.items()}
-        mixed = self.device.type == "cuda" and torch.cuda.is_bf16_supported()
-        with torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=mixed):
+        with networks.reduced_precision(self.device, self.options.architecture):
             said = self.network(as_input(on_device["image"], self.device))
         said = Outputs(*(value.float() for value in said))
         return said, loss_of(said, on_device, self.weights)
