@@ -1,28 +1,31 @@
 """Compare networks that were trained on painted faults, on physical ones, and on both, on the tests of a benchmark.
 
     vbnfault bench --out bench --workers 2
-    python benchmarks/physics_against_paint.py bench --out trained --seeds 3 --epochs 15
+    python benchmarks/physics_against_paint.py bench --out trained --seeds 3 --epochs 6
 
 Network, number of images, optimiser and steps are the same: "paint" has the two training parts with faults of the
 paper's models, "physics" the same views with physical faults, "both" one part of each. Each is trained with every
-seed and scored on every test; what exists in the folder is not made again. The table has the mean over the seeds of
-mean IoU and F1, their range, and the fraction of nominal frames with an alarm. `physics_against_paint.md` and a
-figure of the IoU by class are written to the folder.
+seed and scored on every test, with `bench --frames FOLDER` on images of one's own, too; what exists in the folder
+is not made again. PyTorch computes in one thread, so that two calls may train different seeds side by side
+(`--arms`, `--only-seeds`). `physics_against_paint.md` has the means over the seeds and their range: mean IoU and
+F1, both by class, the figures of straylight alone, severity, and alarms in nominal frames. A figure shows the IoU
+by class.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from matplotlib.lines import Line2D
 
 from vbnfault.core import figures
 from vbnfault.detect.benchmark import read_manifest
-from vbnfault.detect.leaderboard import figures_of
 from vbnfault.detect.scored_samples import ALL, ScoreOptions
 from vbnfault.detect.scoring import FILE, score
 from vbnfault.detect.training import TrainOptions, train
@@ -36,13 +39,13 @@ Results = dict[str, dict[str, list[dict[str, Any]]]]
 
 
 def scored(bench: Path, out: Path, options: argparse.Namespace) -> Results:
-    """Return the figures by arm and test, a dictionary for each seed; train and score what does not exist."""
+    """Return the scores by arm and test, one for each seed; train and score what does not exist."""
     parts = read_manifest(bench)["parts"]
     tests = {name: part for name, part in parts.items() if part["purpose"] == "test"}
-    results: Results = {arm: {name: [] for name in tests} for arm in ARMS}
-    for seed in range(options.seeds):
-        for arm, names in ARMS.items():
-            stores = [str(bench / parts[name]["store"]) for name in names if name in parts]
+    results: Results = {arm: {name: [] for name in tests} for arm in options.arms}
+    for seed in options.only_seeds or range(options.seeds):
+        for arm in options.arms:
+            stores = [str(bench / parts[name]["store"]) for name in ARMS[arm] if name in parts]
             model = out / f"{arm}_{seed}"
             how = TrainOptions(epochs=options.epochs, patience=options.epochs, seed=seed)
             train(stores, model, how, progress=True)
@@ -50,7 +53,7 @@ def scored(bench: Path, out: Path, options: argparse.Namespace) -> Results:
                 folder = out / f"{arm}_{seed}_on_{name}"
                 if not (folder / FILE).exists():
                     score(model, bench / part["store"], folder, ScoreOptions(split=ALL, navigation=False))
-                results[arm][name].append(figures_of(json.loads((folder / FILE).read_text())))
+                results[arm][name].append(json.loads((folder / FILE).read_text()))
     return results
 
 
@@ -62,27 +65,64 @@ def of_seeds(values: list[float | None]) -> str:
     return f"{np.mean(known):.3f} ({min(known):.3f} to {max(known):.3f})"
 
 
-def table(results: Results) -> list[str]:
-    """Return the lines of a Markdown table."""
+def table(results: Results, rows: Mapping[str, Sequence[str]]) -> list[str]:
+    """Return the lines of a Markdown table of figures by the keys of `score.json` that lead to each."""
     tests = next(iter(results.values()))
     lines = ["| test | figure | " + " | ".join(results) + " |", "|---|---|" + "---|" * len(results)]
     for test in tests:
-        for figure, read in (
-            ("mean IoU", lambda one: one["mean"]["iou"]["value"]),
-            ("mean F1", lambda one: one["mean"]["f1"]["value"]),
-            ("nominal frames with an alarm", lambda one: one["nominal_frames_with_alarm"]["all"]["value"]),
-        ):
-            cells = [of_seeds([read(one) for one in results[arm][test]]) for arm in results]
+        for figure, keys in rows.items():
+            cells = [of_seeds([_value(one, keys) for one in results[arm][test]]) for arm in results]
             if set(cells) != {"–"}:
                 lines.append(f"| {test} | {figure} | " + " | ".join(cells) + " |")
-    return lines
+    return [*lines, ""]
+
+
+def _value(one: Any, keys: Sequence[str]) -> float | None:
+    """Return a figure of a score; None where it has none."""
+    for key in keys:
+        one = one[key]
+    found: float | None = one["value"]
+    return found
+
+
+def tables(results: Results) -> list[str]:
+    """Return the lines of all tables."""
+    alarms = ("false_alarms", "all")
+    classes = next(iter(next(iter(results.values())).values()))[0]["classes"]
+    light = ("classes", "straylight")
+    return [
+        *table(
+            results,
+            {
+                "mean IoU": ("mean", "iou"),
+                "mean F1": ("mean", "f1"),
+                "severity within one level": ("severity", "within_one_level"),
+                "nominal frames with a marked pixel": (*alarms, "frames_with_alarm"),
+                "nominal frames told faulty": (*alarms, "frames_told_faulty"),
+                "marked pixels of nominal frames": (*alarms, "pixels_fraction"),
+            },
+        ),
+        *table(
+            results,
+            {
+                f"{name}: {text}": ("classes", name, "pixels", figure)
+                for name in classes
+                for text, figure in (("IoU", "iou"), ("F1", "f1"))
+            },
+        ),
+        *table(
+            results,
+            {f"straylight {name}": (*light, "pixels", name) for name in ("iou", "precision", "recall")}
+            | {"straylight artefact precision": (*light, "artefacts", "pap")},
+        ),
+    ]
 
 
 def draw(results: Results, path: Path) -> None:
     """Draw the IoU of each class on each test with faults, the mean over the seeds, with its range."""
     by_test = next(iter(results.values()))
     tests = [name for name, ones in by_test.items() if ones[0]["mean"]["iou"]["value"] is not None]
-    classes = list(by_test[tests[0]][0]["iou"])
+    classes = list(by_test[tests[0]][0]["classes"])
     panel = (110.0, figures.row_height(classes) * len(classes))
     legend = [
         Line2D([], [], ls="", marker=marker, color=colour, label=arm)
@@ -91,7 +131,10 @@ def draw(results: Results, path: Path) -> None:
     with figures.panels("trained on", (1, len(tests)), panel, legend=legend, heads=tests) as (figure, axes):
         for axis, test in zip(axes, tests, strict=True):
             for k, (scores, line) in enumerate(zip(results.values(), legend, strict=True)):
-                iou = np.array([[one["iou"][name]["value"] or 0.0 for one in scores[test]] for name in classes])
+                found = [
+                    [_value(one, ("classes", name, "pixels", "iou")) for one in scores[test]] for name in classes
+                ]
+                iou = np.array([[value or 0.0 for value in row] for row in found])
                 middle = iou.mean(axis=1)
                 reach = np.abs(np.stack([iou.min(axis=1), iou.max(axis=1)]) - middle)
                 place = np.arange(len(classes)) + 0.24 * (k - 1)
@@ -107,10 +150,13 @@ def main() -> None:
     parser.add_argument("bench", type=Path)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--epochs", type=int, default=15)
+    parser.add_argument("--epochs", type=int, default=6)
+    parser.add_argument("--arms", nargs="*", choices=tuple(ARMS), default=tuple(ARMS))
+    parser.add_argument("--only-seeds", nargs="*", type=int, default=())
     options = parser.parse_args()
+    torch.set_num_threads(1)
     results = scored(options.bench, options.out, options)
-    lines = table(results)
+    lines = tables(results)
     (options.out / "physics_against_paint.md").write_text("\n".join(lines) + "\n")
     draw(results, options.out / "physics_against_paint.png")
     print("\n".join(lines))
