@@ -152,6 +152,13 @@ def test_a_model_is_scored_on_all_tests_and_listed(file: Path, tmp_path: Path) -
     (part,) = table["first"]["parts"].values()  # the other dataset is for training
     assert part["nominal_frames_with_alarm"]["all"]["value"] == 0.25  # one of four is marked
     assert part["good_pixels_kept"]["value"] == 0.75
+    split = CliRunner().invoke(app, ["score", str(masks), str(out), "--split", "val"])
+    assert "of the tests of a benchmark, all samples are scored" in split.output + str(split.exception)
+    (tmp_path / "model").mkdir()
+    (tmp_path / "model" / "model.json").write_text("{}")
+    inside = ["score", str(masks), str(out / "nominal.zarr"), "--out", str(tmp_path / "model")]
+    refused = CliRunner().invoke(app, inside)
+    assert "is a model, in which no other file may lie" in refused.output + str(refused.exception)
     (out / "leaderboard.json").write_text("[]")
     with pytest.raises(InputError, match="is no leaderboard"):
         read_leaderboard(out)

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from ..core.errors import InputError
 from .app import app
-from .datasets import WorkOptions
 from .options import MOST_PROCESSES, MOST_SEED, grouped, local_path, number, progress_bar, whole
 
 if TYPE_CHECKING:
@@ -106,7 +106,10 @@ def score(
     out: Annotated[
         Path | None, local_path("Folder for the score.", unset="MODEL_on_DATASET, beside the model")
     ] = None,
-    split: Annotated[Literal["train", "val", "test", "all"], typer.Option(help="Samples to score.")] = "test",
+    split: Annotated[
+        Literal["train", "val", "test", "all"] | None,
+        typer.Option(help="Samples to score.", show_default="test; of a benchmark, always all"),
+    ] = None,
     masks: Annotated[
         Literal["footprint", "effect"] | None,
         typer.Option(
@@ -128,11 +131,15 @@ def score(
     frame, and by what navigation gains. Writes score.json, score.md and score.html.
     """
     from ..detect.leaderboard import is_benchmark, score_benchmark
+    from ..detect.scored_samples import ALL
     from ..detect.scoring import PAGE, ScoreOptions
     from ..detect.scoring import score as compare
 
+    whole_tests = is_benchmark(dataset)
+    if whole_tests and split not in (None, ALL):
+        raise InputError(f"--split {split}: of the tests of a benchmark, all samples are scored; leave it out")
     options = ScoreOptions(
-        split=split,
+        split=split or (ALL if whole_tests else "test"),
         masks=masks or "",
         calibrate=calibrate,
         navigation=navigation,
@@ -141,7 +148,7 @@ def score(
         seed=seed,
     )
     folder = out or model.absolute().parent / f"{model.absolute().name}_on_{Path(dataset.rstrip('/')).stem}"
-    if not is_benchmark(dataset):
+    if not whole_tests:
         with _advancing() as advance:
             result = compare(model, dataset, folder, options, advance=advance)
         _say_means(result)
@@ -181,10 +188,8 @@ def _say_means(result: Mapping[str, Any], where: str = "") -> None:
 
 
 @app.command(rich_help_panel=_PANEL)
-@grouped
 def bench(
     out: Annotated[Path, local_path("Folder for the datasets and benchmark.json, to make or to continue.")],
-    work: WorkOptions,
     benchmark: Annotated[
         str, typer.Option(help="Path of a benchmark's file, or name of a packaged one.", metavar="BENCHMARK")
     ] = "unseen",
@@ -203,16 +208,18 @@ def bench(
             show_default="those parts are left out",
         ),
     ] = None,
+    workers: Annotated[int, whole(1, MOST_PROCESSES, "Number of processes.")] = 1,
+    dry_run: Annotated[bool, typer.Option(help="Plan and describe the datasets, but render nothing.")] = False,
 ) -> None:
     """Build the datasets of a benchmark: some to train on, and tests that differ from them in one thing each."""
     from .. import dataset
     from ..detect.benchmark import make_benchmark
 
-    how = dataset.BuildOptions(**vars(work))
+    how = dataset.BuildOptions(workers=workers, dry_run=dry_run)
     for name, part, lines in make_benchmark(
         benchmark, out, how, fraction=fraction, only=only or (), frames=frames or ""
     ):
-        if work.dry_run:
+        if dry_run:
             typer.echo("\n".join([f"{name}: {part.description}", *lines]))
         else:
             typer.echo(f"{name}: {part.samples} samples, {part.size_bytes / 1e6:.0f} MB, digest {part.digest}")

@@ -26,7 +26,8 @@ def list_(
     kind: Annotated[
         str | None,
         typer.Argument(
-            help="One of scenes, bodies, lenses, detectors, studies, faults, effects, reflectances and glasses.",
+            help="One of scenes, bodies, lenses, detectors, studies, benchmarks, faults, effects, reflectances and "
+            "glasses.",
             metavar="KIND",
             show_default=False,
         ),
@@ -44,7 +45,7 @@ def list_(
     }
     folders = {
         "scenes": "scenes",
-        **{name: f"scenes/{name}" for name in ("bodies", "lenses", "detectors", "studies")},
+        **{name: f"scenes/{name}" for name in ("bodies", "lenses", "detectors", "studies", "benchmarks")},
     }
     if kind in registered:
         load_plugins(plugins)

@@ -105,8 +105,9 @@ def score(
 
     options, store = options or ScoreOptions(), open_store(dataset)
     check_folder(out)
-    if is_store(out):
-        raise InputError(f"{out}: is a store, in which no other file may lie; choose another --out")
+    if is_store(out) or (out / MODEL_FILE).is_file():
+        kind = "store" if is_store(out) else "model"
+        raise InputError(f"{out}: is a {kind}, in which no other file may lie; choose another --out")
     if not store.spec.faults:
         raise InputError(f"{store.path}: it has no fault class, so there is nothing to detect")
     samples = _samples(store, model, options, options.split)
