@@ -214,7 +214,7 @@ def test_the_real_shape_is_67ps(real_shape: Path) -> None:
             "describe paper67p --set camera.lens=nikor_35_f2p8",
             "camera.lens: nikor_35_f2p8: neither a file nor a packaged name (did you mean nikkor_35_f2p8?)",
         ),
-        ("list", "must be one of scenes, bodies, lenses, detectors, studies, faults, effects, reflect"),
+        ("list", "must be one of scenes, bodies, lenses, detectors, studies, benchmarks, faults, effects, reflect"),
         ("list cameras", "must be one of scenes, bodies, lenses"),
         ("schema body", "must be one of scene, lens, sensor, study"),
     ],
