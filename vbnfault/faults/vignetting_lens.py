@@ -82,17 +82,19 @@ class LensVignetting(LensFault):
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
         """Return lens, decentre of the ring, distance, radius and offset of the hood, and the mask loss.
 
-        Lengths are in mm. Decentre and offset have x to the right and y down.
+        Lengths are in mm; the decentre is also in stop radii. Decentre and offset have x to the right and y down.
         """
         frame = context.frame
         beams = frame.beams(self.lens)
         distance = frame.lens.focal_length_mm if self.hood_distance_mm is None else float(self.hood_distance_mm)
         radius = _clear_radius_mm(beams, distance) if self.hood_radius_mm is None else float(self.hood_radius_mm)
         stop_mm = beams.lens.surfaces[beams.lens.stop].semi_diameter_mm
-        slip, moved = self.decentre.uniform(rng) * stop_mm, self.hood_offset.uniform(rng) * radius
+        decentre, moved = self.decentre.uniform(rng), self.hood_offset.uniform(rng) * radius
+        slip = decentre * stop_mm
         turn = rng.uniform(0, 2 * np.pi, 2)
         return {
             "lens": self.lens,
+            "decentre": float(decentre),
             "decentre_mm": [float(slip * np.cos(turn[0])), float(slip * np.sin(turn[0]))],
             "hood_distance_mm": distance,
             "hood_radius_mm": radius,
