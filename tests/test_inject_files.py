@@ -262,6 +262,23 @@ def test_the_command_says_what_it_assumed_and_where_the_images_are(tmp_path: Pat
     assert json.loads((tmp_path / "out/labels/00.png.json").read_text())["seed"] == 3
 
 
+@pytest.mark.parametrize("labels", ["png", "zarr"])
+def test_images_of_a_sequence_share_the_state_of_the_instrument(labels: str, tmp_path: Path) -> None:
+    pictures, scene = _pictures(tmp_path / "in", 3), tmp_path / "dust.toml"
+    scene.write_text('title = "dust"\n[camera]\nexposure_s = 0.01\nfov_deg = 30.0\n[faults.dust_on_optics]\n')
+    grains = {}
+    for option in ([], ["--sequence"]):
+        out = tmp_path / f"out{len(option)}"
+        arguments = ["inject", str(pictures), "--scene", str(scene), "--out", str(out), "--labels", labels, *option]
+        result = CliRunner().invoke(app, arguments)
+        assert result.exit_code == 0, result.output
+        told = [json.loads(path.read_text())["parameters"] for path in sorted(out.glob("labels/*.json"))]
+        grains[len(option)] = [one["dust_on_optics"] for one in told]
+    assert len(grains[0]) == 3
+    assert grains[0][0] != grains[0][1] != grains[0][2]
+    assert grains[1] == [grains[0][0]] * 3  # the first image has the same in both
+
+
 # --- bad input ----------------------------------------------------------------------------------------------------
 
 

@@ -94,6 +94,12 @@ def inject(
             show_default="image.sun of the scene",
         ),
     ] = None,
+    sequence: Annotated[
+        bool,
+        typer.Option(
+            "--sequence", help="The images follow each other: dust, defects and lens stay as they are through all."
+        ),
+    ] = False,
     seed: Annotated[int | None, whole(0, 2**63 - 1, "Seed.", unset="the scene's")] = None,
     workers: Annotated[int, whole(1, MOST_PROCESSES, "Number of processes.")] = 1,
     settings: Annotated[list[str] | None, replaced("scene", "camera.fov_deg=5")] = None,
@@ -107,7 +113,15 @@ def inject(
     changes = overrides(settings)
     if seed is not None:
         changes["dataset.seed"] = seed
-    batch = inject_files(images, load_scene(scene, changes), out, labels=labels, sun=_sun(sun), workers=workers)
+    batch = inject_files(
+        images,
+        load_scene(scene, changes),
+        out,
+        labels=labels,
+        sun=_sun(sun),
+        sequence=sequence,
+        workers=workers,
+    )
     for sentence in batch.report():
         typer.echo(sentence)
     typer.echo(f"{len(batch.names)} images: {out}")

@@ -71,7 +71,7 @@ class Batch:
     out
         Folder of the results.
     states
-        Number of the instrument's state in each image, which the frames of a film share.
+        Number of the instrument's state in each image, which the frames of a film or a sequence share.
     sun
         In place of `image.sun` of the scene; None: as there.
     """
@@ -333,10 +333,13 @@ def inject_files(
     *,
     labels: Labels = "png",
     sun: str | tuple[float, ...] | None = None,
+    sequence: bool = False,
     workers: int = 1,
     progress: bool = True,
 ) -> Batch:
     """Inject the faults of a scene into the images of files, folders and globs, and write them to a folder.
+
+    With `sequence`, all images share the state of the instrument, as the frames of a film do.
 
     Raises
     ------
@@ -346,6 +349,7 @@ def inject_files(
         Some images failed; all others are made, and the same call tries the failed ones again.
     """
     sources, names, states, films = _frames(*_found(images, out), out)
+    states = (0,) * len(states) if sequence else states
     dataset = scene.dataset.model_copy(update={"samples": len(names)})
     scene = scene.model_copy(update={"dataset": dataset, "plan": _plan(scene)})
     batch = Batch(scene=scene, sources=sources, names=names, out=out, states=states, sun=sun)
