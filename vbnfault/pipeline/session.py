@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -23,7 +24,7 @@ from ..core.quantities import Sample
 from ..scene import config, plan
 from ..scene.config import Scene, configure_faults
 from ..scene.keyed_random import keyed_uniform
-from ..scene.trajectory import FlownPose, Trajectory, as_trajectory, load_trajectory, with_rows
+from ..scene.trajectory import FlownPose, Trajectory, as_trajectory, load_trajectory, one_pose, with_rows
 from ..world import assemble, cameras, ephemeris
 from ..world.coma import check_coma
 from ..world.ground import GroundDetail, ground_details, sites_for_suns
@@ -33,6 +34,7 @@ from .spec import Frame, SampleSpec, Terrain
 from .stages import SharedViews, simulate_frame
 
 if TYPE_CHECKING:
+    from ..faults import Fault
     from ..render import TerrainMesh
 
 # Limit of the slope of an octave of the finest relief: steeper relief would look like needles.
@@ -42,6 +44,7 @@ _STEEPEST_DETAIL = 0.12
 _FEWEST_KEPT = 0.05
 # A shape file holds craters and boulders that are wider than so many of its edges.
 _CRATER_EDGES, _BOULDER_EDGES = 2.0, 1.0
+_KEPT_CALLS = 16  # sets of faults and exposure of `Session.take` whose scenes are kept
 
 
 def simulate(
@@ -136,6 +139,7 @@ class Session:
         self._terrain_key: int | GroundDetail | None = None
         self._model: Terrain | None = None
         self._shared_views = SharedViews()
+        self._taken: dict[str, tuple[Scene, dict[str, Fault], plan.Plan]] = {}  # by faults and exposure
         self._compiled = False  # the first sample compiles the kernels
 
     @cached_property
@@ -349,7 +353,7 @@ class Session:
         if self.trajectory is not None:
             flown = self.trajectory.pose(index)
             values = {"julian_date": flown.julian_date, "distance_au": flown.sun_distance_au}
-        return scene.model_copy(update={"sun": scene.sun.model_copy(update=values)}) if values else scene
+        return _dated(scene, **values) if values else scene
 
     def simulate(self, index: int) -> Sample:
         """Return one finished sample."""
@@ -360,6 +364,96 @@ class Session:
         self._compiled = True
         return sample
 
+    def take(
+        self,
+        pose: Mapping[str, Any] | Sequence[Any],
+        *,
+        sun: Sequence[float] | None = None,
+        time: float | None = None,
+        faults: Mapping[str, bool | Mapping[str, Any]] | None = None,
+        exposure: float | None = None,
+        sample: int = 0,
+    ) -> Sample:
+        """Return the sample of a pose that was not known before, as for a camera in a loop.
+
+        It equals, bit for bit, row `sample` of a table of poses with as many rows as the scene has samples, all of
+        them this pose. Body, kernels, faults and, where it serves, terrain stay from call to call.
+
+        Parameters
+        ----------
+        pose
+            Position of the camera in T in m, float[3], and the quaternion `camera_from_T`, w first, float[4]; or a
+            mapping with the columns of a table of poses.
+        sun
+            Direction from the body to the Sun in T, float[3]; by default the mapping's.
+        time
+            Julian date, TDB; by default the mapping's, or the scene's.
+        faults
+            Which faults the sample has: a class is on with True or with values of keys, such as
+            `{"dust_on_optics": True, "straylight": {"veil_fraction": 0.01}}`, and all others are off. By default
+            the plan chooses.
+        exposure
+            In s; by default as the scene says.
+        sample
+            Number of the sample, from 0 to below `dataset.samples`: the key of its noise and of what is drawn.
+
+        Raises
+        ------
+        InputError
+            If the pose, a fault or a value cannot be used.
+        """
+        dated = self.scene if time is None else _dated(self.scene, julian_date=time)
+        row = one_pose(pose, sun, dated.sun.julian_date, ephemeris.sun_distance_au(dated), time)
+        scene, of_faults, planned = self._switched(row, faults, exposure)
+        number = tables.whole(sample)
+        if number is None or not 0 <= number < len(planned):
+            raise InputError(f"sample = {shown(sample)}: must be a whole number from 0 to {len(planned) - 1}")
+        flown = row.pose(0)
+        spec = SampleSpec(
+            index=number,
+            scene=_dated(scene, julian_date=flown.julian_date, distance_au=flown.sun_distance_au),
+            plan=planned,
+            faults=of_faults,
+            terrain=self.aimed_terrain(flown),
+            flown=flown,
+            terrain_of=self.aimed_terrain if scene.is_aimed else None,
+        )
+        return to_sample(simulate_frame(spec))
+
+    def _switched(
+        self, row: Trajectory, faults: Mapping[str, bool | Mapping[str, Any]] | None, exposure: float | None
+    ) -> tuple[Scene, dict[str, Fault], plan.Plan]:
+        """Return the scene as for a table of poses, with other faults and exposure, its faults and its plan."""
+        key = json.dumps([faults, exposure], sort_keys=True, default=repr)
+        if key not in self._taken:
+            scene = self.scene
+            if faults is not None or exposure is not None:
+                table = scene.resolved()
+                table["camera"] |= {} if exposure is None else {"exposure_s": exposure}
+                for name, values in (faults or {}).items():
+                    if name not in table["faults"]:
+                        known = ", ".join(table["faults"])
+                        raise InputError(f"faults: {shown(name)} is no fault of {self.source}; it has {known}")
+                    table["faults"][name] |= dict(values) if isinstance(values, Mapping) else {}
+                scene = config.parse_scene(table, source=self.source)
+            rows = self.trajectory or row.repeated(len(self.plan))
+            scene = with_rows(scene, rows)
+            parsed = configure_faults(scene, self.source)
+            need_sun = [name for name, fault in parsed.items() if fault.needs_sun]
+            planned = plan.make_plan(scene, list(parsed), [len(rows)], need_sun=need_sun)
+            if faults is not None:
+                on = [faults.get(name, False) is not False for name in planned.faults]
+                planned = replace(planned, injected=np.tile(on, (len(planned), 1)))
+            if len(self._taken) == _KEPT_CALLS:
+                del self._taken[next(iter(self._taken))]
+            self._taken[key] = scene, parsed, planned
+        return self._taken[key]
+
     def frame(self, index: int) -> Frame:
         """Return one sample with the outcome of every stage, from its pose to its labels."""
         return simulate_frame(self.spec(index), shared=self._shared_views)
+
+
+def _dated(scene: Scene, **values: float) -> Scene:
+    """Return a scene with other values of its Sun."""
+    return scene.model_copy(update={"sun": scene.sun.model_copy(update=values)})

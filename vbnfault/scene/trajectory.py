@@ -226,6 +226,63 @@ def as_trajectory(poses: Trajectory | str | Path | Mapping[str, Sequence[Any]] |
     return _checked(columns, _IN_PYTHON)
 
 
+def one_pose(
+    pose: Mapping[str, Any] | Sequence[Any],
+    sun: Any,
+    julian_date: float,
+    sun_distance_au: float,
+    time: float | None = None,
+) -> Trajectory:
+    """Return a table of one pose.
+
+    Parameters
+    ----------
+    pose
+        Position in T in m, float[3], and the quaternion `camera_from_T`, w first, float[4]; or a mapping with the
+        columns of a table, such as a row of a data frame, of which only the camera's are needed.
+    sun
+        Direction from the body to the Sun in T, float[3], of any length; None: the mapping's.
+    julian_date, sun_distance_au
+        TDB and distance, where the mapping has none.
+    time
+        TDB in any case; None: as above.
+
+    Raises
+    ------
+    InputError
+        Something is missing, or no pose.
+    """
+    row: dict[str, Any] = {"name": "pose", "julian_date": julian_date, "sun_distance_au": sun_distance_au}
+    camera = [f"camera_{axis}_T_m" for axis in "xyz"] + [f"camera_from_T_{axis}" for axis in "wxyz"]
+    if isinstance(pose, Mapping) or hasattr(pose, "keys"):
+        row |= dict(pose)
+    else:
+        try:
+            numbers = [*map(float, pose[0]), *map(float, pose[1])]
+            row |= dict(zip(camera, numbers, strict=True))
+        except (TypeError, ValueError, IndexError):
+            raise InputError(
+                f"pose = {shown(pose)}: must be a position in m and a quaternion, w first, or a row of a table of "
+                "poses"
+            ) from None
+    if sun is not None:
+        try:
+            towards = np.array([float(x) for x in sun])
+            length = float(np.linalg.norm(towards))
+        except (TypeError, ValueError):
+            towards, length = np.zeros(0), 0.0
+        if towards.shape != (3,) or not 0 < length < np.inf:
+            raise InputError(
+                f"sun = {shown(sun)}: must be three numbers, the direction from the body to the Sun in T"
+            )
+        row |= dict(zip((f"sun_{axis}_T" for axis in "xyz"), (towards / length).tolist(), strict=True))
+    if time is not None:
+        row["julian_date"] = time
+    if missing := [name for name in COLUMNS if name not in row]:
+        raise InputError(f"pose: {', '.join(missing)} is missing; sun gives the Sun's direction")
+    return _checked({name: [value] for name, value in row.items()}, "pose")
+
+
 def _csv_columns(data: bytes, source: str) -> dict[str, list[Any]]:
     """Return the columns of a CSV file, as texts. Raises InputError."""
     try:
