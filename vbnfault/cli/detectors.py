@@ -41,7 +41,7 @@ class NetworkOptions:
     ] = None
     epochs: Annotated[int, whole(1, 100_000, "Number of passes through the images.")] = 30
     batch_size: Annotated[int, whole(1, 4096, "Images of a step.")] = 8
-    learning_rate: Annotated[float, number(1e-7, 1, "Largest rate of learning.")] = 3e-3
+    learning_rate: Annotated[float, number(1e-7, 1, "Largest rate of learning.")] = 6e-3
     patience: Annotated[
         int, whole(1, 100_000, "Epochs without a better validation after which the training ends.")
     ] = 10

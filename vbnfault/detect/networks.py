@@ -37,6 +37,7 @@ _HIDDEN = 64
 # costs most; flares and blur need the coarse maps. 0.5 million parameters; 270 ms of processor time train it with
 # an image of 256 px on the machine of `benchmarks/detect_training.py`.
 _WIDTHS = (16, 24, 48, 64, 96)
+_AROUND_PX, _GAIN = 5, 8.0  # of the contrast to the neighbourhood, in which a line of few DN is of order 1
 _MOST_PIXELS = 1 << 21  # that are predicted at once
 
 
@@ -93,13 +94,17 @@ def _block(given: int, width: int) -> nn.Sequential:
 class UNet(nn.Module):
     """Segment with a small U-Net (Ronneberger et al. 2015), whose coarsest features know their mean.
 
+    It sees the square root of the image, in which shot noise is the same at any brightness (Anscombe 1948), and its
+    contrast to the mean of 5 × 5 px. In an image with the Sun, normalisation makes a line of 20 DN vanish beside
+    glare: without the two, a training with physical faults does not find broken lines in 1,000 steps, with them in
+    400 (IoU 0.44 on validation images).
     Mean and maximum over the image tell each pixel of veils, blur and falloff, which no window of an image shows.
     Maps grow by repetition: its gradient is the same in every run on a GPU, unlike that of an interpolation.
     """
 
     def __init__(self, classes: int, widths: Sequence[int] = _WIDTHS) -> None:
         super().__init__()
-        self.down = nn.ModuleList(map(_block, (CHANNELS, *widths), widths))
+        self.down = nn.ModuleList(map(_block, (2 * CHANNELS, *widths), widths))
         self.context = nn.Linear(2 * widths[-1], widths[-1])
         coarse, fine = widths[:0:-1], widths[-2::-1]
         self.up = nn.ModuleList(_block(below + beside, beside) for below, beside in zip(coarse, fine, strict=True))
@@ -109,7 +114,9 @@ class UNet(nn.Module):
     def forward(self, images: Tensor) -> Outputs:
         """Return what the network says about images whose sides are multiples of 16 px."""
         beside: list[Tensor] = []
-        maps = images
+        root = images.sqrt()
+        mean = functional.avg_pool2d(root, _AROUND_PX, 1, _AROUND_PX // 2, count_include_pad=False)
+        maps = torch.cat([root, (_GAIN * (root - mean)).clamp(-2, 2)], 1)
         for k, block in enumerate(self.down):
             maps = block(functional.max_pool2d(maps, 2) if k else maps)
             beside.append(maps)

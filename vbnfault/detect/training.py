@@ -87,7 +87,7 @@ class TrainOptions:
     crop_px: int | None = None
     epochs: int = 30
     batch_size: int = 8
-    learning_rate: float = 3e-3
+    learning_rate: float = 6e-3
     patience: int = 10
     seed: int = 0
     weights: Path | None = None
