@@ -34,8 +34,8 @@ MODEL, WEIGHTS, CHECKPOINT = "model.json", "weights.pt", "checkpoint.pt"
 FORMAT = 1
 _HIDDEN = 64
 # Widths of the U-Net at full size, 1/2, … 1/16. Lines and defects of one pixel need the full size, where a channel
-# costs most; flares and blur need the coarse maps. 0.5 million parameters; 270 ms of processor time train it with
-# an image of 256 px on the machine of `benchmarks/detect_training.py`.
+# costs most; flares and blur need the coarse maps. 0.5 million parameters; 120 ms of processor time train it with
+# an image of 256 px (`benchmarks/detect_training.py`, with AMX).
 _WIDTHS = (16, 24, 48, 64, 96)
 _AROUND_PX, _GAIN = 5, 8.0  # of the contrast to the neighbourhood, in which a line of few DN is of order 1
 _MOST_PIXELS = 1 << 21  # that are predicted at once
