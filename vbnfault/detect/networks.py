@@ -260,7 +260,7 @@ def reduced_precision(device: torch.device, architecture: str) -> torch.autocast
     if device.type == "cuda":
         faster = torch.cuda.is_bf16_supported()
     else:
-        asked = getattr(torch.cpu, "get_capabilities", dict)  # older PyTorch does not tell
+        asked: Any = getattr(torch.cpu, "get_capabilities", dict)  # older PyTorch does not tell
         faster = device.type == "cpu" and architecture == UNET and bool(asked().get("amx_bf16", False))
     return torch.autocast(device.type, dtype=torch.bfloat16, enabled=faster)
 
