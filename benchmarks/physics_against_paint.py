@@ -1,13 +1,13 @@
 """Compare networks that were trained on painted faults, on physical ones, and on both, on the tests of a benchmark.
 
     vbnfault bench --out bench --workers 2
-    python benchmarks/physics_against_paint.py bench --out trained --seeds 3 --epochs 6
+    python benchmarks/physics_against_paint.py bench --out trained --seeds 0 1 2 --epochs 6
 
 Network, number of images, optimiser and steps are the same: "paint" has the two training parts with faults of the
 paper's models, "physics" the same views with physical faults, "both" one part of each. Each is trained with every
 seed and scored on every test, with `bench --frames FOLDER` on images of one's own, too; what exists in the folder
 is not made again. PyTorch computes in one thread, so that two calls may train different seeds side by side
-(`--arms`, `--only-seeds`). `physics_against_paint.md` has the means over the seeds and their range: mean IoU and
+(`--arms`, `--seeds`). `physics_against_paint.md` has the means over the seeds and their range: mean IoU and
 F1, both by class, the figures of straylight alone, severity, and alarms in nominal frames. A figure shows the IoU
 by class.
 """
@@ -43,7 +43,7 @@ def scored(bench: Path, out: Path, options: argparse.Namespace) -> Results:
     parts = read_manifest(bench)["parts"]
     tests = {name: part for name, part in parts.items() if part["purpose"] == "test"}
     results: Results = {arm: {name: [] for name in tests} for arm in options.arms}
-    for seed in options.only_seeds or range(options.seeds):
+    for seed in options.seeds:
         for arm in options.arms:
             stores = [str(bench / parts[name]["store"]) for name in ARMS[arm] if name in parts]
             model = out / f"{arm}_{seed}"
@@ -149,10 +149,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("bench", type=Path)
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--seeds", nargs="+", type=int, default=(0, 1, 2))
     parser.add_argument("--epochs", type=int, default=6)
-    parser.add_argument("--arms", nargs="*", choices=tuple(ARMS), default=tuple(ARMS))
-    parser.add_argument("--only-seeds", nargs="*", type=int, default=())
+    parser.add_argument("--arms", nargs="+", choices=tuple(ARMS), default=tuple(ARMS))
     options = parser.parse_args()
     torch.set_num_threads(1)
     results = scored(options.bench, options.out, options)

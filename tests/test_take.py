@@ -77,7 +77,6 @@ def test_faults_and_exposure_are_those_of_the_call(session: vbnfault.Session) ->
     assert not none.scalars["injected"].any()
     assert none.scalars["exposure_s"] == 0.002
     assert not np.array_equal(none.layers["image"], session.take(POSE, faults={}).layers["image"])
-    assert len(session._taken) == 4
 
 
 @pytest.mark.parametrize(
@@ -89,6 +88,8 @@ def test_faults_and_exposure_are_those_of_the_call(session: vbnfault.Session) ->
         ({"pose": ([0, 0, 9e3], [1, 0.1, 0, 0]), "sun": (1, 0, 0)}, r"pose: row 1: .*their norm is 1.00499"),
         ({"sun": (0, 0, 0)}, r"sun = .*: must be three numbers"),
         ({"sun": "up"}, r"sun = .*: must be three numbers"),
+        ({"time": "noon"}, r"julian_date = 'noon': must be a number"),
+        ({"faults": ["dust_on_optics"]}, r"faults = .*: must map names of classes"),
         ({"time": 5}, r"julian_date = 5.*must be a number from 1000000"),
         ({"faults": {"dust": True}}, r"faults: 'dust' is no fault of scene; it has dust_on_optics"),
         ({"faults": {"dust_on_optics": {"cuont": 3}}}, r"cuont"),

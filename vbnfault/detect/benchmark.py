@@ -94,7 +94,7 @@ def scene_of(benchmark: Benchmark, name: str, path: Path) -> Scene:
 
 
 def _beside(name: str, path: Path) -> str:
-    """Return the path of a file that a benchmark's file names, which starts from there; another name as it is."""
+    """Return the path of a file that lies beside the benchmark's file, or the name as it is if there is none."""
     beside = path.absolute().parent / name
     return str(beside) if Path(name).suffix and beside.is_file() else name
 
@@ -166,7 +166,7 @@ def make_benchmark(
 def _injected(
     scene: Scene, frames: str, folder: Path, options: dataset.BuildOptions
 ) -> tuple[Path, int, str | None, list[str]]:
-    """Put a scene's faults into the images of a folder; return the store, their number, its digest and lines."""
+    """Put a scene's faults into a folder's images; return the store, their number, the digest, and a report."""
     from ..inject.batch import inject_files
 
     store = folder / "dataset.zarr"

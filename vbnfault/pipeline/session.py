@@ -402,8 +402,13 @@ class Session:
         InputError
             If the pose, a fault or a value cannot be used.
         """
-        dated = self.scene if time is None else _dated(self.scene, julian_date=time)
-        row = one_pose(pose, sun, dated.sun.julian_date, ephemeris.sun_distance_au(dated), time)
+        row = one_pose(
+            pose,
+            sun,
+            time,
+            self.scene.sun.julian_date,
+            lambda date: ephemeris.sun_distance_au(_dated(self.scene, julian_date=date)),
+        )
         scene, of_faults, planned = self._switched(row, faults, exposure)
         number = tables.whole(sample)
         if number is None or not 0 <= number < len(planned):
@@ -423,7 +428,11 @@ class Session:
     def _switched(
         self, row: Trajectory, faults: Mapping[str, bool | Mapping[str, Any]] | None, exposure: float | None
     ) -> tuple[Scene, dict[str, Fault], plan.Plan]:
-        """Return the scene as for a table of poses, with other faults and exposure, its faults and its plan."""
+        """Return the scene with a table of poses and a call's faults and exposure, its faults, and its plan."""
+        if not isinstance(faults, Mapping | None):
+            raise InputError(
+                f"faults = {shown(faults)}: must map names of classes to True, False or values of keys"
+            )
         key = json.dumps([faults, exposure], sort_keys=True, default=repr)
         if key not in self._taken:
             scene = self.scene
@@ -436,11 +445,10 @@ class Session:
                         raise InputError(f"faults: {shown(name)} is no fault of {self.source}; it has {known}")
                     table["faults"][name] |= dict(values) if isinstance(values, Mapping) else {}
                 scene = config.parse_scene(table, source=self.source)
-            rows = self.trajectory or row.repeated(len(self.plan))
-            scene = with_rows(scene, rows)
+            scene = with_rows(scene, row.repeated(len(self.plan)))
             parsed = configure_faults(scene, self.source)
             need_sun = [name for name, fault in parsed.items() if fault.needs_sun]
-            planned = plan.make_plan(scene, list(parsed), [len(rows)], need_sun=need_sun)
+            planned = plan.make_plan(scene, list(parsed), need_sun=need_sun)
             if faults is not None:
                 on = [faults.get(name, False) is not False for name in planned.faults]
                 planned = replace(planned, injected=np.tile(on, (len(planned), 1)))

@@ -10,7 +10,7 @@ from __future__ import annotations
 import csv
 import io
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -229,9 +229,9 @@ def as_trajectory(poses: Trajectory | str | Path | Mapping[str, Sequence[Any]] |
 def one_pose(
     pose: Mapping[str, Any] | Sequence[Any],
     sun: Any,
-    julian_date: float,
-    sun_distance_au: float,
-    time: float | None = None,
+    time: float | None,
+    default_date: float,
+    distance_au: Callable[[float], float],
 ) -> Trajectory:
     """Return a table of one pose.
 
@@ -242,17 +242,17 @@ def one_pose(
         columns of a table, such as a row of a data frame, of which only the camera's are needed.
     sun
         Direction from the body to the Sun in T, float[3], of any length; None: the mapping's.
-    julian_date, sun_distance_au
-        TDB and distance, where the mapping has none.
     time
-        TDB in any case; None: as above.
+        Julian date, TDB; None: the mapping's, or else `default_date`.
+    distance_au
+        Gives the distance from the Sun at a date, where the mapping has none.
 
     Raises
     ------
     InputError
         Something is missing, or no pose.
     """
-    row: dict[str, Any] = {"name": "pose", "julian_date": julian_date, "sun_distance_au": sun_distance_au}
+    row: dict[str, Any] = {"name": "pose", "julian_date": default_date}
     camera = [f"camera_{axis}_T_m" for axis in "xyz"] + [f"camera_from_T_{axis}" for axis in "wxyz"]
     if isinstance(pose, Mapping) or hasattr(pose, "keys"):
         row |= dict(pose)
@@ -278,6 +278,8 @@ def one_pose(
         row |= dict(zip((f"sun_{axis}_T" for axis in "xyz"), (towards / length).tolist(), strict=True))
     if time is not None:
         row["julian_date"] = time
+    if "sun_distance_au" not in row:
+        row["sun_distance_au"] = distance_au(float(_numbers([row["julian_date"]], "julian_date", "pose")[0]))
     if missing := [name for name in COLUMNS if name not in row]:
         raise InputError(f"pose: {', '.join(missing)} is missing; sun gives the Sun's direction")
     return _checked({name: [value] for name, value in row.items()}, "pose")
