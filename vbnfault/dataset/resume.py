@@ -104,12 +104,13 @@ def check_same_scene(
 def check_same_dataset(store: Store, reference: Store) -> None:
     """Raise InputError with the differences if two stores do not hold samples of one dataset.
 
-    Scene, seed, blocks of samples, versions and size of the shards must be equal.
+    Scene, seed, blocks and number of samples, versions and size of the shards must be equal.
     """
     stored, wanted = (
         {
             **_compared(s.spec),
             "blocks": s.attributes.get("blocks", [s.samples]),
+            "samples": s.samples,  # of the arrays, which damage may have made others than the blocks say
             "shard_samples": s.spec.shard_samples,
         }
         for s in (store, reference)
