@@ -6,8 +6,11 @@ What is not changed in an image is as much a choice as what is:
 - A mirrored image is possible only where every fault acts on the light: lenses and dirt know no left and right.
   Behind the sensor's surface they exist: charge, smear, lines and trails run in the direction of the readout, and a
   network must not learn the other one. Top and bottom differ for both, since bodies lie below.
-- Brightness, colour, noise and sharpness stay as they are. They are what exposure, filters, sensor and lens made of
-  the light, and broken pixels, banding, dust and blur are deviations from them.
+- Brightness, colour and sharpness stay as they are. They are what exposure, filters and lens made of the light, and
+  dust, veils and blur are deviations from them.
+- Half of the images get a black level of up to 12 DN and noise of up to 1.5 DN. A rendered sky is exactly black
+  where the sensor's black level is subtracted, one of a real camera is not: the sky of frames of Rosetta's NAVCAM
+  has 3 to 10 DN. A network that has never seen such takes all of it for a veil.
 """
 
 from __future__ import annotations
@@ -36,6 +39,7 @@ CROP_PX = 256  # by default
 LEAST_CROP_PX = 32
 _MOST_WEIGHT = 10.0
 _COUNTED = 64  # samples of each store that are read for it
+_MOST_BLACK_LEVEL_DN, _MOST_NOISE_DN = 12.0, 1.5
 _LIGHT = {"light", "electrons"}  # the steps of a fault before the sensor
 
 
@@ -58,12 +62,19 @@ class Labelled:
         Side of the crop; None: the whole image.
     mirrored
         Whether half of the images are mirrored, left to right.
+    raised
+        Whether half of the images get another black level and more noise.
     """
 
     def __init__(
-        self, severity: Mapping[int, NDArray[np.float32]], crop_px: int | None = None, *, mirrored: bool = False
+        self,
+        severity: Mapping[int, NDArray[np.float32]],
+        crop_px: int | None = None,
+        *,
+        mirrored: bool = False,
+        raised: bool = False,
     ) -> None:
-        self.severity, self.crop_px, self.mirrored = severity, crop_px, mirrored
+        self.severity, self.crop_px, self.mirrored, self.raised = severity, crop_px, mirrored, raised
 
     def __call__(self, sample: Batch) -> Batch:
         """Return the crop of a sample and its labels."""
@@ -78,6 +89,8 @@ class Labelled:
                 present = present * planes[1].flatten(1).any(1)
         if self.mirrored and torch.rand(()) < 0.5:
             planes = [plane.flip(-1) for plane in planes]
+        if self.raised and torch.rand(()) < 0.5:
+            planes[0] = _raised(planes[0])
         level = torch.from_numpy(self.severity[int(sample["sample"])])
         return {
             "image": planes[0],
@@ -86,6 +99,12 @@ class Labelled:
             "severity": torch.where(present > 0, level, 0.0),
             "usable": 1 - planes[2].float().mean(),
         }
+
+
+def _raised(image: torch.Tensor) -> torch.Tensor:
+    """Return an image uint8[4, y, x] as that of a camera with a higher black level and more noise."""
+    level, noise = torch.rand(2) * torch.tensor([_MOST_BLACK_LEVEL_DN, _MOST_NOISE_DN])
+    return (image + level + noise * torch.randn(image.shape)).round().clamp(0, 255).to(torch.uint8)
 
 
 def may_be_mirrored(store: Store) -> bool:
@@ -171,7 +190,8 @@ class TrainingData:
         """Return the samples of a split of a store: crops to train with, whole images to validate."""
         store = self.stores[number]
         crop = self.crop_px if split == "train" else None
-        label = Labelled(self._levels[number], crop, mirrored=crop is not None and may_be_mirrored(store))
+        varied = crop is not None
+        label = Labelled(self._levels[number], crop, mirrored=varied and may_be_mirrored(store), raised=varied)
         targets = ("masks", "classes", "mask_any")
         return SampleDataset(
             str(store.path), split, targets, classes=self.classes, masks=self.masks, transform=label
@@ -231,7 +251,7 @@ class TrainingData:
         """Return the weight of pixels in a mask of each class, float32[class]: √(pixels outside / inside), 1 to 10.
 
         The square root lies between no balance, with which thin lines are not marked for long, and the whole ratio,
-        with which neighbourhoods are marked; `losses.loss_of` has figures. All stores count by their images.
+        with which neighbourhoods are marked. All stores count by their images.
         """
         odds = torch.stack([1 / data.pixel_weights(_COUNTED) for data in self.train])
         inside = (odds / (1 + odds) * torch.tensor([len(data) for data in self.train])[:, None]).sum(
