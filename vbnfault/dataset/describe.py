@@ -244,7 +244,7 @@ def _trajectory(session: Session, table: Trajectory) -> list[str]:
     distance = table.sun_distance_au[:count]
     return [
         f"trajectory: {count} of {len(table)} rows of {Path(table.source).name}, from {table.name[0]} to "
-        f"{table.name[count - 1]}; a site stands for {session.scene.dataset.shard_samples} rows side by side; "
+        f"{table.name[count - 1]}; {_rows_of_a_site(session, table)}; "
         "poses are kept, and faults that cannot show are recorded as not injected",
         f"nearest ground: {_span(range_m.min(), range_m.max())} m from the camera{first}, "
         f"{_span(*(ground.pixel_rad(session.scene) * range_m[[range_m.argmin(), range_m.argmax()]]))} m a pixel; "
@@ -254,6 +254,17 @@ def _trajectory(session: Session, table: Trajectory) -> list[str]:
         *_rows_inside_the_body(session, table, count),
         *_rows_without_the_sun(session, table, count),
     ]
+
+
+def _rows_of_a_site(session: Session, table: Trajectory) -> str:
+    """Return the clause that says which rows share a site, and how far apart frames of sequences are."""
+    if not table.frames:
+        return f"a site stands for {session.scene.dataset.shard_samples} rows side by side"
+    frames, last = np.array(table.frames), np.cumsum(table.frames)[:-1]
+    apart_s = np.delete(np.diff(table.time_s), last - 1)
+    times = f", {_span(apart_s.min(), apart_s.max())} s apart" if len(apart_s) else ""
+    number = f"{len(frames)} sequences" if len(frames) > 1 else "one sequence"
+    return f"{number} of {_span(frames.min(), frames.max())} frames{times}, each with one camera and its faults"
 
 
 def _rows_that_miss_the_body(session: Session, table: Trajectory, count: int) -> list[str]:

@@ -38,6 +38,7 @@ from ..scene.config import Scene
 from ..scene.instrument import OF_THE_DETECTOR
 from ..scene.sampling import OF_AN_AIM
 from ..scene.target import EARTH
+from ..scene.trajectory import place_in_sequence
 from ..store import StoreSpec
 from ..world import assemble, ephemeris
 
@@ -278,6 +279,7 @@ def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
         rendered_shape=_rendered_shape(camera) if "scene_radiance" in layers else (),
         shard_samples=dataset.shard_samples,
         sample_names=() if session.trajectory is None else session.trajectory.name,
+        sequence_names=() if session.trajectory is None else session.trajectory.sequence_names,
         attributes=_root_attributes(session, blocks),
     )
 
@@ -469,6 +471,7 @@ def planned(attributes: Mapping[str, Any], faults: Sequence[str]) -> Callable[[i
     """
     scene, table = stored_plan(attributes, faults)
     numbers = plan_numbers(attributes)
+    frames = () if scene.trajectory is None else scene.trajectory.frames
 
     def expected(sample: int, tries: int) -> dict[str, Any]:
         index = int(numbers[sample])
@@ -484,6 +487,7 @@ def planned(attributes: Mapping[str, Any], faults: Sequence[str]) -> Callable[[i
             "detector_individual": int(table.individual[index]),
             "proposal": proposal(scene, table, index, drawn),
             "injected": table.injected[index],
+            **(dict(zip(("sequence", "frame"), place_in_sequence(frames, index), strict=True)) if frames else {}),
         }
 
     return expected

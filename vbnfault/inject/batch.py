@@ -38,7 +38,7 @@ from ..pipeline.record import proposal
 from ..scene import plan
 from ..scene.config import Scene
 from ..scene.sampling import PlanTable
-from ..store.schema import SCALARS
+from ..store import SCALARS
 from .files import ENDINGS, MOST_VALUES, ImageFile, read_image, source_files
 from .films import ENDINGS as FILMS
 from .films import Film, assemble, frame_path, unpack
@@ -71,7 +71,8 @@ class Batch:
     out
         Folder of the results.
     states
-        Number of the instrument's state in each image, which the frames of a film or a sequence share.
+        Number of the instrument's state in each image, which the frames of a film or a sequence share; None for an
+        image by itself.
     sun
         In place of `image.sun` of the scene; None: as there.
     """
@@ -80,7 +81,7 @@ class Batch:
     sources: tuple[Path, ...]
     names: tuple[str, ...]
     out: Path
-    states: tuple[int, ...]
+    states: tuple[int | None, ...]
     sun: str | tuple[float, ...] | None = None
 
     @cached_property
@@ -420,16 +421,16 @@ def _first_image(batch: Batch) -> ImageFile:
 
 def _frames(
     root: Path, paths: Sequence[Path], out: Path
-) -> tuple[tuple[Path, ...], tuple[str, ...], tuple[int, ...], dict[str, Film]]:
+) -> tuple[tuple[Path, ...], tuple[str, ...], tuple[int | None, ...], dict[str, Film]]:
     """Return images, with frames for films, their names below the folder `root`, states, and the films by name."""
     sources: list[Path] = []
     names: list[str] = []
-    states: list[int] = []
+    states: list[int | None] = []
     films = {}
     for path in paths:
         name = path.relative_to(root).as_posix()
         if path.suffix.lower() not in FILMS:
-            states.append(len(sources))
+            states.append(None)
             sources.append(path)
             names.append(name)
             continue

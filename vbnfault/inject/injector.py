@@ -23,7 +23,7 @@ from ..pipeline.development import Development, Draws, without
 from ..pipeline.exposure import reference_exposure_s
 from ..pipeline.injection import draw_faults, visible_draws
 from ..pipeline.labels import labels_of
-from ..pipeline.spec import Draw, Injection, Labels, SceneExposure, SceneLight, mask_any_faults
+from ..pipeline.spec import Draw, Injection, Labels, SceneExposure, SceneLight, is_state, mask_any_faults
 from ..scene import keyed_random
 from ..scene.config import Scene, configure_faults, load_scene, parse_scene
 from ..scene.instrument import CameraTable, ImageTable
@@ -135,11 +135,16 @@ class _Drawing:
     faults: Mapping[str, Fault]
     seed: int
     index: int
-    state: int
+    state: int | None
+
+    @property
+    def shares_state(self) -> bool:
+        """Return whether other images have the same state of the instrument."""
+        return self.state is not None
 
     def rng(self, stage: str, name: str) -> np.random.Generator:
         """Return the generator for (stage, name); faults that last from image to image follow `state`."""
-        lasts = stage == "fault" and not self.faults[name.partition("/")[0]].per_exposure
+        lasts = stage == "fault" and self.state is not None and is_state(self, name.partition("/")[0])
         return keyed_random.rng(self.seed, self.state if lasts else self.index, stage, name)
 
 
@@ -228,9 +233,7 @@ class Injector:
         given = image if isinstance(image, Electrons | Radiance) else _checked_array(image)
         grey = isinstance(given, np.ndarray) and given.ndim == 2
         camera, assumed = self._camera(_shape(given), camera, grey=grey)
-        drawing = _Drawing(
-            faults=self.faults, seed=self.scene.dataset.seed, index=index, state=index if state is None else state
-        )
+        drawing = _Drawing(faults=self.faults, seed=self.scene.dataset.seed, index=index, state=state)
         picture = None
         if isinstance(given, Electrons | Radiance):
             light = given if isinstance(given, Electrons) else camera.expose(given, camera.exposure_s)

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..faults import FaultContext
 from .development import Development, Draws, acting_at, informs
-from .spec import Draw, Drawing, Injection, Pose, Rendering, SampleSpec, SceneExposure, stored_layers
+from .spec import Draw, Drawing, Injection, Pose, Rendering, SampleSpec, SceneExposure, is_state, stored_layers
 
 _DRAW_TRIES = 8
 # A fault that changes the light by less than a count moves the noise-free image across a few roundings. The image
@@ -32,7 +32,7 @@ def inject_faults(
     in whose place another one is needed in any case (`asking_for_another_view`).
 
     A fault without a visible effect is drawn again a few times, then left out. So the result holds the faults that
-    are in the image, and labels never claim more.
+    are in the image, and labels never claim more. A state of the instrument is not drawn again in a sequence.
     """
     commanded = list(spec.commanded if commanded is None else commanded)
     if not pose.resolved or pose.sun_visible_fraction == 0:
@@ -70,7 +70,9 @@ def visible_draws(
         draws = {name: draw for name, draw in draws.items() if name not in invisible}
         attempt += 1
         if attempt <= last:
-            draws = draw_faults(spec, development, commanded, draws, attempt)
+            # what one image of a sequence does not show stays as it is: others may show it
+            again = [name for name in commanded if not (spec.shares_state and is_state(spec, name))]
+            draws = draw_faults(spec, development, again, draws, attempt)
     return draws
 
 

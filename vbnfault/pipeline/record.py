@@ -12,6 +12,7 @@ from ..core import frames
 from ..core.quantities import Sample
 from ..scene import plan
 from ..scene.config import Scene
+from ..scene.trajectory import FlownPose
 from ..world import assemble, ephemeris
 from . import masks
 from .spec import Frame, stored_layers
@@ -139,7 +140,13 @@ def _provenance(frame: Frame) -> dict[str, Any]:
             name: {"model": spec.faults[name].model, **params} for name, params in sorted(frame.drawn.items())
         },
         "proposal": proposal(spec.scene, spec.plan, i, pose.variables),
+        **(of_sequence(spec.flown) if spec.shares_state and spec.flown else {}),
     }
+
+
+def of_sequence(flown: FlownPose) -> dict[str, Any]:
+    """Return the place of a pose in its sequence."""
+    return {"sequence": flown.sequence, "frame": flown.frame, "time_s": flown.time_s}
 
 
 def points_T_m(frame: Frame) -> F64:

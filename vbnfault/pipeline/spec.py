@@ -80,8 +80,17 @@ class Drawing(Protocol):
     def faults(self) -> Mapping[str, Fault]:
         """Return the faults by class, in dataset order."""
 
+    @property
+    def shares_state(self) -> bool:
+        """Return whether other images have the same state of the instrument, as the frames of a sequence do."""
+
     def rng(self, stage: str, name: str) -> np.random.Generator:
         """Return the random generator of the sample for (stage, name)."""
+
+
+def is_state(drawing: Drawing, fault: str) -> bool:
+    """Return whether a fault is a state of the instrument, which lasts from image to image of a sequence."""
+    return fault in drawing.faults and not drawing.faults[fault].per_exposure
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -127,8 +136,14 @@ class SampleSpec:
         return self if first == self.index else replace(self, index=first)
 
     def rng(self, stage: str, name: str) -> np.random.Generator:
-        """Return the random generator of this sample for (stage, name)."""
-        return keyed_random.rng(self.seed, self.index, stage, name)
+        """Return the random generator of this sample for (stage, name); states of the instrument last."""
+        lasts = stage == "fault" and is_state(self, name.partition("/")[0])
+        return keyed_random.rng(self.seed, int(self.plan.state[self.index]) if lasts else self.index, stage, name)
+
+    @property
+    def shares_state(self) -> bool:
+        """Return whether the sample is a frame of a sequence, whose frames share the state of the instrument."""
+        return self.flown is not None and self.flown.sequence >= 0
 
     @cached_property
     def camera(self) -> Camera:

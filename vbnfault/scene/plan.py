@@ -56,6 +56,8 @@ class Plan:
     - `aim` uint8[n] is the aim, an index in `aims.AIMS`; None without `geometry.aim`.
     - `draw` int64[n] is the sample whose key the draws of a sample's view have: by default the first of its view.
     - `block` int64[n] is the block that each sample was planned with.
+    - `state` int64[n] is the sample whose key the draws of the instrument's state have: the first frame of each
+      sample's sequence, or itself. Dust, defects and wear are states; what happens during an exposure is not.
     - `group` int64[n] numbers the samples that exchange views; None if views are drawn again instead.
     - `views` are those of an earlier dataset, if the plan takes them over.
 
@@ -75,6 +77,7 @@ class Plan:
     paired: NDArray[np.bool_]
     draw: NDArray[np.int64]
     block: NDArray[np.int64]
+    state: NDArray[np.int64]
     group: NDArray[np.int64] | None = None
     aim: NDArray[np.uint8] | None = None
     views: EarlierViews | None = None
@@ -157,14 +160,19 @@ def make_plan(
     starts = np.cumsum([0, *sizes])
     samples = np.arange(int(starts[-1]), dtype=np.int64)
     shard = samples // scene.dataset.shard_samples
-    site = _shard_sites(scene, int(shard[-1]) + 1)[shard]
+    sequence, state = _sequences(scene, samples)
+    site = _shard_sites(scene, int(shard[-1]) + 1)[shard] if sequence is None else sequence
     split = site_split(scene)[site]
+    firsts = np.flatnonzero(state == samples)  # the frames of a sequence carry the same faults
     parts = []
     for b, (start, end) in enumerate(itertools.pairwise(starts.tolist())):
-        rows = slice(start, end)
-        parts.append(draw_block(scene, (tuple(faults), frozenset(need_sun)), (b, start), shard[rows], split[rows]))
-    injected = np.concatenate([p[0] for p in parts])
-    stratum = np.concatenate([p[1] for p in parts])
+        rows = firsts[(firsts >= start) & (firsts < end)]
+        if len(rows):
+            classes = tuple(faults), frozenset(need_sun)
+            parts.append(draw_block(scene, classes, (b, start), shard[rows], split[rows]))
+    unit = np.searchsorted(firsts, state)
+    injected = np.concatenate([p[0] for p in parts])[unit]
+    stratum = np.concatenate([p[1] for p in parts])[unit]
     block = np.repeat(np.arange(len(sizes)), sizes)
     together = shard if scene.plan.order == "shuffled" else block * scene.dataset.sites + site
     light, paired = _pairs(scene, samples, stratum, together)
@@ -188,13 +196,14 @@ def make_plan(
         stratum=stratum,
         site=site,
         split=split,
-        architecture=_pick(seed, samples, "architecture", len(scene.camera.architectures)),
-        readout_direction=_pick(seed, samples, "readout_direction", len(scene.camera.readout_directions)),
-        individual=individuals(scene, samples, split),
+        architecture=_pick(seed, state, "architecture", len(scene.camera.architectures)),
+        readout_direction=_pick(seed, state, "readout_direction", len(scene.camera.readout_directions)),
+        individual=individuals(scene, state, split),
         light=light,
         paired=paired,
         draw=draw,
         block=block,
+        state=state,
         group=group,
         aim=aim,
         variants=variants,
@@ -222,6 +231,30 @@ def shortcomings(scene: Scene, table: Plan) -> list[str]:
         if classes:
             out.append(f"split {name} has no sample with {', '.join(classes)}")
     return out
+
+
+def _sequences(scene: Scene, samples: NDArray[np.int64]) -> tuple[NDArray[np.int32] | None, NDArray[np.int64]]:
+    """Return the sequence of each sample, int32[n], and the sample of its first frame, int64[n].
+
+    Without sequences, there are no such numbers, and each sample is its own first frame. Raises InputError where
+    the sequences have fewer frames than there are samples, and where samples share a view.
+    """
+    frames = () if scene.trajectory is None else scene.trajectory.frames
+    if not frames:
+        return None, samples
+    if scene.dataset.variants_per_view > 1:
+        raise InputError(
+            f"dataset.variants_per_view = {scene.dataset.variants_per_view}: the rows of the table of poses are "
+            "frames of sequences, each at its own time; must be 1"
+        )
+    starts = np.cumsum([0, *frames])
+    if starts[-1] < len(samples):
+        raise InputError(
+            f"trajectory.frames: the sequences have {starts[-1]} frames; must have at least {len(samples)}, one "
+            "for each sample"
+        )
+    sequence = np.searchsorted(starts, samples, side="right") - 1
+    return sequence.astype(np.int32), starts[sequence]
 
 
 def _pair(low: NDArray[np.float64], high: NDArray[np.float64], stratum: int) -> list[float]:
@@ -404,7 +437,6 @@ def make_retaken_plan(
             )
             _check_enough(scene, names, int(needs.sum()), int(facing.sum()), last - first)
             injected[rows] = injected[rows][_exchanged(needs, facing, split[rows])]
-    samples = np.arange(len(stratum), dtype=np.int64)
     return replace(
         own,
         variables={name: np.repeat(values, repeats) for name, values in earlier.variables.items()},
@@ -412,7 +444,7 @@ def make_retaken_plan(
         stratum=stratum,
         site=np.repeat(earlier.site, repeats),
         split=split,
-        individual=individuals(scene, samples, split),
+        individual=individuals(scene, own.state, split),
         light=np.repeat(earlier.light, repeats) * repeats,
         paired=np.repeat(earlier.paired, repeats),
         aim=None if earlier.aim is None else np.repeat(earlier.aim, repeats),

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, PositiveInt
 
 from ..core import tables
 from ..core.errors import InputError, shown, under_key
@@ -40,6 +40,10 @@ _NUMBERS: dict[str, tuple[float, float]] = {
     "sun_distance_au": (0.01, 1000),
 }
 COLUMNS = ("name", *_NUMBERS)
+# Columns that a table may have: the rows of a sequence are frames that the same camera takes one after the other.
+SEQUENCE_COLUMNS = ("sequence", "time_s")
+_TIME_S = (-1e9, 1e9)
+_DAY_S = 86400.0
 # Largest deviation of the norm of a quaternion or of the Sun's direction from 1; they are then scaled to 1. Four
 # decimals, as in many labels of images, keep it below 2e-4.
 NORM_TOLERANCE = 1e-3
@@ -59,7 +63,10 @@ class TrajectoryTable(Table):
         min_length=1,
         description="CSV or Parquet file with the columns name, julian_date, camera_x_T_m, camera_y_T_m, "
         "camera_z_T_m, camera_from_T_w, camera_from_T_x, camera_from_T_y, camera_from_T_z, sun_x_T, sun_y_T, "
-        "sun_z_T and sun_distance_au",
+        "sun_z_T and sun_distance_au; with sequence and time_s for frames that follow each other",
+    )
+    frames: tuple[PositiveInt, ...] = Field(
+        (), description="Number of rows of each sequence, which vbnfault fills in from the file"
     )
 
 
@@ -68,7 +75,7 @@ class FlownPose:
     """Hold one row: camera and Sun in T.
 
     `T_from_C` float64[3, 3] has the camera's axes as columns. `sun_direction_T` float64[3] is a unit vector towards
-    the Sun.
+    the Sun. `sequence` is -1 for a row of none; `time_s` counts as the table does.
     """
 
     name: str
@@ -77,6 +84,9 @@ class FlownPose:
     T_from_C: F64
     sun_direction_T: F64
     sun_distance_au: float
+    sequence: int = -1
+    frame: int = 0
+    time_s: float = np.nan
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -99,6 +109,12 @@ class Trajectory:
         float64[n, 3], unit vectors towards the Sun.
     sun_distance_au
         float64[n].
+    sequence_names
+        Names of the sequences, in the order of their rows; () if the rows are not frames of such.
+    frames
+        Number of rows of each sequence.
+    time_s
+        float64[n], rising through each sequence; nan without sequences.
     """
 
     source: str
@@ -108,6 +124,9 @@ class Trajectory:
     camera_from_T: F64
     sun_direction_T: F64
     sun_distance_au: F64
+    time_s: F64
+    sequence_names: tuple[str, ...] = ()
+    frames: tuple[int, ...] = ()
 
     def __len__(self) -> int:
         return len(self.name)
@@ -120,7 +139,7 @@ class Trajectory:
         arrays: dict[str, Any] = {
             key: np.repeat(v, count, axis=0) for key, v in vars(self).items() if isinstance(v, np.ndarray)
         }
-        return replace(self, name=names, **arrays)
+        return replace(self, name=names, frames=tuple(count * k for k in self.frames), **arrays)
 
     @property
     def boresight_T(self) -> F64:
@@ -138,6 +157,7 @@ class Trajectory:
                 [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
             ]
         )
+        sequence, frame = place_in_sequence(self.frames, index)
         return FlownPose(
             name=self.name[index],
             julian_date=float(self.julian_date[index]),
@@ -145,13 +165,29 @@ class Trajectory:
             T_from_C=camera_from_T.T,
             sun_direction_T=self.sun_direction_T[index],
             sun_distance_au=float(self.sun_distance_au[index]),
+            sequence=sequence,
+            frame=frame,
+            time_s=float(self.time_s[index]),
         )
+
+
+def place_in_sequence(frames: Sequence[int], index: int) -> tuple[int, int]:
+    """Return the sequence of a row and its frame there, from 0; -1 and 0 without sequences.
+
+    `frames` are the numbers of rows of the sequences, one after the other.
+    """
+    if not frames:
+        return -1, 0
+    starts = np.cumsum([0, *frames])
+    sequence = int(np.searchsorted(starts, index, side="right")) - 1
+    return sequence, index - int(starts[sequence])
 
 
 def with_rows(scene: Scene, trajectory: Trajectory | None = None) -> Scene:
     """Return the scene with the numbers of samples and sites that its table of poses has.
 
-    A sample is a row. A site stands for `dataset.shard_samples` consecutive rows, which share a split.
+    A sample is a row. A site stands for the frames of a sequence, or without sequences for `dataset.shard_samples`
+    consecutive rows; they share a split.
 
     Parameters
     ----------
@@ -180,15 +216,16 @@ def with_rows(scene: Scene, trajectory: Trajectory | None = None) -> Scene:
                 f"dataset.samples = {samples}: {trajectory.source} has {len(trajectory)} rows, and each is a "
                 f"sample; must be from 1 to {len(trajectory)}, or be left out"
             )
-    sites = -(-len(trajectory) // scene.dataset.shard_samples)
+    assert scene.trajectory is not None
+    sites = len(trajectory.frames) or -(-len(trajectory) // scene.dataset.shard_samples)
     if sites > _MOST_SITES:
         raise InputError(
             f"{trajectory.source}: has {len(trajectory)} rows; must have at most "
             f"{_MOST_SITES * scene.dataset.shard_samples}, {_MOST_SITES} times dataset.shard_samples"
         )
-    return scene.model_copy(
-        update={"dataset": scene.dataset.model_copy(update={"samples": samples, "sites": sites})}
-    )
+    table = scene.trajectory.model_copy(update={"frames": trajectory.frames})
+    dataset = scene.dataset.model_copy(update={"samples": samples, "sites": sites})
+    return scene.model_copy(update={"trajectory": table, "dataset": dataset})
 
 
 @file_contents.cached_with_contents(maxsize=4)
@@ -315,7 +352,7 @@ def _parquet_columns(data: bytes, source: str) -> dict[str, list[Any]]:
             raise InputError(f"{source}: has {file.metadata.num_rows} rows; must have at most {_MOST_ROWS}")
         _check_types(file.schema_arrow, source)
         table = file.read()
-        return {name: table.column(name).to_pylist() for name in COLUMNS}
+        return {name: table.column(name).to_pylist() for name in file.schema_arrow.names}
     except (pyarrow.ArrowException, OSError, ValueError) as error:
         raise InputError(f"{source}: is no Parquet file: {' '.join(str(error).split())[:200]}") from None
 
@@ -328,7 +365,7 @@ def _check_types(schema: Any, source: str) -> None:
         kind = column.type.value_type if types.is_dictionary(column.type) else column.type
         checks = (types.is_floating, types.is_integer, types.is_decimal, types.is_string, types.is_large_string)
         if not any(check(kind) for check in checks):
-            wanted = "texts" if column.name == "name" else "numbers"
+            wanted = "texts" if column.name in ("name", "sequence") else "numbers"
             raise InputError(f"{source}: column {column.name} has the type {kind}; must hold {wanted}")
 
 
@@ -340,11 +377,14 @@ def _check_names(names: Sequence[str], source: str) -> None:
         if times > 1:
             raise InputError(f"{source}: column {shown(name)} stands twice; must stand once")
     missing = [name for name in COLUMNS if name not in names]
-    unknown = [name for name in names if name not in COLUMNS]
+    unknown = [name for name in names if name not in COLUMNS + SEQUENCE_COLUMNS]
     if missing or unknown:
         clauses = [f"columns are missing: {', '.join(missing)}"] if missing else []
         clauses += [f"unknown columns: {', '.join(shown(name) for name in unknown[:5])}"] if unknown else []
-        raise InputError(f"{source}: {'; '.join(clauses)}; must have exactly the columns {', '.join(COLUMNS)}")
+        raise InputError(
+            f"{source}: {'; '.join(clauses)}; must have exactly the columns {', '.join(COLUMNS)}, and may have "
+            f"{' and '.join(SEQUENCE_COLUMNS)}"
+        )
 
 
 def _checked(columns: Mapping[str, Sequence[Any]], source: str) -> Trajectory:
@@ -353,21 +393,67 @@ def _checked(columns: Mapping[str, Sequence[Any]], source: str) -> Trajectory:
     count = len(columns["name"])
     if not count:
         raise InputError(f"{source}: has no rows; must have at least 1, each a pose")
-    for name in COLUMNS:
+    for name in columns:
         if len(columns[name]) != count:
             raise InputError(
                 f"{source}: column {name} has {len(columns[name])} rows; must have {count}, as name has"
             )
     values = {name: _numbers(columns[name], name, source) for name in _NUMBERS}
+    names = _names(columns["name"], source)
     return Trajectory(
         source=source,
-        name=_names(columns["name"], source),
+        name=names,
         julian_date=values["julian_date"],
         camera_position_T_m=np.stack([values[f"camera_{axis}_T_m"] for axis in "xyz"], axis=1),
         camera_from_T=_units(values, [f"camera_from_T_{axis}" for axis in "wxyz"], source),
         sun_direction_T=_units(values, [f"sun_{axis}_T" for axis in "xyz"], source),
         sun_distance_au=values["sun_distance_au"],
+        **_sequences(columns, names, values["julian_date"], source),
     )
+
+
+def _sequences(
+    columns: Mapping[str, Sequence[Any]], names: Sequence[str], julian_date: F64, source: str
+) -> dict[str, Any]:
+    """Return times, and names and lengths of the sequences. Raises InputError for frames out of order.
+
+    Without `time_s`, a frame's time counts from the date of its sequence's first row; without `sequence`, all rows
+    are one.
+    """
+    given = [name for name in SEQUENCE_COLUMNS if name in columns]
+    if not given:
+        return {"time_s": np.full(len(names), np.nan)}
+    column = [str(value) for value in columns.get("sequence", ["0"] * len(names))]
+    for row, name in enumerate(column, 1):
+        if not 1 <= len(name) <= _LONGEST_NAME or not name.isprintable():
+            raise InputError(
+                f"{source}: row {row}: sequence = {shown(name)}: must be a printable text of 1 to {_LONGEST_NAME} "
+                "characters"
+            )
+    starts = [k for k, name in enumerate(column) if not k or name != column[k - 1]]
+    frames = np.diff([*starts, len(names)])
+    first: dict[str, int] = {}
+    for start in starts:
+        if (before := first.setdefault(column[start], start)) != start:
+            raise InputError(
+                f"{source}: row {start + 1}: sequence = {shown(column[start])}: has ended before, and began in row "
+                f"{before + 1}; the rows of a sequence must follow each other"
+            )
+    if "time_s" in columns:
+        time_s = _numbers(columns["time_s"], "time_s", source)
+    else:
+        time_s = (julian_date - np.repeat(julian_date[starts], frames)) * _DAY_S
+    late = np.ones(len(names), bool)
+    late[1:] = np.diff(time_s) > 0
+    late[starts] = True
+    if not late.all():
+        row = int(np.argmin(late))
+        raise InputError(
+            f"{source}: row {row + 1}: {names[row]} is at {time_s[row]:.10g} s of its sequence, and the row "
+            f"before, {names[row - 1]}, at {time_s[row - 1]:.10g} s; "
+            f"{'time_s' if 'time_s' in given else 'julian_date'} must rise through a sequence"
+        )
+    return {"time_s": time_s, "sequence_names": tuple(first), "frames": tuple(frames.tolist())}
 
 
 def _names(column: Sequence[Any], source: str) -> tuple[str, ...]:
@@ -389,7 +475,7 @@ def _names(column: Sequence[Any], source: str) -> tuple[str, ...]:
 
 def _numbers(column: Sequence[Any], name: str, source: str) -> F64:
     """Return a column as float64[n]. Raises InputError for a value that is no number, or out of its range."""
-    low, high = _NUMBERS[name]
+    low, high = _NUMBERS.get(name, _TIME_S)
     out = np.empty(len(column))
     for row, value in enumerate(column):
         try:

@@ -430,6 +430,20 @@ SCALARS: dict[str, Array] = {
         most_bytes=1 << 18,
     ),
 }
+# Scalars of stores whose samples are frames of sequences.
+OF_SEQUENCES: dict[str, Array] = {
+    "sequence": Array(
+        "index of the sequence",
+        "Position in the attribute names. Frames of a sequence share camera, device, dirt and wear.",
+        dtype="int32",
+    ),
+    "frame": Array("number of the frame in its sequence", "From 0, in the order of time.", dtype="int32"),
+    "time_s": Array(
+        "time of the frame in its sequence",
+        "As the table of poses counts it, or from the date of the sequence's first frame.",
+        units="s",
+    ),
+}
 # What says that the others are whole.
 CRC32C = Array(
     "CRC-32C of the decoded bytes",

@@ -61,7 +61,16 @@ _MOST_FLAGS = 2**28
 # Fields of `StoreSpec` that become names of arrays, of folders and of files of an export.
 _NAMES = ("faults", "soft_layers")
 # Fields and root attributes that are shown as texts, and of those the ones that may have several lines.
-_TEXTS = ("coefficients", "mask_kinds", "mask_rules", "site_names", "lens_names", "detector_names", "sample_names")
+_TEXTS = (
+    "coefficients",
+    "mask_kinds",
+    "mask_rules",
+    "site_names",
+    "lens_names",
+    "detector_names",
+    "sample_names",
+    "sequence_names",
+)
 _TEXTS_OF_ROOT = ("title", "licence", "description", "citation", "intensity_channel", "scene_hash", "command")
 _OF_LINES = ("description", "citation", "mask_rules", "command")
 _NAME = re.compile("[a-z][a-z0-9_]{0,127}")

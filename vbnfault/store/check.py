@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from ..core.errors import VbnfaultError
 from ..core.quantities import soft_kind
-from .arrays import SCALARS
 from .bucket import Url
 from .codec import DIGEST_BYTES, crc32c, crc_of_scalars, mask_union, sample_digest, threads
 from .group import open_store
@@ -168,7 +167,7 @@ def examine_shard(store: Store, number: int, *, labels: bool = False) -> ShardCh
     crcs = {i: columns["crc32c"][i - samples.start] for i in finished}
     scalars: dict[int, dict[str, Any]] = {}
     if not unreadable:
-        scalars = {i: {name: columns[name][i - samples.start] for name in SCALARS} for i in finished}
+        scalars = {i: {name: columns[name][i - samples.start] for name in store.spec.scalars} for i in finished}
         problems += [
             Problem((i,), f"sample {i}: its scalars do not match their crc32c")
             for i in finished
@@ -220,7 +219,7 @@ def _columns(store: Store, number: int) -> tuple[dict[str, NDArray[Any]], dict[s
     """
     columns: dict[str, NDArray[Any]] = {}
     unreadable: dict[str, str] = {}
-    for names in (("done",), ("crc32c", *SCALARS)):
+    for names in (("done",), ("crc32c", *store.spec.scalars)):
         for name, column in zip(names, store.columns(names, number), strict=True):
             file = store.file_name(name, number)
             if not isinstance(column, Exception):
@@ -324,7 +323,7 @@ def unplanned_samples(store: Store, number: int, expected: Planned, *, exact: bo
     """
     finished = [i for i, done in store.done(number).items() if done]
     try:
-        columns = {name: store.column(name, number) for name in SCALARS} if finished else {}
+        columns = {name: store.column(name, number) for name in store.spec.scalars} if finished else {}
     except (OSError, ValueError):
         return set()
     scalars = {
@@ -547,12 +546,13 @@ def _check_plan(
                 if exact and commanded and not is_in:
                     yield f"sample {i}: {fault} is not injected, although the plan commands it"
             continue
-        if SCALARS[name].is_text:
+        row = spec.scalars[name]
+        if row.is_text:
             text = planned if isinstance(planned, str) else json.dumps(planned)
             same = str(stored) == text or _parsed(str(stored)) == _parsed(text)
         else:
-            values = np.asarray(planned).astype(SCALARS[name].dtype)
-            same = np.array_equal(values, stored, equal_nan=SCALARS[name].dtype == "float64")
+            values = np.asarray(planned).astype(row.dtype)
+            same = np.array_equal(values, stored, equal_nan=row.dtype == "float64")
         if not same:
             yield f"sample {i}: {name} = {short(stored)} is not as planned ({short(planned)})"
 

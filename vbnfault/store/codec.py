@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ..core.process import environment
 from ..core.quantities import Sample
-from .arrays import SCALARS
+from .arrays import OF_SEQUENCES, SCALARS
 from .compressors import compressor
 from .schema import StoreSpec
 
@@ -158,7 +158,7 @@ def encode(spec: StoreSpec, sample: Sample, shared: SharedChunks | None = None) 
     if "mask" in layers and "mask_any" not in layers:
         layers["mask_any"] = mask_union(spec, layers["mask"])
     _same_names(sample.index, "layer", layers, spec.pixel_layers)
-    _same_names(sample.index, "scalar", sample.scalars, SCALARS)
+    _same_names(sample.index, "scalar", sample.scalars, spec.scalars)
 
     arrays = {}
     for name, row in spec.pixel_layers.items():
@@ -170,7 +170,7 @@ def encode(spec: StoreSpec, sample: Sample, shared: SharedChunks | None = None) 
                 f"not {row.dtype}{list(spec.shape(row))}"
             )
     packed = (shared or SharedChunks()).packed(arrays)
-    scalars = {name: _scalar(spec, sample.index, name, sample.scalars[name]) for name in SCALARS}
+    scalars = {name: _scalar(spec, sample.index, name, sample.scalars[name]) for name in spec.scalars}
     crcs = [crc for _, crc, _ in packed.values()]
     return Encoded(
         index=sample.index,
@@ -197,7 +197,7 @@ def _same_names(index: int, kind: str, got: Iterable[str], expected: Iterable[st
 
 def _scalar(spec: StoreSpec, index: int, name: str, value: Any) -> Any:
     """Return a scalar in the dtype of the schema; raise ValueError if its shape or value does not fit."""
-    row = SCALARS[name]
+    row = spec.scalars[name]
     if row.is_text:
         text = value if isinstance(value, str) else json.dumps(value, sort_keys=True)
         if len(text.encode()) > row.most_bytes:
@@ -236,7 +236,9 @@ def sample_digest(layers: Mapping[str, bytes], scalars: Mapping[str, Any]) -> by
 def _packed(scalars: Mapping[str, Any]) -> bytes:
     """Return all scalars of a sample as bytes, each after its length, in the order of the schema."""
     parts = []
-    for name, row in SCALARS.items():
+    for name, row in {**SCALARS, **OF_SEQUENCES}.items():
+        if name not in scalars:
+            continue
         data = scalars[name].encode() if row.is_text else np.asarray(scalars[name]).astype(row.dtype).tobytes()
         parts.append(struct.pack("<Q", len(data)) + data)
     return b"".join(parts)

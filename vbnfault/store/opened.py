@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from ..core.errors import InputError, VbnfaultError
 from ..core.quantities import Sample
 from . import disk
-from .arrays import SCALARS
 from .attributes import check_attributes, check_names, number_of_samples
 from .bucket import Files
 from .codec import (
@@ -172,7 +171,8 @@ class Store:
         """
         number = index // self.spec.shard_samples
         scalars: dict[str, Any] = {}
-        for (name, row), column in zip(SCALARS.items(), self.columns(SCALARS, number), strict=True):
+        rows = self.spec.scalars
+        for (name, row), column in zip(rows.items(), self.columns(rows, number), strict=True):
             if isinstance(column, Exception):
                 raise VbnfaultError(
                     f"{self.path}: {name} of sample {index} cannot be read ({column}); the build command repairs it"
@@ -405,12 +405,12 @@ class Store:
         """
         first = self.shard(number).start
         chunks = {name: self._recoded(name, number, samples, codecs[name]) for name in self.spec.pixel_layers}
-        columns = {name: self.column(name, number) for name in (*SCALARS, "crc32c")}
+        columns = {name: self.column(name, number) for name in (*self.spec.scalars, "crc32c")}
         return {
             i: Encoded(
                 index=i,
                 chunks={name: chunks[name][i] for name in chunks},
-                scalars={name: columns[name][i - first] for name in SCALARS},
+                scalars={name: columns[name][i - first] for name in self.spec.scalars},
                 crc32c=columns["crc32c"][i - first],
                 digest=b"",
             )
@@ -458,7 +458,7 @@ class Store:
         chunks: dict[str, dict[int, bytes]] = {}
         columns: dict[str, NDArray[Any]] = {}
         try:
-            for name in (*SCALARS, "crc32c") if wished else ():
+            for name in (*self.spec.scalars, "crc32c") if wished else ():
                 columns[name] = self.column(name, number)
             for name in self.spec.pixel_layers if wished else ():
                 chunks[name] = self.chunk(name, number)
@@ -482,7 +482,7 @@ class Store:
                 held = {i: e.chunks[name] for i, e in given.items()} | {i: chunks[name][i] for i in kept}
                 shard = join_shard({i - first: chunk for i, chunk in held.items()}, self.spec.shard_samples)
                 yield self.file_name(name, number), shard
-        for name in (*SCALARS, "crc32c"):
+        for name in (*self.spec.scalars, "crc32c"):
             if not self.spec.empty(name):
                 values = {i: e.crc32c if name == "crc32c" else e.scalars[name] for i, e in given.items()}
                 values |= {i: columns[name][i - first] for i in kept}

@@ -26,6 +26,7 @@ from .arrays import (
     JOINT_ATTRIBUTES,
     LAYERS,
     MASK_ANY_RULE,
+    OF_SEQUENCES,
     RADIANCE_LAYERS,
     REQUIRED_LAYERS,
     SCALARS,
@@ -57,6 +58,7 @@ RATIONAL = COEFFICIENTS["opencv"][:8]  # of the distortion of cameras without a 
 # Fields that older stores lack, with their defaults, which are not written: such stores stay as they were.
 _LATER = {
     "sample_names": (),
+    "sequence_names": (),
     "rendered_shape": (),
     "mask_any_joint": False,
     "distortion_valid_to_deg": None,
@@ -139,6 +141,9 @@ class StoreSpec:
     sample_names
         Names of the samples, at least as many as there are samples, if the rows of a trajectory name them; they
         become the coordinate `name`.
+    sequence_names
+        Names that the integer array `sequence` indexes; () for a store without sequences, which lacks the arrays
+        `OF_SEQUENCES`.
     distortion_residual_px
         Root mean square and maximum deviation of the stored distortion coefficients from the lens's chief rays,
         over the lit frame.
@@ -196,6 +201,7 @@ class StoreSpec:
     centre_of_mass_T_m: tuple[float, float, float] | None = None
     detector_names: tuple[str, ...] = ()
     sample_names: tuple[str, ...] = ()
+    sequence_names: tuple[str, ...] = ()
     radiance_dtype: str = "float16"
     rendered_shape: tuple[int, ...] = ()
     shard_samples: int = 0
@@ -244,9 +250,14 @@ class StoreSpec:
         return layers
 
     @cached_property
+    def scalars(self) -> dict[str, Array]:
+        """Return the schema row of every value of a sample that is no layer."""
+        return {**SCALARS, **(OF_SEQUENCES if self.sequence_names else {})}
+
+    @cached_property
     def arrays(self) -> dict[str, Array]:
         """Return the schema row by name of every array that tasks write."""
-        return {**self.pixel_layers, **SCALARS, "crc32c": CRC32C, "done": DONE}
+        return {**self.pixel_layers, **self.scalars, "crc32c": CRC32C, "done": DONE}
 
     @property
     def _labels(self) -> dict[str, tuple[str, ...]]:
@@ -295,6 +306,7 @@ class StoreSpec:
                 **(JOINT_ATTRIBUTES if self.mask_any_joint else {}),
             },
             "site": {"names": list(self.site_names)},
+            "sequence": {"names": list(self.sequence_names)},
             "lens": {"names": list(self.lens_names)},
             "distortion": {
                 "residual_px_rms": self.distortion_residual_px[0],

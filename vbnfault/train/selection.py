@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import InputError, shown
-from ..store import SCALARS, SPLITS, ShardReader, Store
+from ..store import SPLITS, ShardReader, Store
 
 Where = Callable[["Columns"], NDArray[np.bool_]]
 
@@ -29,8 +29,9 @@ class Columns(Mapping[str, NDArray]):
         self._shards = np.unique(self.samples // store.spec.shard_samples).tolist()
 
     def __getitem__(self, name: str) -> NDArray:
-        if name not in SCALARS:
-            raise KeyError(f"{name!r}: a store has no such value of a sample; known: {', '.join(SCALARS)}")
+        scalars = self._reader.store.spec.scalars
+        if name not in scalars:
+            raise KeyError(f"{name!r}: a store has no such value of a sample; known: {', '.join(scalars)}")
         if name not in self._columns:
             store = self._reader.store
             parts = []
@@ -38,14 +39,14 @@ class Columns(Mapping[str, NDArray]):
                 column, own = self._reader.column(name, number), np.asarray(store.shard(number))
                 parts.append(column[np.isin(own, self.samples)])
             values = np.concatenate(parts) if parts else np.empty(0)
-            self._columns[name] = values.astype(str) if SCALARS[name].is_text else values
+            self._columns[name] = values.astype(str) if scalars[name].is_text else values
         return self._columns[name]
 
     def __iter__(self) -> Iterator[str]:
-        return iter(SCALARS)
+        return iter(self._reader.store.spec.scalars)
 
     def __len__(self) -> int:
-        return len(SCALARS)
+        return len(self._reader.store.spec.scalars)
 
 
 def select(

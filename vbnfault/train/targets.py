@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import InputError, shown
-from ..store import MASK_RULES, SCALARS, Store
+from ..store import MASK_RULES, Store
 from .selection import known_classes
 
 
@@ -87,7 +87,7 @@ class Targets:
         target = TARGETS.get(name)
         if target is None and name in store.spec.pixel_layers:
             target = Target(name, (), "")
-        if target is None and name in SCALARS and not SCALARS[name].is_text:
+        if target is None and name in store.spec.scalars and not store.spec.scalars[name].is_text:
             target = Target("", (name,), "")
         if target is None:
             from ..core.tables import did_you_mean  # not above: its import takes longer than all others here

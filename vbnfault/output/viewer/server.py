@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from ...core.errors import InputError, VbnfaultError
 from ...core.files import images
 from ...core.files.whole_files import plain
-from ...store import SCALARS, SEMANTIC, SPLITS, STRATA, ShardReader, Store, drawn_table
+from ...store import SEMANTIC, SPLITS, STRATA, ShardReader, Store, drawn_table
 from ..contact_sheet import COLOURS, abbreviations, overlay, resized, resized_mask
 
 NOT_KNOWN = 255  # a split without a name, or a severity of a fault that is not injected or draws no number
@@ -176,7 +176,7 @@ class Viewer:
         store, spec = self.store, self.store.spec
         number, values = index // spec.shard_samples, dict[str, Any]()
         damaged = []
-        for name, row in SCALARS.items():
+        for name, row in spec.scalars.items():
             try:
                 value = store.column(name, number)[index - store.shard(number).start]
             except FileNotFoundError:
@@ -194,7 +194,12 @@ class Viewer:
                 )
             except (ValueError, RecursionError):
                 damaged.append(name)
-        names = {"site": spec.site_names, "lens": spec.lens_names, "detector_individual": spec.detector_names}
+        names = {
+            "site": spec.site_names,
+            "lens": spec.lens_names,
+            "detector_individual": spec.detector_names,
+            "sequence": spec.sequence_names,
+        }
         for name, known in names.items():
             k = values.get(name)
             if isinstance(k, int) and 0 <= k < len(known):

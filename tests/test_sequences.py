@@ -1,0 +1,208 @@
+"""Sequences: tables of poses whose rows are frames, what their frames share, and what the store says of them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from poses_kit import columns_of, row
+
+import vbnfault
+from vbnfault.core.errors import InputError
+from vbnfault.dataset import describe_scene
+from vbnfault.scene import config, plan
+from vbnfault.scene.trajectory import as_trajectory, load_trajectory, place_in_sequence
+
+FRAMES = (3, 1, 5)
+NAMES = ("approach", "still", "leave")
+SCENE = """
+title = "frames"
+faults.dust_on_optics.model = "defocused"
+faults.cosmic_rays.flux_per_cm2_s = 3000.0
+camera = {detector = "generic_ccd", width_px = 64, height_px = 48, fov_deg = 40.0, exposure_s = 0.02}
+plan.faulty_fraction = 1.0
+plan.classes_per_sample = [2, 2]
+render = {bands = 2, samples_per_pixel = 1}
+patch = {facet_m = 10.0, radius_m = 40.0, boulders = false, max_triangles = 60_000}
+dataset = {shard_samples = 2, seed = 3}
+trajectory.file = "poses.csv"
+"""
+
+
+def columns() -> dict[str, list[Any]]:
+    """Return nine poses in three sequences, a second apart."""
+    poses = [row(f"{k}", (0.0, 3e3 - 10 * k, 300.0), (0, 1, 0)) for k in range(sum(FRAMES))]
+    sequence = np.repeat(NAMES, FRAMES).tolist()
+    return {**columns_of(poses), "sequence": sequence, "time_s": [float(k) for n in FRAMES for k in range(n)]}
+
+
+def write(path: Path, table: dict[str, list[Any]]) -> Path:
+    """Write columns as a CSV file."""
+    lines = [",".join(table), *(",".join(map(str, values)) for values in zip(*table.values(), strict=True))]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    write(tmp_path / "poses.csv", columns())
+    path = tmp_path / "scene.toml"
+    path.write_text(SCENE)
+    return path
+
+
+# --- tables -------------------------------------------------------------------------------------------------------
+
+
+def test_csv_parquet_and_columns_are_the_same_sequences(tmp_path: Path) -> None:
+    import pyarrow
+    import pyarrow.parquet
+
+    given = columns()
+    pyarrow.parquet.write_table(pyarrow.table(given), tmp_path / "poses.parquet")
+    files = write(tmp_path / "poses.csv", given), tmp_path / "poses.parquet"
+    for table in (as_trajectory(given), *(load_trajectory(str(path)) for path in files)):
+        assert (table.sequence_names, table.frames) == (NAMES, FRAMES)
+        assert table.time_s.tolist() == given["time_s"]
+        pose = table.pose(5)
+        assert (pose.sequence, pose.frame, pose.time_s) == (2, 1, 1.0)
+
+
+def test_either_column_alone_is_enough() -> None:
+    """A date is a float64 of 2.5 million days, whose digits are 40 us."""
+    given = columns()
+    del given["time_s"]
+    given["julian_date"] = [2457000.5 + k / 8640 for k in range(9)]
+    dated = as_trajectory(given)
+    np.testing.assert_allclose(dated.time_s, [0, 10, 20, 0, 0, 10, 20, 30, 40], atol=1e-4)
+    del given["sequence"]
+    one = as_trajectory({**given, "time_s": list(range(9))})
+    assert (one.sequence_names, one.frames, one.time_s[8]) == (("0",), (9,), 8.0)
+    rows = as_trajectory(given)
+    assert (rows.sequence_names, rows.frames, rows.pose(3).sequence) == ((), (), -1)
+    assert np.isnan(rows.time_s).all()
+
+
+def test_the_place_of_a_row_is_that_of_counting() -> None:
+    counted = [(s, k) for s, n in enumerate(FRAMES) for k in range(n)]
+    assert [place_in_sequence(FRAMES, k) for k in range(sum(FRAMES))] == counted
+    assert place_in_sequence((), 4) == (-1, 0)
+
+
+@pytest.mark.parametrize(
+    ("column", "row_number", "value", "sentence"),
+    [
+        ("time_s", 6, 0.0, r"row 7: 6 is at 0 s of its sequence, and the row before, 5, at 1 s; time_s must rise"),
+        ("time_s", 6, 1.0, r"row 7: 6 is at 1 s of its sequence"),
+        ("time_s", 2, "soon", r"row 3: time_s = 'soon': must be a number from -1000000000 to 1000000000"),
+        ("time_s", 2, float("nan"), r"row 3: time_s = nan: must be a number"),
+        ("sequence", 3, "leave", r""),
+        ("sequence", 8, "approach", r"row 9: sequence = 'approach': has ended before, and began in row 1"),
+        ("sequence", 8, "", r"row 9: sequence = '': must be a printable text of 1 to 200 characters"),
+    ],
+)
+def test_frames_out_of_order_are_named(column: str, row_number: int, value: Any, sentence: str) -> None:
+    table = columns()
+    table[column][row_number] = value
+    if not sentence:
+        table["time_s"][row_number] = -1.0  # now the first frame of the last sequence
+        assert as_trajectory(table).frames == (3, 6)
+        return
+    with pytest.raises(InputError, match=sentence):
+        as_trajectory(table)
+
+
+def test_dates_that_run_backward_are_named() -> None:
+    table = columns()
+    del table["time_s"]
+    with pytest.raises(InputError, match=r"row 2: 1 is at 0 s .* julian_date must rise through a sequence"):
+        as_trajectory(table)
+
+
+def test_frames_at_two_times_share_no_view(scene: Path) -> None:
+    with pytest.raises(InputError, match=r"dataset\.variants_per_view = 2: .* frames of sequences.*; must be 1"):
+        vbnfault.Session(config.load_scene(scene, {"dataset.variants_per_view": 2}))
+
+
+# --- plans and stores ---------------------------------------------------------------------------------------------
+
+
+def test_a_plan_keeps_sequences_whole(scene: Path) -> None:
+    """Over many sequences, splits, devices and faults change from one to the next, and never inside one."""
+    loaded = config.load_scene(scene, {"camera.individuals": 6, "plan.classes_per_sample": [1, 2]})
+    frames = tuple(np.random.default_rng(1).integers(1, 30, 40).tolist())
+    dataset = loaded.dataset.model_copy(update={"samples": sum(frames), "sites": len(frames)})
+    table = loaded.trajectory.model_copy(update={"frames": frames})
+    loaded = loaded.model_copy(update={"dataset": dataset, "trajectory": table})
+    blocks = [sum(frames) - 100, 100]  # the second begins inside a sequence
+    planned = plan.make_plan(loaded, ["dust_on_optics", "cosmic_rays"], blocks)
+    sequence = np.repeat(np.arange(len(frames)), frames)
+    np.testing.assert_array_equal(planned.site, sequence)
+    for name in ("split", "individual", "injected", "stratum", "architecture", "readout_direction", "state"):
+        values = getattr(planned, name)
+        first = np.concatenate([[0], np.cumsum(frames)[:-1]])
+        np.testing.assert_array_equal(values, np.repeat(values[first], frames, axis=0))
+        assert name in ("stratum", "architecture", "readout_direction") or len(np.unique(values, axis=0)) > 1
+    short = table.model_copy(update={"frames": frames[:-1]})
+    with pytest.raises(InputError, match=r"trajectory\.frames: the sequences have .* frames; must have at least"):
+        plan.make_plan(loaded.model_copy(update={"trajectory": short}), ["dust_on_optics"])
+
+
+def test_frames_share_the_instrument_and_not_what_happens_in_an_exposure(scene: Path, tmp_path: Path) -> None:
+    out = tmp_path / "s.zarr"
+    assert vbnfault.build(scene, out, samples=4, progress=False).built == 4  # ends within the last sequence
+    assert vbnfault.build(scene, out, samples=4, append=5, progress=False, workers=2).built == 5
+    assert vbnfault.verify(out).problems == []
+    with vbnfault.open_dataset(out) as data:
+        assert data["sequence"].attrs["names"] == list(NAMES)
+        assert data["sequence"].values.tolist() == [0, 0, 0, 1, 2, 2, 2, 2, 2]
+        assert data["frame"].values.tolist() == [0, 1, 2, 0, 0, 1, 2, 3, 4]
+        assert data["time_s"].values.tolist() == columns()["time_s"]
+        assert data["time_s"].attrs["units"] == "s"
+        drawn = [json.loads(text) for text in data["parameters"].values]
+        images = data["image"].values
+    dust, rays = ([json.dumps(one.get(name)) for one in drawn] for name in ("dust_on_optics", "cosmic_rays"))
+    assert len(set(dust[:3])) == len(set(dust[4:])) == 1
+    assert len({dust[0], dust[3], dust[4]}) == 3
+    assert "null" not in dust + rays
+    assert len(set(rays)) == 9
+    assert len({image.tobytes() for image in images}) == 9
+    single = tmp_path / "single.zarr"
+    vbnfault.build(scene, single, progress=False)
+    with vbnfault.open_dataset(single) as data:
+        assert [json.dumps(json.loads(text).get("dust_on_optics")) for text in data["parameters"].values] == dust
+        np.testing.assert_array_equal(data["image"].values[:4], images[:4])
+    np.testing.assert_array_equal(vbnfault.simulate(scene, 8).layers["image"], images[8])
+
+
+def test_a_fault_that_one_frame_does_not_show_is_not_drawn_again(scene: Path, tmp_path: Path) -> None:
+    """A grain that darkens the near body lies before the sky where the body is far away, a quarter as wide.
+
+    Any other draw of a few would lie on the body in half of the tries near, and in a few of a hundred far away.
+    """
+    poses = [row(f"{k}", (0.0, 5e3 + 15e3 * (k % 2), 300.0), (0, 1, 0)) for k in range(8)]
+    write(tmp_path / "poses.csv", {**columns_of(poses), "time_s": list(map(float, range(8)))})
+    grains = {"faults.dust_on_optics.count": 2, "faults.dust_on_optics.diameter_um": 100.0}
+    session = vbnfault.Session(config.load_scene(scene, {**grains, "dataset.seed": 1}))
+    taken = [session.simulate(k).scalars["parameters"].get("dust_on_optics") for k in range(8)]
+    assert taken[0] is not None
+    assert taken == [taken[0], None] * 4
+
+
+def test_readers_give_the_columns_of_sequences(scene: Path, tmp_path: Path) -> None:
+    from vbnfault.store import open_store
+    from vbnfault.train import Columns
+
+    out = tmp_path / "s.zarr"
+    vbnfault.build(scene, out, samples=4, progress=False)
+    table = Columns(open_store(out))
+    assert table["frame"].tolist() == [0, 1, 2, 0]
+    assert {"sequence", "frame", "time_s"} <= set(table)
+
+
+def test_the_description_counts_sequences(scene: Path) -> None:
+    text = "\n".join(describe_scene(config.load_scene(scene), source="frames"))
+    assert "3 sequences of 1 to 5 frames, 1 s apart, each with one camera and its faults" in text
