@@ -282,7 +282,7 @@ _DIMENSIONLESS = """
     contour_scarps
     crater_depth crater_index dark_nonuniformity
     dead_fraction default_material distance_exponent dsnu_freedom dust_contrast eccentricity
-    equilibrium exposure_stops f_number
+    duty equilibrium exposure_stops f_number frames
     faulty_fraction fill_power gain gamma grain_albedo halo_index hot_clustered_fraction hot_offset_fraction hurst
     individuals
     intermittency internal_transmittance_10mm iso iso_power joints k leak limb log10_scale max_samples_per_pixel

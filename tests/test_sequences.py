@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import csv
+import itertools
 import json
+import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from conftest import Called
 from poses_kit import columns_of, row
 
 import vbnfault
 from vbnfault.core.errors import InputError
 from vbnfault.dataset import describe_scene
+from vbnfault.faults import registry
 from vbnfault.scene import config, plan
+from vbnfault.scene.events import events_of_sequence
 from vbnfault.scene.trajectory import as_trajectory, load_trajectory, place_in_sequence
 
 FRAMES = (3, 1, 5)
@@ -206,3 +213,200 @@ def test_readers_give_the_columns_of_sequences(scene: Path, tmp_path: Path) -> N
 def test_the_description_counts_sequences(scene: Path) -> None:
     text = "\n".join(describe_scene(config.load_scene(scene), source="frames"))
     assert "3 sequences of 1 to 5 frames, 1 s apart, each with one camera and its faults" in text
+
+
+# --- events -------------------------------------------------------------------------------------------------------
+
+EVENTS = """
+[[event]]
+cause = "dust event"
+faults = ["dust_on_optics", "cosmic_rays"]
+onset_s = [0.5, 1.5]
+duration_s = 2.0
+"""
+
+
+@pytest.mark.parametrize(
+    ("keys", "on", "off"),
+    [
+        ({}, {1.0: 1.0, 99.0: 1.0}, (0.999,)),
+        ({"duration_s": 2.0}, {1.0: 1.0, 2.999: 1.0}, (0.0, 3.0, 9.0)),
+        ({"profile": "growing", "rise_s": 4.0}, {2.0: 0.25, 4.0: 0.75, 5.0: 1.0, 50.0: 1.0}, (1.0,)),
+        (
+            {"profile": "intermittent", "period_s": 2.0, "duty": 0.25, "duration_s": 4.0},
+            {1.0: 1.0, 1.49: 1.0, 3.2: 1.0},
+            (0.9, 1.51, 2.9, 3.6, 5.1),
+        ),
+    ],
+)
+def test_profiles_over_time(scene: Path, keys: dict[str, Any], on: dict[float, float], off: tuple[float]) -> None:
+    table = {"cause": "test", "faults": ["dust_on_optics"], "onset_s": 1.0, **keys}
+    (event,) = events_of_sequence(config.load_scene(scene, {"event": [table]}), 0)
+    assert {t: event.fraction(t) for t in on} == pytest.approx(on)
+    assert [event.fraction(t) for t in off] == [0.0] * len(off)
+
+
+def test_times_of_events_are_drawn_within_their_bounds_for_each_sequence(scene: Path) -> None:
+    """Of 400 uniform numbers, the mean is within three of its errors, 0.29 / 20 of the width."""
+    table = {"cause": "c", "faults": ["dust_on_optics"], "onset_s": [2.0, 6.0], "duration_s": [1.0, 3.0]}
+    loaded = config.load_scene(scene, {"event": [table, {**table, "cause": "d"}]})
+    drawn = [events_of_sequence(loaded, state) for state in range(400)]
+    onset = np.array([[event.onset_s for event in events] for events in drawn])
+    length = np.array([[event.end_s - event.onset_s for event in events] for events in drawn])
+    assert (onset.min(), onset.max()) == (pytest.approx(2, abs=0.05), pytest.approx(6, abs=0.05))
+    assert abs(onset.mean() - 4) < 3 * 4 * 0.29 / np.sqrt(800)
+    assert (length.min(), length.max()) == (pytest.approx(1, abs=0.03), pytest.approx(3, abs=0.03))
+    correlation = np.corrcoef([*onset.T, *length.T]) - np.eye(4)
+    assert np.abs(correlation).max() < 0.2  # four times 1 / √400
+    assert drawn[7] == events_of_sequence(loaded, 7)
+
+
+def test_an_event_brings_all_of_its_faults_and_takes_them_away(scene: Path, tmp_path: Path) -> None:
+    """What the store says of events is what changes in the pixels of its frames."""
+    scene.write_text(scene.read_text() + EVENTS)
+    out = tmp_path / "s.zarr"
+    vbnfault.build(scene, out, progress=False)
+    assert vbnfault.verify(out).problems == []
+    with vbnfault.open_dataset(out) as data:
+        injected = data["injected"].values
+        changed = (data["image"].values != data["clean"].values).any(axis=(1, 2, 3))
+        parameters = [json.loads(text) for text in data["parameters"].values]
+    time_s, sequence = np.array(columns()["time_s"]), np.repeat(range(3), FRAMES)
+    listed = vbnfault.events(out)
+    expected = np.zeros((9, 2), bool)
+    for event in listed:
+        assert (event.cause, event.end_s) == ("dust event", pytest.approx(event.onset_s + 2))
+        mine = sequence == NAMES.index(event.sequence)
+        active = mine & (time_s >= event.onset_s) & (time_s < event.end_s)
+        expected[active, ["dust_on_optics", "cosmic_rays"].index(event.fault)] = True
+        frames = (np.flatnonzero(active) - np.flatnonzero(mine)[0]).tolist()
+        assert (event.first_frame, event.last_frame, event.frames) == (frames[0], frames[-1], len(frames))
+    assert {event.sequence for event in listed} == {"approach", "leave"}  # the other has one frame, at 0 s
+    assert {event.fault for event in listed} == {"dust_on_optics", "cosmic_rays"}
+    onsets = {event.sequence: event.onset_s for event in listed}
+    assert [event.onset_s for event in listed] == [onsets[event.sequence] for event in listed]
+    np.testing.assert_array_equal(injected, expected)
+    np.testing.assert_array_equal(changed, expected.any(axis=1))
+    assert {one["dust_on_optics"]["event"]["cause"] for one in parameters if one} == {"dust event"}
+
+
+def test_common_causes_strike_together(scene: Path) -> None:
+    scene.write_text(scene.read_text() + EVENTS)
+    keys = {"plan.classes_per_sample": [1, 1], "plan.faulty_fraction": 0.7}
+    loaded = config.load_scene(scene, keys)
+    frames = (2,) * 50
+    loaded = loaded.model_copy(
+        update={
+            "dataset": loaded.dataset.model_copy(update={"samples": 100, "sites": 50}),
+            "trajectory": loaded.trajectory.model_copy(update={"frames": frames}),
+        }
+    )
+    without = plan.make_plan(loaded.model_copy(update={"event": ()}), ["dust_on_optics", "cosmic_rays"])
+    together = plan.make_plan(loaded, ["dust_on_optics", "cosmic_rays"])
+    assert not without.injected.all(axis=1).any()
+    np.testing.assert_array_equal(together.injected[:, 0], without.injected[:, 0])
+    np.testing.assert_array_equal(together.injected[:, 1], without.injected[:, 0])
+
+
+def test_a_growing_fault_keeps_what_was_there(scene: Path) -> None:
+    event = {"cause": "storm", "faults": ["dust_on_optics"], "onset_s": -1.0, "profile": "growing", "rise_s": 5.0}
+    session = vbnfault.Session(config.load_scene(scene, {"event": [event]}))
+    grains = [session.simulate(k).scalars["parameters"]["dust_on_optics"]["x_mm"] for k in range(4, 9)]
+    assert [len(one) for one in grains] == [round(len(grains[-1]) * f) for f in (0.2, 0.4, 0.6, 0.8, 1)]
+    assert all(after[: len(before)] == before for before, after in itertools.pairwise(grains))
+
+
+@pytest.mark.parametrize(
+    ("fault", "model", "fraction", "smaller"),
+    [
+        ("dust_on_optics", "gaussian", 0.5, {"x_px": 2, "peak_dn": 2}),
+        ("broken_pixels", "texture", 0.25, {"x": 1, "y": 1, "brightness_dn": 1}),
+        ("broken_lines", "texture", 0.5, {"rows": 2, "row_values": 2, "columns": 2}),
+        ("broken_lines", "readout", 0.5, {"lines": 2}),
+        ("optics_degradation", "contamination", 0.5, {"haze": 0.2, "coating_loss": 0.2, "scratches": 2}),
+        ("vignetting", "lens", 0.5, {"decentre": 0.2, "decentre_mm": [0.2, 0.2]}),
+    ],
+)
+def test_models_grow(fault: str, model: str, fraction: float, smaller: dict[str, Any]) -> None:
+    lists = ("x_px", "y_px", "peak_dn", "sigma_xx", "sigma_yy", "sigma_xy", "x", "y", "brightness_dn", "lines")
+    lists += ("rows", "row_values", "columns", "column_values", "scratches")
+    params = {name: [1, 2, 3, 4] for name in lists}
+    params |= dict.fromkeys(("haze", "dose_krad", "coating_loss", "decentre"), 0.4)
+    params |= {"decentre_mm": [0.4, 0.4], "hood_offset_mm": [0.4, 0.4]}
+    cls = registry()[fault][model]
+    grown = cls.grown(cls(), params, fraction)
+    for name, value in smaller.items():
+        now = len(grown[name]) if isinstance(value, int) else grown[name]
+        assert now == (pytest.approx(value) if not isinstance(value, int) else value)
+    assert cls.grown(cls(), params, 1.0) == params
+    assert cls.grown(cls(), {**params, "lines": [], "x": []}, 1e-9).get("lines") == []
+
+
+def test_events_are_listed_by_the_command(scene: Path, tmp_path: Path, call: Callable[..., Called]) -> None:
+    scene.write_text(scene.read_text() + EVENTS.replace(', "cosmic_rays"', ""))
+    out, table = tmp_path / "s.zarr", tmp_path / "events.csv"
+    vbnfault.build(scene, out, progress=False)
+    lines = call("events", out).out.splitlines()
+    assert any(
+        re.match(r"leave: dust_on_optics: dust event, from .* s to .* s; in \d frames, \d to \d", line)
+        for line in lines
+    )
+    assert "still: cosmic_rays: from the start; in 1 frames, 0 to 0" in lines
+    assert call("events", out, "--out", table).out.strip() == f"{table}: {len(lines)} events"
+    rows = list(csv.DictReader(table.read_text().splitlines()))
+    assert len(rows) == len(lines)
+    assert {row["onset_s"] for row in rows if row["fault"] == "cosmic_rays"} == {""}
+    assert call("events", tmp_path / "none.zarr").code == 2
+
+
+@pytest.mark.parametrize(
+    ("table", "sentence"),
+    [
+        ({"cause": "", "faults": ["dust_on_optics"], "onset_s": 1.0}, r"event\[0\]\.cause"),
+        (
+            {"cause": "c", "faults": ["glint"], "onset_s": 1.0},
+            r"event\[0\]\.faults: 'glint' is no fault class of the scene; it has dust",
+        ),
+        ({"cause": "c", "faults": [], "onset_s": 1.0}, r"event\[0\]\.faults"),
+        ({"cause": "c", "faults": ["dust_on_optics"] * 2, "onset_s": 1.0}, r"given twice"),
+        ({"cause": "c", "faults": ["dust_on_optics"]}, r"event\[0\]\.onset_s"),
+        ({"cause": "c", "faults": ["dust_on_optics"], "onset_s": [3.0, 1.0]}, r"event\[0\]\.onset_s"),
+        (
+            {"cause": "c", "faults": ["dust_on_optics"], "onset_s": 1.0, "duration_s": 0.0},
+            r"event\[0\]\.duration_s",
+        ),
+        (
+            {"cause": "c", "faults": ["dust_on_optics"], "onset_s": 1.0, "duration_s": -2.0},
+            r"event\[0\]\.duration_s",
+        ),
+        ({"cause": "c", "faults": ["dust_on_optics"], "onset_s": 1.0, "profile": "slow"}, r"event\[0\]\.profile"),
+        ({"cause": "c", "faults": ["dust_on_optics"], "onset_s": 1.0, "profile": "growing"}, r"rise_s must be set"),
+        ({"cause": "c", "faults": ["dust_on_optics"], "onset_s": 1.0, "rise_s": 1.0}, r"rise_s must not be set"),
+        (
+            {
+                "cause": "c",
+                "faults": ["dust_on_optics"],
+                "onset_s": 1.0,
+                "profile": "intermittent",
+                "period_s": 1.0,
+                "duty": 1.5,
+            },
+            r"event\[0\]\.duty",
+        ),
+    ],
+)
+def test_a_wrong_event_is_told_in_a_sentence(scene: Path, table: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence) as caught:
+        config.load_scene(scene, {"event": [table]})
+    assert "\n" not in str(caught.value)
+
+
+def test_events_need_sequences(scene: Path) -> None:
+    table = columns()
+    del table["sequence"], table["time_s"]
+    write(scene.parent / "poses.csv", table)
+    scene.write_text(scene.read_text() + EVENTS)
+    with pytest.raises(
+        InputError, match=r"event: 'dust event' happens at a time of a sequence, and the scene has none"
+    ):
+        vbnfault.Session(config.load_scene(scene))

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from .dataset import BuildOptions, verify
     from .dataset import build_scene as build
     from .dataset import merge_stores as merge
+    from .dataset.events import events
     from .dataset.retake import retake
     from .dataset.statistics import statistics
     from .detector.effects import Effect, Exposure
@@ -63,6 +64,7 @@ _HOMES = {
     "bounds": "faults",
     "build": "dataset:build_scene",
     "choice": "faults",
+    "events": "dataset.events",
     "flag": "faults",
     "export": "output.export:export_store",
     "inject": "inject:",

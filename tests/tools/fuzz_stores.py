@@ -330,9 +330,11 @@ def _text(store: Path, rng: random.Random, _: Path) -> None:
     padded[: len(column)] = column
     opened.file(name, number).write_bytes(layout.encode_values(padded))
     if rng.random() < 0.8:
-        columns = {n: opened.column(n, number) for n in (*stores.SCALARS, "crc32c") if n != name} | {name: column}
+        columns = {n: opened.column(n, number) for n in (*opened.spec.scalars, "crc32c") if n != name} | {
+            name: column
+        }
         crcs = np.zeros((opened.spec.shard_samples, len(opened.spec.checked)), np.uint32)
         crcs[: len(column)] = columns["crc32c"]
         for k in range(len(column)):
-            crcs[k, -1] = codec.crc_of_scalars({n: columns[n][k] for n in stores.SCALARS})
+            crcs[k, -1] = codec.crc_of_scalars({n: columns[n][k] for n in opened.spec.scalars})
         opened.file("crc32c", number).write_bytes(layout.encode_values(crcs))

@@ -271,6 +271,24 @@ def stats(
 
 
 @app.command(rich_help_panel=_PANEL)
+def events(
+    store: StoreArgument,
+    out: Annotated[Path | None, local_path("CSV file to write in place of the lines.")] = None,
+) -> None:
+    """List what happened in the sequences of a store: which fault was in which frames, since when, and why."""
+    from ..dataset import events as listing
+
+    listed = listing.events(store)
+    if out is not None:
+        with writing(out):
+            out.write_text(listing.as_csv(listed), encoding="utf-8")
+        typer.echo(f"{out}: {len(listed)} events")
+        return
+    for event in listed:
+        typer.echo(event.line)
+
+
+@app.command(rich_help_panel=_PANEL)
 def card(store: StoreArgument) -> None:
     """Write the card (README.md) and the Croissant description of a store into it, as a build does at its end."""
     from ..dataset.card import write_card

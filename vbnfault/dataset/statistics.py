@@ -271,7 +271,7 @@ def statistics(path: str | os.PathLike[str] | Store) -> Statistics:
     sites: dict[str, set[int]] = {}
     ranges: dict[str, dict[str, Range]] = {name: {} for name in _RANGED}
     parameters: dict[str, dict[str, _Parameter]] = {fault: {} for fault in faults}
-    for samples, columns in _groups(store):
+    for samples, columns in finished_scalars(store, _READ):
         injected = columns["injected"].astype(np.int64).reshape(len(samples), len(faults))
         together += injected.T @ injected
         per_sample.update(injected.sum(axis=1).tolist())
@@ -334,19 +334,22 @@ def _commanded(store: Store) -> NDArray[np.bool_] | None:
         return None
 
 
-def _groups(store: Store) -> Iterator[tuple[list[int], dict[str, NDArray[Any]]]]:
-    """Yield the finished samples of some shards at once, and their scalars by name."""
+def finished_scalars(store: Store, names: Collection[str]) -> Iterator[tuple[list[int], dict[str, NDArray[Any]]]]:
+    """Yield the finished samples of some shards at once, and their scalars by name.
+
+    Raises VbnfaultError for scalars that cannot be read.
+    """
     begun = store.begun()
     for start in range(0, len(begun), _SHARDS_AT_ONCE):
         samples: list[int] = []
-        columns: dict[str, list[NDArray[Any]]] = {name: [] for name in _READ}
+        columns: dict[str, list[NDArray[Any]]] = {name: [] for name in names}
         for number in begun[start : start + _SHARDS_AT_ONCE]:
             finished = [i for i, done in store.done(number).items() if done]
             if not finished:
                 continue
             chosen = [i - store.shard(number).start for i in finished]
             try:
-                for name in _READ:
+                for name in names:
                     columns[name].append(store.column(name, number)[chosen])
             except (OSError, ValueError) as error:
                 raise VbnfaultError(

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .context import FaultContext, Params
-from .contract import Fault
+from .contract import Fault, first_of
 from .fields import Interval, Severity, bounds, choice, number
 
 BOTH_WAYS = ("interline_ccd", "cmos")
@@ -98,6 +98,10 @@ class TextureBrokenLines(Fault):
             "columns": columns.tolist(),
             "column_values": values[~is_row][: len(columns)].tolist(),
         }
+
+    def grown(self, params: Params, fraction: float) -> Params:
+        """Return the parameters with the first of the rows and columns."""
+        return first_of(params, fraction, "rows", "row_values", "columns", "column_values")
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
         """Return the image with the lines set in all four channels."""

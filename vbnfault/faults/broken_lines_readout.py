@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from ..detector.readout import last_before, node_of, readout_steps
 from .context import FaultContext, Params
-from .contract import Fault
+from .contract import Fault, first_of
 from .fields import Interval, Severity, bounds, number
 
 Mask = NDArray[np.bool_]
@@ -136,6 +136,10 @@ class ReadoutBrokenLines(Fault):
             pixels = int(readout_steps(context.shape, nodes)[1].max())
             register = {"node": int(rng.integers(nodes)), "begin": int(rng.integers(1, pixels, endpoint=True))}
         return {"lines": lines, "register": register, "node": node}
+
+    def grown(self, params: Params, fraction: float) -> Params:
+        """Return the parameters with the first of the lines."""
+        return first_of(params, fraction, "lines")
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
         """Return the raw digital numbers with the broken lines, register and node."""

@@ -36,7 +36,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .context import FaultContext, Params
-from .contract import Fault
+from .contract import Fault, first_of
 from .fields import Interval, Severity, bounds, number
 from .planes import scale_by_intensity
 
@@ -121,6 +121,10 @@ class TextureBrokenPixels(Fault):
             params["line_offset_dn"] = (lo + np.floor(fraction * (hi - lo + 1))).astype(int).tolist()
             params["line_direction"] = context.camera.readout_direction
         return params
+
+    def grown(self, params: Params, fraction: float) -> Params:
+        """Return the parameters with the first of the defects."""
+        return first_of(params, fraction, "x", "y", "brightness_dn", "line_offset_dn")
 
     def _positions(
         self, count: int, height: int, width: int, rng: np.random.Generator

@@ -173,6 +173,13 @@ class Fault:
         """Return the parameters of `draw` on which the image depends; the others only describe the fault."""
         return self.draw(context, rng)
 
+    def grown(self, params: Params, fraction: float) -> Params:
+        """Return the parameters of the fault when `fraction` of it, in (0, 1], is there.
+
+        A fault that grows overrides this hook, with `first_of` or `scaled`; of the others, all is there at once.
+        """
+        return params
+
     def added_light(self, params: Params, context: FaultContext, once: Any, *, spikes: Any = None) -> Any:
         """Return what the fault adds by its parts, for studies (`straylight_lens.AddedLight`); None: unknown.
 
@@ -296,3 +303,18 @@ def with_sensor(camera: Camera, **changes: Any) -> Camera:
     return dataclasses.replace(
         camera, detector=dataclasses.replace(detector, sensor=dataclasses.replace(detector.sensor, **changes))
     )
+
+
+def first_of(params: Params, fraction: float, *keys: str) -> Params:
+    """Return parameters with the first `fraction`, in (0, 1], of each list of things; at least one of them."""
+    return params | {
+        key: params[key][: max(1, round(fraction * len(params[key])))] for key in keys if params.get(key)
+    }
+
+
+def scaled(params: Params, fraction: float, *keys: str) -> Params:
+    """Return parameters of which some, numbers or lists of numbers, are multiplied by `fraction`."""
+    return params | {
+        key: [fraction * x for x in params[key]] if isinstance(params[key], list) else fraction * params[key]
+        for key in keys
+    }

@@ -41,7 +41,7 @@ from ..lens.coating import mean_reflectance
 from ..lens.image_frame import ImageFrame
 from ..lens.straylight.scatter import Harvey
 from .context import FaultContext, Params
-from .contract import LensFault
+from .contract import LensFault, first_of, scaled
 from .fields import Interval, Severity, bounds, choice, number
 from .planes import cell_px, strewn, times
 
@@ -114,6 +114,10 @@ class Contamination(LensFault):
         for name in ("scratch_bend_deg", "browning_per_mm_krad", "browning_exponent"):
             params[name] = float(getattr(self, name))
         return params
+
+    def grown(self, params: Params, fraction: float) -> Params:
+        """Return the parameters with less haze, dose and loss of the coating, and the first of the scratches."""
+        return first_of(scaled(params, fraction, "haze", "dose_krad", "coating_loss"), fraction, "scratches")
 
     def inform(self, context: FaultContext, params: Params) -> FaultContext:
         """Return the context with the coating loss, which makes ghosts brighter."""

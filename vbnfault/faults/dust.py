@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .context import FaultContext, Params
-from .contract import Fault
+from .contract import Fault, first_of
 from .fields import Interval, Severity, bounds, flag, number
 from .planes import times
 
@@ -117,6 +117,10 @@ class GaussianDust(Fault):
         params["pixels_per_grid_unit"] = float(self.pixels_per_grid_unit * scale)
         params["mask_level_dn"] = float(self.mask_level_dn)
         return params
+
+    def grown(self, params: Params, fraction: float) -> Params:
+        """Return the parameters with the first of the grains."""
+        return first_of(params, fraction, "x_px", "y_px", "peak_dn", "sigma_xx", "sigma_yy", "sigma_xy")
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
         """Return the expected electrons times the transmission of all grains."""

@@ -56,7 +56,7 @@ from ..lens.paraxial import along
 from ..lens.rays import forward
 from ..lens.straylight.particles import DUST_INDEX
 from .context import FaultContext, Params
-from .contract import LensFault
+from .contract import LensFault, first_of
 from .fields import Interval, Severity, bounds, number
 from .planes import cell_px, reaches, strewn, times
 
@@ -150,6 +150,10 @@ class DefocusedDust(LensFault):
         if cover := self.cover.uniform(rng):  # so that the stored parameters of other scenes stay as they are
             params |= {"cover": cover, "cover_um": float(self.cover_um)}
         return params
+
+    def grown(self, params: Params, fraction: float) -> Params:
+        """Return the parameters with the first of the grains."""
+        return first_of(params, fraction, "on_window", "x_mm", "y_mm", "diameter_um", "transmission")
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
         """Return the expected electrons times the transmission of all grains, plus their glow."""

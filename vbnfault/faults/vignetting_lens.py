@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from ..lens.beams import Beams
 from ..lens.image_frame import ImageFrame
 from .context import FaultContext, Params
-from .contract import LensFault
+from .contract import LensFault, scaled
 from .fields import Interval, Severity, bounds, number
 from .planes import times
 
@@ -101,6 +101,10 @@ class LensVignetting(LensFault):
             "hood_offset_mm": [float(moved * np.cos(turn[1])), float(moved * np.sin(turn[1]))],
             "mask_loss": float(self.mask_loss),
         }
+
+    def grown(self, params: Params, fraction: float) -> Params:
+        """Return the parameters with ring and hood nearer to their places."""
+        return scaled(params, fraction, "decentre", "decentre_mm", "hood_offset_mm")
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
         """Return the expected electrons times the factor of each pixel."""

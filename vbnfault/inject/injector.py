@@ -142,10 +142,14 @@ class _Drawing:
         """Return whether other images have the same state of the instrument."""
         return self.state is not None
 
+    def fraction(self, fault: str) -> float:
+        """Return that all of a fault is there."""
+        return 1.0
+
     def rng(self, stage: str, name: str) -> np.random.Generator:
         """Return the generator for (stage, name); faults that last from image to image follow `state`."""
-        lasts = stage == "fault" and self.state is not None and is_state(self, name.partition("/")[0])
-        return keyed_random.rng(self.seed, self.state if lasts else self.index, stage, name)
+        state = self.state if stage == "fault" and is_state(self, name.partition("/")[0]) else None
+        return keyed_random.rng(self.seed, self.index if state is None else state, stage, name)
 
 
 class Injector:

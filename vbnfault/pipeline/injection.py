@@ -127,7 +127,7 @@ def draw_faults(
             fault = spec.faults[name]
             context = development.context_of(fault, complete)
             params = fault.draw(context, spec.rng("fault", f"{name}/{attempt}"))
-            complete[name] = Draw(fault=fault, attempt=attempt, params=params)
+            complete[name] = Draw(fault=fault, attempt=attempt, params=fault.grown(params, spec.fraction(name)))
     return complete
 
 

@@ -15,7 +15,7 @@ from ..scene.config import Scene
 from ..scene.trajectory import FlownPose
 from ..world import assemble, ephemeris
 from . import masks
-from .spec import Frame, stored_layers
+from .spec import Frame, SampleSpec, stored_layers
 
 F64 = NDArray[np.float64]
 
@@ -137,10 +137,26 @@ def _provenance(frame: Frame) -> dict[str, Any]:
         "site": int(spec.plan.site[i]),
         "split": plan.SPLITS[spec.plan.split[i]],
         "parameters": {
-            name: {"model": spec.faults[name].model, **params} for name, params in sorted(frame.drawn.items())
+            name: {"model": spec.faults[name].model, **params, **_of_event(spec, name)}
+            for name, params in sorted(frame.drawn.items())
         },
         "proposal": proposal(spec.scene, spec.plan, i, pose.variables),
         **(of_sequence(spec.flown) if spec.shares_state and spec.flown else {}),
+    }
+
+
+def _of_event(spec: SampleSpec, fault: str) -> dict[str, Any]:
+    """Return what brings a fault of a sequence, when, and how much of it is there; {} for what no event brings."""
+    event = spec.event_of(fault)
+    if event is None:
+        return {}
+    return {
+        "event": {
+            "cause": event.cause,
+            "onset_s": event.onset_s,
+            "end_s": event.end_s if np.isfinite(event.end_s) else None,
+            "fraction": spec.fraction(fault),
+        }
     }
 
 

@@ -19,6 +19,7 @@ from ..lens import Lens
 from ..render.description import RenderInput
 from ..scene import keyed_random, plan
 from ..scene.config import Scene
+from ..scene.events import Event, events_of_sequence, strongest
 from ..scene.sampling import DEFAULT_TWINS
 from ..scene.trajectory import FlownPose
 from ..world import cameras
@@ -87,6 +88,9 @@ class Drawing(Protocol):
     def rng(self, stage: str, name: str) -> np.random.Generator:
         """Return the random generator of the sample for (stage, name)."""
 
+    def fraction(self, fault: str) -> float:
+        """Return how much of a fault is there, from 0 to 1, which is all of it."""
+
 
 def is_state(drawing: Drawing, fault: str) -> bool:
     """Return whether a fault is a state of the instrument, which lasts from image to image of a sequence."""
@@ -121,13 +125,27 @@ class SampleSpec:
 
     @property
     def commanded(self) -> tuple[str, ...]:
-        """Return the faults that the sample is commanded to carry, in dataset order."""
-        return self.plan.commanded(self.index)
+        """Return the faults that the sample is commanded to carry now, in dataset order."""
+        return tuple(name for name in self.plan.commanded(self.index) if self.fraction(name) > 0)
 
     @property
     def commanded_in_view(self) -> tuple[str, ...]:
-        """Return the faults that any sample of the view is commanded to carry, in dataset order."""
-        return self.plan.commanded_in_view(self.index)
+        """Return the faults that any sample of the view is commanded to carry now, in dataset order."""
+        return tuple(name for name in self.plan.commanded_in_view(self.index) if self.fraction(name) > 0)
+
+    @cached_property
+    def events(self) -> tuple[Event, ...]:
+        """Return the events of the sample's sequence; () if it is no frame of one."""
+        return events_of_sequence(self.scene, int(self.plan.state[self.index])) if self.shares_state else ()
+
+    def event_of(self, fault: str) -> Event | None:
+        """Return the event that brings a fault now; None if the fault needs none."""
+        return strongest(self.events, fault, self.flown.time_s) if self.flown is not None else None
+
+    def fraction(self, fault: str) -> float:
+        """Return how much of a fault is there now, from 0 to 1, which is all of it."""
+        event = self.event_of(fault)
+        return 1.0 if event is None or self.flown is None else event.fraction(self.flown.time_s)
 
     @property
     def of_view(self) -> SampleSpec:

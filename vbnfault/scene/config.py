@@ -22,6 +22,7 @@ from ..core.tables import Table
 from ..reflectance import is_packaged
 from .bodies import with_named_body
 from .coma import ComaTable
+from .events import EventTable
 from .instrument import OF_A_SENSOR_FILE, CameraTable, ImageTable, RenderTable
 from .sampling import DEFAULT_TWINS, OF_AN_AIM, DatasetTable, GeometryTable, PlanTable, StratumTable
 from .surroundings import OrbitTable, SkyTable, SpacecraftTable, SpiceTable, SunTable
@@ -75,6 +76,9 @@ class Scene(Table):
     geometry: GeometryTable = GeometryTable()
     plan: PlanTable = PlanTable()
     faults: dict[str, dict[str, Any]] = Field(default_factory=dict)
+    event: tuple[EventTable, ...] = Field(
+        (), max_length=64, description="what brings faults at some time of a sequence"
+    )
     # when a scene is read, each level is replaced by its value: this table is of no use afterwards
     severity: SeverityLevels | None = Field(None, exclude=True)
 
@@ -345,6 +349,12 @@ def _check_faults(scene: Scene, faults: Mapping[str, Fault]) -> None:
         raise InputError(
             f"plan.classes_per_sample = [{least}, {most}]: the scene has only {len(faults)} fault classes"
         )
+    for number, event in enumerate(scene.event):
+        for name in event.faults:
+            if name not in faults:
+                raise InputError(
+                    f"event[{number}].faults: {shown(name)} is no fault class of the scene{_it_has(faults)}"
+                )
     if camera.lens:  # a name without a lens is refused before what does not fit to a lens
         with under_key("camera.lens"):
             resources.find("scenes/lenses", camera.lens)
@@ -369,6 +379,11 @@ def _check_faults(scene: Scene, faults: Mapping[str, Fault]) -> None:
                     f"faults.{name}: acts on charge that a CCD moves, and camera.detector = {camera.detector!r} is "
                     "a CMOS sensor; leave the fault out, or name a CCD"
                 )
+
+
+def _it_has(faults: Mapping[str, Fault]) -> str:
+    """Return the clause that lists the fault classes of a scene."""
+    return f"; it has {', '.join(faults)}" if faults else "; it has none"
 
 
 def _check_layers(scene: Scene, faults: Mapping[str, Fault]) -> None:

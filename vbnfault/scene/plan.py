@@ -22,9 +22,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.errors import InputError
+from ..core.errors import InputError, shown
 from . import aims, exchange, keyed_random, redraw
 from .config import Scene
+from .events import first_classes
 from .fault_matrix import draw_block
 from .names import SPLITS, SUN_AVERTED, SUN_FACING
 
@@ -171,7 +172,7 @@ def make_plan(
             classes = tuple(faults), frozenset(need_sun)
             parts.append(draw_block(scene, classes, (b, start), shard[rows], split[rows]))
     unit = np.searchsorted(firsts, state)
-    injected = np.concatenate([p[0] for p in parts])[unit]
+    injected = _with_common_causes(scene, faults, np.concatenate([p[0] for p in parts]))[unit]
     stratum = np.concatenate([p[1] for p in parts])[unit]
     block = np.repeat(np.arange(len(sizes)), sizes)
     together = shard if scene.plan.order == "shuffled" else block * scene.dataset.sites + site
@@ -241,6 +242,11 @@ def _sequences(scene: Scene, samples: NDArray[np.int64]) -> tuple[NDArray[np.int
     """
     frames = () if scene.trajectory is None else scene.trajectory.frames
     if not frames:
+        if scene.event:
+            raise InputError(
+                f"event: {shown(scene.event[0].cause)} happens at a time of a sequence, and the scene has none; "
+                "trajectory.file must name a table of poses with sequences"
+            )
         return None, samples
     if scene.dataset.variants_per_view > 1:
         raise InputError(
@@ -255,6 +261,14 @@ def _sequences(scene: Scene, samples: NDArray[np.int64]) -> tuple[NDArray[np.int
         )
     sequence = np.searchsorted(starts, samples, side="right") - 1
     return sequence.astype(np.int32), starts[sequence]
+
+
+def _with_common_causes(scene: Scene, faults: Sequence[str], injected: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return the fault matrix, bool[sequence, fault], where the first class of each event brings its others."""
+    out = injected.copy()
+    for name, causes in first_classes(scene.event).items():
+        out[:, list(faults).index(name)] = injected[:, [list(faults).index(cause) for cause in causes]].any(axis=1)
+    return out
 
 
 def _pair(low: NDArray[np.float64], high: NDArray[np.float64], stratum: int) -> list[float]:

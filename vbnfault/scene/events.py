@@ -1,0 +1,133 @@
+"""Define the tables `[[event]]` of a scene file: causes that bring faults at some time of a sequence.
+
+An event strikes a sequence whose frames carry the first of its faults, and brings all of them together. Its times
+are drawn once for a sequence. Faults of no event are there from the first frame to the last.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import numpy as np
+from pydantic import AfterValidator, Field, model_validator
+
+from ..core.tables import Table, each_once, pair_within
+from . import keyed_random
+
+_LONGEST_S, _SHORTEST_S = 1e9, 1e-6
+if TYPE_CHECKING:
+    from .config import Scene
+
+    Times = float | tuple[float, float]
+    Spans = float | tuple[float, float]
+else:
+    Times = Annotated[float, Field(ge=-_LONGEST_S, le=_LONGEST_S)] | pair_within(-_LONGEST_S, _LONGEST_S)
+    Spans = Annotated[float, Field(ge=_SHORTEST_S, le=_LONGEST_S)] | pair_within(_SHORTEST_S, _LONGEST_S)
+_NEEDS = {"sudden": (), "growing": ("rise_s",), "intermittent": ("period_s",)}
+
+
+class EventTable(Table):
+    """Name a cause, the faults that it brings, and when. Times count as those of the frames of a sequence."""
+
+    cause: str = Field(min_length=1, max_length=200, description="what happens, such as a dust event")
+    faults: Annotated[tuple[str, ...], AfterValidator(each_once)] = Field(
+        min_length=1, description="classes of the scene that it brings, all together"
+    )
+    onset_s: Times = Field(description="time at which it begins, or bounds between which it is drawn")
+    duration_s: Spans | None = Field(
+        None, description="how long it lasts, or bounds; by default to the end of the sequence"
+    )
+    profile: Literal["sudden", "growing", "intermittent"] = Field(
+        "sudden",
+        description="sudden: there at once; growing: from nothing to all of it in rise_s, for the models that "
+        "grow; intermittent: on for the fraction duty of each period_s",
+    )
+    rise_s: Spans | None = Field(None, description="time in which a growing fault is whole, or bounds")
+    period_s: Spans | None = Field(None, description="period of an intermittent fault, or bounds")
+    duty: Annotated[float, Field(gt=0, lt=1)] = Field(
+        0.5, description="fraction of its period for which an intermittent fault is on"
+    )
+
+    @model_validator(mode="after")
+    def _has_what_its_profile_needs(self) -> EventTable:
+        for profile, names in _NEEDS.items():
+            for name in names:
+                if (getattr(self, name) is None) == (profile == self.profile):
+                    verb = "must be set" if profile == self.profile else "must not be set"
+                    raise ValueError(f'profile = "{self.profile}": {name} {verb}; it is for the profile {profile}')
+        return self
+
+
+@dataclass(frozen=True, kw_only=True)
+class Event:
+    """Hold an event of a sequence, as drawn; `end_s` is infinite for one that lasts."""
+
+    cause: str
+    faults: tuple[str, ...]
+    onset_s: float
+    end_s: float
+    profile: str
+    rise_s: float
+    period_s: float
+    duty: float
+
+    def fraction(self, time_s: float) -> float:
+        """Return how much of the faults is there at a time, from 0, nothing, to 1."""
+        since_s = time_s - self.onset_s
+        if since_s < 0 or time_s >= self.end_s:
+            return 0.0
+        if self.profile == "growing":
+            return min(since_s / self.rise_s, 1.0)
+        if self.profile == "intermittent":
+            return float(since_s % self.period_s < self.duty * self.period_s)
+        return 1.0
+
+
+def events_of_sequence(scene: Scene, state: int) -> tuple[Event, ...]:
+    """Return the events of the sequence whose first frame is the sample `state`, in the order of the scene."""
+    out = []
+    for number, table in enumerate(scene.event):
+        rng = keyed_random.rng(scene.dataset.seed, state, "plan", f"event/{number}")
+        onset_s, duration_s, rise_s, period_s = (
+            _drawn(getattr(table, name), rng) for name in ("onset_s", "duration_s", "rise_s", "period_s")
+        )
+        out.append(
+            Event(
+                cause=table.cause,
+                faults=table.faults,
+                onset_s=onset_s,
+                end_s=onset_s + duration_s,
+                profile=table.profile,
+                rise_s=rise_s,
+                period_s=period_s,
+                duty=table.duty,
+            )
+        )
+    return tuple(out)
+
+
+def strongest(events: Sequence[Event], fault: str, time_s: float) -> Event | None:
+    """Return the event that brings most of a fault at a time; None if none brings it, or none is of it."""
+    mine = [event for event in events if fault in event.faults]
+    return max(mine, key=lambda event: event.fraction(time_s), default=None)
+
+
+def first_classes(tables: Sequence[EventTable]) -> Mapping[str, tuple[str, ...]]:
+    """Return for each class of an event the first classes of all events that bring it."""
+    out: dict[str, tuple[str, ...]] = {}
+    for table in tables:
+        for fault in table.faults:
+            out[fault] = (*out.get(fault, ()), table.faults[0])
+    return out
+
+
+def _drawn(value: float | tuple[float, float] | None, rng: np.random.Generator) -> float:
+    """Return a number, or one from between two bounds; infinity where there is none."""
+    fraction = float(rng.random())  # always drawn, so that other values do not depend on this one
+    if value is None:
+        return np.inf
+    if isinstance(value, tuple):
+        return value[0] + fraction * (value[1] - value[0])
+    return float(value)
