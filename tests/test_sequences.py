@@ -210,6 +210,26 @@ def test_readers_give_the_columns_of_sequences(scene: Path, tmp_path: Path) -> N
     assert {"sequence", "frame", "time_s"} <= set(table)
 
 
+def test_a_contact_sheet_has_film_strips(scene: Path, tmp_path: Path) -> None:
+    """Two of three sequences, the first and the last, a row each: tiles of 320 px, with gaps of 14 px."""
+    import cv2
+
+    from vbnfault.output import contact_sheet
+
+    out, sheet = tmp_path / "s.zarr", tmp_path / "sheet.png"
+    vbnfault.build(scene, out, progress=False)
+    assert contact_sheet.preview(out, sheet) == 3 + 5
+    picture = cv2.imread(str(sheet))
+    assert picture.shape[1] == 14 + 5 * (320 + 14)
+    rows = picture.shape[0] - 14 - 2 * (240 + 46 + 14)
+    assert 46 < rows < 120  # the header
+    second = picture[-(240 + 46 + 14) :, :, 0]
+    first = picture[-2 * (240 + 46 + 14) : -(240 + 46 + 14), :, 0]
+    beyond = slice(14 + 3 * 334, None)  # the first strip has three frames
+    assert np.ptp(first[:, beyond]) == 0 < np.ptp(second[:, beyond])
+    assert contact_sheet.preview(out, sheet, max_samples=1) == 1
+
+
 def test_the_description_counts_sequences(scene: Path) -> None:
     text = "\n".join(describe_scene(config.load_scene(scene), source="frames"))
     assert "3 sequences of 1 to 5 frames, 1 s apart, each with one camera and its faults" in text

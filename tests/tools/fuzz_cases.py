@@ -224,6 +224,13 @@ def case_poses(seeds: Seeds, rng: random.Random, here: Path) -> Case:
     scene["dataset"] = {key: value for key, value in scene["dataset"].items() if key != "samples"}
     table = {"file": str(here / name)}
     scene["trajectory"] = changed(table, rng) if rng.random() < 0.1 else table
+    if rng.random() < 0.5:
+        event = {"cause": "c", "faults": ["dust_on_optics"], "onset_s": [1.0, 3.0], "duration_s": 2.0}
+        event |= rng.choice(
+            [{}, {"profile": "growing", "rise_s": 2.0}, {"profile": "intermittent", "period_s": 1.0}]
+        )
+        scene |= {"faults": {"dust_on_optics": {}}, "event": [changed(event, rng)]}
+        scene["plan"] = {"classes_per_sample": [1, 1]}
     path = here / "scene.toml"
     path.write_bytes(toml(scene))
     return dry(path), {}

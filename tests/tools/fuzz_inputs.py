@@ -340,20 +340,21 @@ def _images(folder: Path) -> dict[str, bytes]:
 
 
 def _poses() -> dict[str, bytes]:
-    """Return one table of two poses as CSV and as Parquet, by file name."""
+    """Return one table of two frames of a sequence as CSV and as Parquet, by file name."""
     import io
 
     import pyarrow
     import pyarrow.parquet
 
-    from vbnfault.scene.trajectory import COLUMNS
+    from vbnfault.scene.trajectory import COLUMNS, SEQUENCE_COLUMNS
 
     rows = [
-        ("a", 2456875.4, 0.0, 0.0, 9000.0, 0.0, 1.0, 0.0, 0.0, 0.6, 0.0, 0.8, 3.6),
-        ("b", 2456876.4, 0.0, 0.0, 900.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.6, 0.8, 3.6),
+        ("a", 2456875.4, 0.0, 0.0, 9000.0, 0.0, 1.0, 0.0, 0.0, 0.6, 0.0, 0.8, 3.6, "s", 0.0),
+        ("b", 2456876.4, 0.0, 0.0, 900.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.6, 0.8, 3.6, "s", 5.0),
     ]
-    lines = [",".join(COLUMNS), *(",".join(map(str, row)) for row in rows)]
+    names = (*COLUMNS, *SEQUENCE_COLUMNS)
+    lines = [",".join(names), *(",".join(map(str, row)) for row in rows)]
     file = io.BytesIO()
-    columns = dict(zip(COLUMNS, map(list, zip(*rows, strict=True)), strict=True))
+    columns = dict(zip(names, map(list, zip(*rows, strict=True)), strict=True))
     pyarrow.parquet.write_table(pyarrow.table(columns), file)
     return {"poses.csv": "\n".join(lines).encode(), "poses.parquet": file.getvalue()}

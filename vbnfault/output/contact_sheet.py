@@ -53,7 +53,8 @@ def preview(
     """Write a contact sheet of up to `max_samples` finished samples, spread evenly over the store.
 
     Each tile shows the image, tinted by the mask of every injected fault in the fault's colour. The caption gives
-    sample, stratum, site and faults.
+    sample, stratum, site and faults. Frames of sequences are film strips, a row for each of some sequences, with
+    their times.
 
     Parameters
     ----------
@@ -82,15 +83,30 @@ def preview(
     done = [i for number in range(store.shards) for i, whole in store.done(number).items() if whole]
     if not done:
         raise InputError(f"{store.path}: {store.why_none_is_finished()}, so there is nothing to show")
-    chosen = [done[k] for k in spread(len(done), max_samples)]
     short = abbreviations(store.spec.faults)
-    tiles = [_tile(store, i, short, masks) for i in chosen]
-    columns = min(len(tiles), max(1, round(np.sqrt(len(tiles) * 1.25))))
-    body = _grid(tiles, columns)
-    name = f"{store.path.name}: {len(chosen)} of {store.samples} samples"
+    if store.spec.sequence_names:
+        strips = _strips(store, done, max_samples)
+        columns = max(map(len, strips))
+    else:
+        strips = [[done[k] for k in spread(len(done), max_samples)]]
+        columns = min(len(strips[0]), max(1, round(np.sqrt(len(strips[0]) * 1.25))))
+    tiles = [[_tile(store, i, short, masks) for i in strip] for strip in strips]
+    body = np.vstack([_grid(strip, columns)[0 if k == 0 else _GAP_PX :] for k, strip in enumerate(tiles)])
+    count = sum(map(len, tiles))
+    name = f"{store.path.name}: {count} of {store.samples} samples"
     sheet = np.vstack([_header(name, store.spec.faults, short, body.shape[1]), body])
     _write_png(Path(out_png), sheet)
-    return len(tiles)
+    return count
+
+
+def _strips(store: Store, done: Sequence[int], most: int) -> list[list[int]]:
+    """Return frames of some sequences, evenly spaced in each; about three times as many frames as sequences."""
+    of: dict[int, list[int]] = {}
+    for i in done:
+        number = i // store.spec.shard_samples
+        of.setdefault(int(store.column("sequence", number)[i - store.shard(number).start]), []).append(i)
+    shown = [list(of.values())[k] for k in spread(len(of), max(1, round(np.sqrt(most / 3))))]
+    return [[frames[k] for k in spread(len(frames), most // len(shown))] for frames in shown]
 
 
 def spread(count: int, most: int) -> NDArray[np.int64]:
@@ -173,6 +189,9 @@ def _tile(store: Store, index: int, short: Mapping[str, str], masks: bool) -> U8
     site_name = spec.site_names[site] if 0 <= site < len(spec.site_names) else f"site {site}"
     _write(tile, f"#{index}", (8, size[1] + 19), _TEXT, 0.48)
     right = f"{STRATA[int(sample.scalars['stratum'])]}  {site_name}"
+    if spec.sequence_names:
+        sequence, time_s = int(sample.scalars["sequence"]), float(sample.scalars["time_s"])
+        right = f"{spec.sequence_names[sequence]}  {time_s:.6g} s" if sequence < len(spec.sequence_names) else ""
     _write(tile, right, (size[0] - 8 - _text_width(right, 0.4), size[1] + 19), _FAINT, 0.4)
     x = 8
     for k in np.flatnonzero(injected):
