@@ -210,6 +210,20 @@ def test_readers_give_the_columns_of_sequences(scene: Path, tmp_path: Path) -> N
     assert {"sequence", "frame", "time_s"} <= set(table)
 
 
+def test_frames_of_a_loop_are_those_of_a_table(scene: Path) -> None:
+    """A pose with the name of a sequence is a frame of one that has all samples of the scene."""
+    table = columns()
+    table["camera_y_T_m"] = [10 * y for y in table["camera_y_T_m"]]  # from afar, all rows share the terrain
+    write(scene.parent / "poses.csv", table)
+    session = vbnfault.Session(config.load_scene(scene))
+    for k in (0, 2):
+        frame = session.take({name: values[k] for name, values in table.items()}, sample=k)
+        expected = session.simulate(k)
+        assert frame.scalars["parameters"] == expected.scalars["parameters"]
+        np.testing.assert_array_equal(frame.layers["image"], expected.layers["image"])
+        assert frame.scalars["time_s"] == k
+
+
 def test_a_contact_sheet_has_film_strips(scene: Path, tmp_path: Path) -> None:
     """Two of three sequences, the first and the last, a row each: tiles of 320 px, with gaps of 14 px."""
     import cv2

@@ -383,7 +383,8 @@ class Session:
         ----------
         pose
             Position of the camera in T in m, float[3], and the quaternion `camera_from_T`, w first, float[4]; or a
-            mapping with the columns of a table of poses.
+            mapping with the columns of a table of poses. With a `sequence`, all samples of the session are frames
+            of it: dust, defects and wear stay from call to call, and events come at its `time_s`.
         sun
             Direction from the body to the Sun in T, float[3]; by default the mapping's.
         time
