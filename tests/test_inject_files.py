@@ -279,6 +279,27 @@ def test_images_of_a_sequence_share_the_state_of_the_instrument(labels: str, tmp
     assert grains[1] == [grains[0][0]] * 3  # the first image has the same in both
 
 
+def test_images_of_a_sequence_carry_the_same_faults(tmp_path: Path) -> None:
+    pictures, scene = _pictures(tmp_path / "in", 6), tmp_path / "some.toml"
+    scene.write_text(
+        'title = "some"\n[camera]\nexposure_s = 0.01\nfov_deg = 30.0\n[faults.dust_on_optics]\n'
+        "[faults.broken_lines]\n"
+        "[plan]\nclasses_per_sample = [1, 1]\nfaulty_fraction = 0.5\n"
+    )
+    commanded = {}
+    for option in ([], ["--sequence"]):
+        out = tmp_path / f"out{len(option)}"
+        arguments = ["inject", str(pictures), "--scene", str(scene), "--out", str(out), "--labels", "zarr", *option]
+        result = CliRunner().invoke(app, arguments)
+        assert result.exit_code == 0, result.output
+        assert vbnfault.verify(out / "dataset.zarr").problems == []
+        with vbnfault.open_dataset(out / "dataset.zarr") as data:
+            proposals = [json.loads(text) for text in data["proposal"].values]
+        commanded[len(option)] = {tuple(one["injected"]) for one in proposals}
+    assert len(commanded[0]) == 3  # none, and each of the two
+    assert len(commanded[1]) == 1
+
+
 # --- bad input ----------------------------------------------------------------------------------------------------
 
 

@@ -471,7 +471,7 @@ def planned(attributes: Mapping[str, Any], faults: Sequence[str]) -> Callable[[i
     """
     scene, table = stored_plan(attributes, faults)
     numbers = plan_numbers(attributes)
-    frames = () if scene.trajectory is None else scene.trajectory.frames
+    frames = () if scene.trajectory is None else scene.frames
 
     def expected(sample: int, tries: int) -> dict[str, Any]:
         index = int(numbers[sample])

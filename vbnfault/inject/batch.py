@@ -37,7 +37,9 @@ from ..pipeline import Session
 from ..pipeline.record import proposal
 from ..scene import plan
 from ..scene.config import Scene
+from ..scene.instrument import ImageTable
 from ..scene.sampling import PlanTable
+from ..scene.trajectory import place_in_sequence
 from ..store import SCALARS
 from .files import ENDINGS, MOST_VALUES, ImageFile, read_image, source_files
 from .films import ENDINGS as FILMS
@@ -70,9 +72,6 @@ class Batch:
         lie below its name without the ending.
     out
         Folder of the results.
-    states
-        Number of the instrument's state in each image, which the frames of a film or a sequence share; None for an
-        image by itself.
     sun
         In place of `image.sun` of the scene; None: as there.
     """
@@ -81,7 +80,6 @@ class Batch:
     sources: tuple[Path, ...]
     names: tuple[str, ...]
     out: Path
-    states: tuple[int | None, ...]
     sun: str | tuple[float, ...] | None = None
 
     @cached_property
@@ -96,10 +94,15 @@ class Batch:
         need_sun = [name for name, fault in faults.items() if fault.needs_sun]
         return plan.make_plan(self.scene, list(faults), (len(self.names),), need_sun=need_sun)
 
+    def state(self, index: int) -> int | None:
+        """Return the number of the instrument's state in an image; None for an image by itself."""
+        sequence = place_in_sequence(self.scene.frames, index)[0]
+        return None if sequence < 0 or self.scene.frames[sequence] == 1 else int(self.plan.state[index])
+
     def key(self, index: int) -> str:
         """Return a digest of the input of an image: its file, its number, the scene and the Sun."""
         content, scene = self.content(index), self.scene.model_dump(mode="json")
-        told = json.dumps([content, index, self.states[index], self.sun, len(self.names), scene], sort_keys=True)
+        told = json.dumps([content, index, self.sun, len(self.names), scene], sort_keys=True)
         return user_files.sha256(told.encode())
 
     def content(self, index: int) -> str:
@@ -158,7 +161,7 @@ class Batch:
             return image, self.injector(
                 image.numbers,
                 index,
-                state=self.states[index],
+                state=self.state(index),
                 sun=self.sun,
                 commanded=self.plan.commanded(index),
                 depth_m=image.depth_m,
@@ -340,7 +343,7 @@ def inject_files(
 ) -> Batch:
     """Inject the faults of a scene into the images of files, folders and globs, and write them to a folder.
 
-    With `sequence`, all images share the state of the instrument, as the frames of a film do.
+    With `sequence`, all images share the faults and the state of the instrument, as the frames of a film do.
 
     Raises
     ------
@@ -349,11 +352,15 @@ def inject_files(
     VbnfaultError
         Some images failed; all others are made, and the same call tries the failed ones again.
     """
-    sources, names, states, films = _frames(*_found(images, out), out)
-    states = (0,) * len(states) if sequence else states
+    sources, names, frames, films = _frames(*_found(images, out), out)
+    frames = (len(names),) if sequence else frames if films else ()
     dataset = scene.dataset.model_copy(update={"samples": len(names)})
     scene = scene.model_copy(update={"dataset": dataset, "plan": _plan(scene)})
-    batch = Batch(scene=scene, sources=sources, names=names, out=out, states=states, sun=sun)
+    if frames:  # each is a site of its own, as a sequence of poses is
+        dataset = dataset.model_copy(update={"sites": len(frames)})
+        image = (scene.image or ImageTable()).model_copy(update={"frames": frames})
+        scene = scene.model_copy(update={"dataset": dataset, "image": image})
+    batch = Batch(scene=scene, sources=sources, names=names, out=out, sun=sun)
     options = build.BuildOptions(workers=workers, progress=progress)
     batch.injector.require_faults()  # an unusable scene is reported before any image
     if labels == "zarr":
@@ -421,16 +428,19 @@ def _first_image(batch: Batch) -> ImageFile:
 
 def _frames(
     root: Path, paths: Sequence[Path], out: Path
-) -> tuple[tuple[Path, ...], tuple[str, ...], tuple[int | None, ...], dict[str, Film]]:
-    """Return images, with frames for films, their names below the folder `root`, states, and the films by name."""
+) -> tuple[tuple[Path, ...], tuple[str, ...], tuple[int, ...], dict[str, Film]]:
+    """Return images, with frames for films, their names below the folder `root`, and the films by name.
+
+    Between names and films are the numbers of frames that follow each other: those of a film, and 1 of an image.
+    """
     sources: list[Path] = []
     names: list[str] = []
-    states: list[int | None] = []
+    together: list[int] = []
     films = {}
     for path in paths:
         name = path.relative_to(root).as_posix()
         if path.suffix.lower() not in FILMS:
-            states.append(None)
+            together.append(1)
             sources.append(path)
             names.append(name)
             continue
@@ -443,7 +453,7 @@ def _frames(
                 film = Film(sha256="", frames=0, rate="1", ended=str(error))
         films[name] = film
         frames = [frame_path(folder, number) for number in range(1, film.frames + 1)]
-        states += [len(sources)] * len(frames)
+        together += [len(frames)] if frames else []
         sources += frames
         names += [f"{name}/{frame.name}" for frame in frames]
     twice = next((name for name, count in Counter(names).items() if count > 1), None)
@@ -451,7 +461,7 @@ def _frames(
         raise InputError(f"{root / twice}: is named twice")
     if not names:
         raise InputError("; ".join(film.ended for film in films.values()))
-    return tuple(sources), tuple(names), tuple(states), films
+    return tuple(sources), tuple(names), tuple(together), films
 
 
 def _found(images: Sequence[str | Path], out: Path) -> tuple[Path, list[Path]]:

@@ -102,6 +102,12 @@ class Scene(Table):
         return self
 
     @property
+    def frames(self) -> tuple[int, ...]:
+        """Return the number of samples of each sequence; () if the samples are not frames of such."""
+        given = self.trajectory or self.image
+        return () if given is None else given.frames
+
+    @property
     def is_flown(self) -> bool:
         """Return whether poses and Sun are those of a trajectory: of a table of poses, or of SPICE."""
         return self.trajectory is not None or bool(self.spice.spacecraft)

@@ -240,7 +240,7 @@ def _sequences(scene: Scene, samples: NDArray[np.int64]) -> tuple[NDArray[np.int
     Without sequences, there are no such numbers, and each sample is its own first frame. Raises InputError where
     the sequences have fewer frames than there are samples, and where samples share a view.
     """
-    frames = () if scene.trajectory is None else scene.trajectory.frames
+    frames = scene.frames
     if not frames:
         if scene.event:
             raise InputError(
@@ -250,13 +250,13 @@ def _sequences(scene: Scene, samples: NDArray[np.int64]) -> tuple[NDArray[np.int
         return None, samples
     if scene.dataset.variants_per_view > 1:
         raise InputError(
-            f"dataset.variants_per_view = {scene.dataset.variants_per_view}: the rows of the table of poses are "
-            "frames of sequences, each at its own time; must be 1"
+            f"dataset.variants_per_view = {scene.dataset.variants_per_view}: the samples are frames of sequences, "
+            "each at its own time; must be 1"
         )
     starts = np.cumsum([0, *frames])
     if starts[-1] < len(samples):
         raise InputError(
-            f"trajectory.frames: the sequences have {starts[-1]} frames; must have at least {len(samples)}, one "
+            f"frames: the sequences have {starts[-1]} frames; must have at least {len(samples)}, one "
             "for each sample"
         )
     sequence = np.searchsorted(starts, samples, side="right") - 1
