@@ -29,6 +29,7 @@ from .scores import (
     roc_auc,
 )
 from .severity_labels import severity_labels
+from .time_scores import Frames, time_figures
 
 if TYPE_CHECKING:
     from .scored_samples import Samples
@@ -38,6 +39,7 @@ F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
 MEANS = ("iou", "precision", "recall", "f1", "average_precision", "par", "pap", "pamiou", "presence_ap")
+PRESENT = 0.5  # probability from which on a class is told present
 _WITHIN = 1.0  # level of severity
 
 
@@ -97,7 +99,20 @@ def json_result(
         "severity": _severity(bootstrap, injected, severity, tally.severity),
         "false_alarms": _false_alarms(samples, tally, bootstrap, injected),
         "navigation": _navigation(samples, tally, bootstrap, views, pairs, no_pairs),
+        "time": _time(samples, tally, injected),
     }
+
+
+def _time(samples: Samples, tally: Tally, injected: NDArray[np.bool_]) -> dict[str, Any] | None:
+    """Return what is seen when in the sequences of a store; None if it has none."""
+    if not samples.store.spec.sequence_names:
+        return None
+    sequence, time_s, parameters = (samples.column(name) for name in ("sequence", "time_s", "parameters"))
+    said = tally.present >= PRESENT
+    frames = Frames.of(
+        sequence.astype(np.int64), time_s, injected, said, parameters.tolist(), tuple(samples.classes)
+    )
+    return time_figures(frames, tuple(samples.classes), samples.options.seed)
 
 
 def view_numbers(samples: Samples) -> I64:
@@ -194,7 +209,7 @@ def _false_alarms(
         xy, visible = samples.column("sun_xy_px"), samples.column("sun_visible_fraction")
         in_view = ((xy >= 0) & (xy < (spec.width, spec.height))).all(axis=1) & ~(visible <= 0)
     alarm = tally.predicted_px > 0
-    told = (tally.present >= 0.5).any(axis=1)
+    told = (tally.present >= PRESENT).any(axis=1)
     out: dict[str, Any] = {}
     for name, chosen in (
         ("all", nominal),

@@ -76,6 +76,7 @@ def write_pages(folder: Path, result: Mapping[str, Any], samples: Samples, tally
         "classes": [(["class", *columns], _class_rows(result, columns)) for columns in (PIXELS, ARTEFACTS)],
         "false_alarms": _alarm_rows(result),
         "severity": _severity_rows(result),
+        "time": (TIME, _time_rows(result["time"])),
         "kept": with_interval(navigation["good_pixels_kept"], percent=True),
         "let": with_interval(navigation["bad_pixels_let_through"], percent=True),
         "navigation": _navigation_rows(navigation),
@@ -185,6 +186,27 @@ def _severity_rows(result: Mapping[str, Any]) -> list[list[str]]:
         ]
         for name, one in named
         if result["severity"]["known"]
+    ]
+
+
+TIME = ["class", "events", "missed", "delay / s, median", "largest", "false alarms an hour", "flicker"]
+
+
+def _time_rows(time: Mapping[str, Any] | None) -> list[list[str]]:
+    """Return the table of events, the last row of which is all classes together; empty without sequences."""
+    if time is None:
+        return []
+    return [
+        [
+            name,
+            str(one["events"]),
+            with_interval(one["missed_fraction"], percent=True),
+            with_interval(one["delay_s_median"]),
+            "–" if one["delay_s_largest"] is None else f"{one['delay_s_largest']:.4g}",
+            with_interval(one["false_alarms_per_hour"]),
+            with_interval(one["flicker"], percent=True),
+        ]
+        for name, one in [*time["classes"].items(), ("all", time["all"])]
     ]
 
 

@@ -1,0 +1,150 @@
+"""Compute how soon a detector says what happens in a sequence, what it misses, and how steadily it says it.
+
+An event is a fault of one onset in one sequence. It begins with the first frame whose pixels it changes, and ends
+with the last such frame; an intermittent fault is one event. It is detected in the first frame from then to its end
+in which the class is told present.
+"""
+
+from __future__ import annotations
+
+import json
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .scores import Bootstrap, Estimate, ratio
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+
+_HOUR_S = 3600.0
+
+
+class Frames(NamedTuple):
+    """Hold the frames of sequences in the order of sequence and time.
+
+    Attributes
+    ----------
+    sequence
+        int64[n].
+    time_s
+        float64[n], in the time of each sequence.
+    injected, said
+        bool[n, class]: the class changes the pixels; it is told present.
+    onset_s
+        float64[n, class]: of the event that brings the class; -inf for none.
+    """
+
+    sequence: I64
+    time_s: F64
+    injected: Flags
+    said: Flags
+    onset_s: F64
+
+    @classmethod
+    def of(
+        cls,
+        sequence: I64,
+        time_s: F64,
+        injected: Flags,
+        said: Flags,
+        parameters: list[str],
+        classes: tuple[str, ...],
+    ) -> Frames:
+        """Return frames in any order, with their drawn parameters as texts of JSON, in their order."""
+        drawn = [json.loads(text) for text in parameters]
+        onset_s = np.full(injected.shape, -np.inf)
+        for i, faults in enumerate(drawn):
+            for c, name in enumerate(classes):
+                onset_s[i, c] = faults.get(name, {}).get("event", {}).get("onset_s", -np.inf)
+        order = np.lexsort((time_s, sequence))
+        return cls(sequence[order], time_s[order], injected[order], said[order], onset_s[order])
+
+
+def time_figures(frames: Frames, classes: tuple[str, ...], seed: int) -> dict[str, Any]:
+    """Return the figures by class, and of all classes together, each with an interval over sequences."""
+    bootstrap = Bootstrap(frames.sequence, seed)
+    counts = [_counts(frames, c) for c in range(len(classes))]
+    together = _Counts(
+        *(np.concatenate([getattr(one, name) for one in counts], axis=1) for name in _Counts._fields)
+    )
+    hours = _hours(frames)
+    return {
+        "sequences": bootstrap.views,
+        "hours": float(hours.sum()),
+        "classes": {name: _figures(one, hours, bootstrap) for name, one in zip(classes, counts, strict=True)},
+        "all": _figures(together, hours, bootstrap),
+    }
+
+
+class _Counts(NamedTuple):
+    """Hold what is counted at each frame, [n, class] each; events count at their first frame.
+
+    `delay_s` is nan but where an event begins that is detected; `alarms` begin where a class is told present
+    outside of its events; `pairs` are frames whose class is as in the frame before, and `flips` those of them in
+    which what is said changes.
+    """
+
+    events: Flags
+    missed: Flags
+    delay_s: F64
+    alarms: Flags
+    pairs: Flags
+    flips: Flags
+
+
+def _counts(frames: Frames, c: int) -> _Counts:
+    """Return the counts of a class."""
+    sequence, injected, said = frames.sequence, frames.injected[:, c], frames.said[:, c]
+    events, missed, during = (np.zeros(len(sequence), bool) for _ in range(3))
+    delay_s = np.full(len(sequence), np.nan)
+    there = np.flatnonzero(injected)
+    keys = np.column_stack([sequence[there].astype(np.float64), frames.onset_s[there, c]])
+    for key in np.unique(keys, axis=0):
+        mine = there[(keys == key).all(axis=1)]
+        first, last = mine[0], mine[-1]
+        events[first] = True
+        during[first : last + 1] = True
+        told = np.flatnonzero(said[first : last + 1])
+        missed[first] = not len(told)
+        if len(told):
+            delay_s[first] = frames.time_s[first + told[0]] - frames.time_s[first]
+    follows = np.diff(sequence, prepend=-1) == 0
+    before = np.concatenate([[False], said[:-1]]) & follows
+    false = said & ~during
+    pairs = follows & (injected == np.concatenate([[False], injected[:-1]]))
+    columns = (events, missed, delay_s, false & ~before, pairs, pairs & (said != before))
+    return _Counts(*(column[:, None] for column in columns))
+
+
+def _hours(frames: Frames) -> F64:
+    """Return for each frame the hours that it stands for, float64[n]: to the next one, of the last as before it."""
+    out = np.zeros(len(frames.time_s))
+    for sequence in np.unique(frames.sequence):
+        mine = np.flatnonzero(frames.sequence == sequence)
+        steps = np.diff(frames.time_s[mine])
+        out[mine[:-1]], out[mine[-1]] = steps, steps[-1] if len(steps) else 0.0
+    return out / _HOUR_S
+
+
+def _figures(counts: _Counts, hours: F64, bootstrap: Bootstrap) -> dict[str, Any]:
+    """Return figures of counts for JSON."""
+    classes = counts.events.shape[1]
+
+    def fraction(above: Any, below: Any) -> Estimate:
+        return bootstrap.fraction(above.sum(axis=1), below.sum(axis=1) if below.ndim == 2 else below)
+
+    known = counts.delay_s[counts.events & ~counts.missed]
+    # a sample has one value in a median over samples: of several events that begin in it, their mean
+    number = np.isfinite(counts.delay_s).sum(axis=1)
+    of_frame = ratio(np.nansum(counts.delay_s, axis=1), number)
+    return {
+        "events": int(counts.events.sum()),
+        "missed_fraction": fraction(counts.missed, counts.events).plain(),
+        "delay_s_median": bootstrap.median(of_frame).plain(),
+        "delay_s_largest": float(known.max()) if len(known) else None,
+        "false_alarms_per_hour": fraction(counts.alarms, hours * classes).plain(),
+        "flicker": fraction(counts.flips, counts.pairs).plain(),
+    }
