@@ -63,6 +63,7 @@ ONLY = {  # distribution → the packages or modules that import it
         "train.datasets",
         "train.loader",
         "train.slots",
+        "train.windows",
     },
     "torchvision": {"detect.networks"},
     "onnxruntime": {"detect.model_files"},

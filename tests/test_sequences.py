@@ -224,6 +224,39 @@ def test_frames_of_a_loop_are_those_of_a_table(scene: Path) -> None:
         assert frame.scalars["time_s"] == k
 
 
+def test_windows_are_frames_that_follow_each_other(scene: Path, tmp_path: Path) -> None:
+    torch = pytest.importorskip("torch", reason="PyTorch is not installed: pip install '.[torch]'")
+    from vbnfault.torch import SampleDataset, WindowDataset
+
+    out = tmp_path / "s.zarr"
+    vbnfault.build(scene, out, progress=False)
+    data = SampleDataset(str(out), None, ["time_s", "masks"])
+    windows = WindowDataset(data, 2)
+    assert [window["sample"].tolist() for window in windows] == [[k, k + 1] for k in (0, 1, 4, 5, 6, 7)]
+    for window in windows:
+        assert window["image"].shape == (2, 4, 48, 64)
+        np.testing.assert_allclose(np.diff(window["time_s"]), 1.0)
+        for k in range(2):
+            alone = data[int(window["sample"][k])]
+            assert all(torch.equal(window[name][k], alone[name]) for name in alone)
+    assert [w["sample"].tolist() for w in WindowDataset(data, 2, step=2)] == [[0, 1], [4, 5], [6, 7]]
+    batches = list(torch.utils.data.DataLoader(WindowDataset(data, 3, step=2), batch_size=2))
+    assert [batch["sample"].tolist() for batch in batches] == [[[0, 1, 2], [4, 5, 6]], [[6, 7, 8]]]
+    without = SampleDataset(str(out), None, where=lambda columns: columns["frame"] != 1)
+    assert [w["sample"].tolist() for w in WindowDataset(without, 2)] == [[6, 7], [7, 8]]  # no gap inside
+    brighter = WindowDataset(data, 5, transform=lambda window: int(window["image"].max()))
+    assert list(brighter) == [int(max(data[k]["image"].max() for k in range(4, 9)))]
+    for options, sentence in (
+        ({"frames": 6}, "frames = 6: no sequence has as many frames side by side"),
+        ({"frames": 0}, "frames = 0: must be a whole number of at least 1"),
+        ({"frames": 2, "step": 1.5}, "step = 1.5: must be a whole number of at least 1"),
+    ):
+        with pytest.raises(InputError, match=sentence):
+            WindowDataset(data, **options)
+    with pytest.raises(InputError, match="changes each frame by itself"):
+        WindowDataset(SampleDataset(str(out), transform=dict), 2)
+
+
 def test_a_contact_sheet_has_film_strips(scene: Path, tmp_path: Path) -> None:
     """Two of three sequences, the first and the last, a row each: tiles of 320 px, with gaps of 14 px."""
     import cv2

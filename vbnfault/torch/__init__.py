@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from ..inject.transform import Inject
     from ..train.datasets import BatchDataset, SampleDataset, ShardSampler
     from ..train.loader import Loader
+    from ..train.windows import WindowDataset
 
 _HOMES = {
     "BatchDataset": "train.datasets",
@@ -27,6 +28,7 @@ _HOMES = {
     "Loader": "train.loader",
     "SampleDataset": "train.datasets",
     "ShardSampler": "train.datasets",
+    "WindowDataset": "train.windows",
 }
 __all__ = list(_HOMES)
 
