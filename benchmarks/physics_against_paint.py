@@ -35,6 +35,7 @@ ARMS = {
     "physics": ("train_physics_a", "train_physics_b"),
     "both": ("train_paint_a", "train_physics_b"),
 }
+ACROSS = 4  # panels side by side in the figure
 Results = dict[str, dict[str, list[dict[str, Any]]]]
 
 
@@ -128,8 +129,11 @@ def draw(results: Results, path: Path) -> None:
         Line2D([], [], ls="", marker=marker, color=colour, label=arm)
         for arm, marker, colour in zip(results, figures.SERIES_MARKERS, figures.SERIES_COLOURS, strict=False)
     ]
-    with figures.panels("trained on", (1, len(tests)), panel, legend=legend, heads=tests) as (figure, axes):
-        for axis, test in zip(axes, tests, strict=True):
+    grid = -(-len(tests) // ACROSS), min(ACROSS, len(tests))
+    with figures.panels("trained on", grid, panel, legend=legend) as (figure, axes):
+        for axis in axes[len(tests) :]:
+            axis.remove()
+        for axis, test in zip(axes, tests, strict=False):
             for k, (scores, line) in enumerate(zip(results.values(), legend, strict=True)):
                 found = [
                     [_value(one, ("classes", name, "pixels", "iou")) for one in scores[test]] for name in classes
@@ -139,8 +143,9 @@ def draw(results: Results, path: Path) -> None:
                 reach = np.abs(np.stack([iou.min(axis=1), iou.max(axis=1)]) - middle)
                 place = np.arange(len(classes)) + 0.24 * (k - 1)
                 axis.errorbar(middle, place, xerr=reach, fmt=line.get_marker(), color=line.get_color(), ms=4)
-            axis.set(xlim=(0, 1), xlabel="IoU")
-        figures.label_rows(axes, classes)
+            axis.set(xlim=(0, 1), xlabel="IoU", title=test)
+        for first in range(0, len(tests), grid[1]):
+            figures.label_rows(axes[first : min(first + grid[1], len(tests))], classes)
         path.write_bytes(figures.png_bytes(figure))
 
 
