@@ -353,6 +353,9 @@ def test_an_event_brings_all_of_its_faults_and_takes_them_away(scene: Path, tmp_
     onsets = {event.sequence: event.onset_s for event in listed}
     assert [event.onset_s for event in listed] == [onsets[event.sequence] for event in listed]
     np.testing.assert_array_equal(injected, expected)
+    counts = vbnfault.statistics(out).counts
+    for c, fault in enumerate(("dust_on_optics", "cosmic_rays")):
+        assert counts.planned(fault) == counts.realised(fault) == expected[:, c].sum()
     np.testing.assert_array_equal(changed, expected.any(axis=1))
     assert {one["dust_on_optics"]["event"]["cause"] for one in parameters if one} == {"dust event"}
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from .. import store as stores
 from ..core.errors import VbnfaultError
+from ..scene.events import commanded_now
 from ..store import SPLITS, STRATA, FaultCounts, Store
 from .identity import plan_numbers, stored_plan
 
@@ -326,12 +327,23 @@ def pair_of(value: Any) -> tuple[float, float] | None:
 
 
 def _commanded(store: Store) -> NDArray[np.bool_] | None:
-    """Return the commanded faults bool[sample, fault], or None if the stored scene cannot be planned here."""
-    attributes = store.spec.attributes
+    """Return the commanded faults bool[sample, fault], or None if the stored scene cannot be planned here.
+
+    Of a sequence with events, those that are there at the time of each frame.
+    """
+    attributes, faults = store.spec.attributes, store.spec.faults
     try:
-        return stored_plan(attributes, store.spec.faults)[1].injected[plan_numbers(attributes)]
+        scene, table = stored_plan(attributes, faults)
+        numbers = plan_numbers(attributes)
     except (VbnfaultError, KeyError):  # a scene of another program or of a plug-in that is not loaded
         return None
+    injected: NDArray[np.bool_] = table.injected[numbers]
+    if scene.event and store.spec.sequence_names:
+        for samples, columns in finished_scalars(store, ("time_s",)):
+            for i, time_s in zip(samples, columns["time_s"].tolist(), strict=True):
+                state = int(table.state[numbers[i]])
+                injected[i] = commanded_now(scene, faults, injected[i].tolist(), state, time_s)
+    return injected
 
 
 def finished_scalars(store: Store, names: Collection[str]) -> Iterator[tuple[list[int], dict[str, NDArray[Any]]]]:

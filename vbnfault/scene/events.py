@@ -114,6 +114,18 @@ def strongest(events: Sequence[Event], fault: str, time_s: float) -> Event | Non
     return max(mine, key=lambda event: event.fraction(time_s), default=None)
 
 
+def commanded_now(
+    scene: Scene, faults: Sequence[str], injected: Sequence[bool], state: int, time_s: float
+) -> list[bool]:
+    """Return which of the commanded faults of a frame of the sequence `state` are there at a time."""
+    events = events_of_sequence(scene, state)
+    now = [strongest(events, fault, time_s) for fault in faults]
+    return [
+        bool(has) and (event is None or event.fraction(time_s) > 0)
+        for has, event in zip(injected, now, strict=True)
+    ]
+
+
 def first_classes(tables: Sequence[EventTable]) -> Mapping[str, tuple[str, ...]]:
     """Return for each class of an event the first classes of all events that bring it."""
     out: dict[str, tuple[str, ...]] = {}
