@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Annotated, Literal
 
-from pydantic import Field, PositiveInt, model_validator
+from pydantic import Field, model_validator
 
 from ..core import spectra
 from ..core.calibration import Calibration
@@ -402,6 +402,6 @@ class ImageTable(Table):
         description="whether the images are renders without noise: the camera adds the noise of the light and of "
         "its readout before the faults, and light above white saturates",
     )
-    frames: tuple[PositiveInt, ...] = Field(
+    frames: tuple[Annotated[int, Field(ge=1, le=10_000_000)], ...] = Field(
         (), description="Number of images of each film or sequence, which vbnfault fills in"
     )

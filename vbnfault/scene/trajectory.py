@@ -13,11 +13,11 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, PositiveInt
+from pydantic import Field
 
 from ..core import tables
 from ..core.errors import InputError, shown, under_key
@@ -53,6 +53,9 @@ _MOST_ROWS = 1_000_000
 _IN_PYTHON = "poses"  # stands for the file's name where the table was given in Python
 
 
+Frames = Annotated[int, Field(ge=1, le=_MOST_ROWS)]
+
+
 class TrajectoryTable(Table):
     """Name a table of poses. Every row is a sample, seen from there: its camera, its Sun, its date and its name.
 
@@ -65,7 +68,7 @@ class TrajectoryTable(Table):
         "camera_z_T_m, camera_from_T_w, camera_from_T_x, camera_from_T_y, camera_from_T_z, sun_x_T, sun_y_T, "
         "sun_z_T and sun_distance_au; with sequence and time_s for frames that follow each other",
     )
-    frames: tuple[PositiveInt, ...] = Field(
+    frames: tuple[Frames, ...] = Field(
         (), description="Number of rows of each sequence, which vbnfault fills in from the file"
     )
 
