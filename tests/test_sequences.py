@@ -17,10 +17,10 @@ from poses_kit import columns_of, row
 
 import vbnfault
 from vbnfault.core.errors import InputError
-from vbnfault.dataset import describe_scene
+from vbnfault.dataset import describe_scene, scene_identity
 from vbnfault.faults import registry
 from vbnfault.scene import config, plan
-from vbnfault.scene.events import events_of_sequence
+from vbnfault.scene.events import commanded_now, events_of_sequence, striking
 from vbnfault.scene.trajectory import as_trajectory, load_trajectory, place_in_sequence
 
 FRAMES = (3, 1, 5)
@@ -109,6 +109,8 @@ def test_the_place_of_a_row_is_that_of_counting() -> None:
         ("sequence", 3, "leave", r""),
         ("sequence", 8, "approach", r"row 9: sequence = 'approach': has ended before, and began in row 1"),
         ("sequence", 8, "", r"row 9: sequence = '': must be a printable text of 1 to 200 characters"),
+        ("sequence", 8, None, r"row 9: sequence = '': must be a printable text"),
+        ("sequence", 8, float("nan"), r"row 9: sequence = '': must be a printable text"),
     ],
 )
 def test_frames_out_of_order_are_named(column: str, row_number: int, value: Any, sentence: str) -> None:
@@ -247,7 +249,7 @@ def test_windows_are_frames_that_follow_each_other(scene: Path, tmp_path: Path) 
     brighter = WindowDataset(data, 5, transform=lambda window: int(window["image"].max()))
     assert list(brighter) == [int(max(data[k]["image"].max() for k in range(4, 9)))]
     for options, sentence in (
-        ({"frames": 6}, "frames = 6: no sequence has as many frames side by side"),
+        ({"frames": 6}, "frames = 6, step = 1: no sequence has as many frames side by side"),
         ({"frames": 0}, "frames = 0: must be a whole number of at least 1"),
         ({"frames": 2, "step": 1.5}, "step = 1.5: must be a whole number of at least 1"),
     ):
@@ -378,6 +380,54 @@ def test_common_causes_strike_together(scene: Path) -> None:
     np.testing.assert_array_equal(together.injected[:, 1], without.injected[:, 0])
 
 
+def test_an_event_strikes_only_the_sequences_that_carry_its_first_fault(scene: Path) -> None:
+    """A brings b with a, B brings c with b: so a brings all three, b brings c, and of b alone the cause is B."""
+    tables = [
+        {"cause": "A", "faults": ["dust_on_optics", "vignetting"], "onset_s": 1.0},
+        {"cause": "B", "faults": ["vignetting", "cosmic_rays"], "onset_s": 2.0},
+    ]
+    keys = {"faults.vignetting.model": "lens", "plan.classes_per_sample": [1, 1], "event": tables}
+    loaded = config.load_scene(scene, keys)
+    loaded = loaded.model_copy(
+        update={
+            "dataset": loaded.dataset.model_copy(update={"samples": 60, "sites": 60}),
+            "trajectory": loaded.trajectory.model_copy(update={"frames": (1,) * 60}),
+        }
+    )
+    order = ["dust_on_optics", "vignetting", "cosmic_rays"]
+    rows = {tuple(row) for row in plan.make_plan(loaded, order).injected.tolist()}
+    assert rows == {
+        (True, True, True),
+        (False, True, True),
+        (False, False, False),
+    }  # rays alone: nothing brings them
+    events = events_of_sequence(loaded, 0)
+    assert [event.cause for event in striking(events, ["vignetting", "cosmic_rays"])] == ["B"]
+    assert commanded_now(loaded, order, [False, True, True], 0, 1.5) == [False, False, False]
+    assert commanded_now(loaded, order, [True, True, True], 0, 1.5) == [True, True, False]
+    assert commanded_now(loaded, order, [False, True, True], 0, 2.5) == [False, True, True]
+
+
+def test_calls_with_a_sequence_and_without_one_do_not_mix(scene: Path) -> None:
+    session = vbnfault.Session(config.load_scene(scene))
+    row_of = {name: values[0] for name, values in columns().items() if name not in ("sequence", "time_s")}
+    alone = session.take(row_of, sample=1).scalars["parameters"]["dust_on_optics"]
+    framed = session.take({**row_of, "sequence": "s", "time_s": 0.0}, sample=1).scalars["parameters"][
+        "dust_on_optics"
+    ]
+    again = session.take(row_of, sample=1).scalars["parameters"]["dust_on_optics"]
+    assert alone == again != framed
+
+
+def test_a_scene_without_sequences_has_the_identity_of_before(scene: Path) -> None:
+    assert "event" not in scene_identity(vbnfault.Session(config.load_scene("quickstart")))
+    table = columns()
+    del table["sequence"], table["time_s"]
+    write(scene.parent / "poses.csv", table)
+    plain = scene_identity(vbnfault.Session(config.load_scene(scene)))
+    assert set(plain["trajectory"]) == {"file"}
+
+
 def test_a_growing_fault_keeps_what_was_there(scene: Path) -> None:
     event = {"cause": "storm", "faults": ["dust_on_optics"], "onset_s": -1.0, "profile": "growing", "rise_s": 5.0}
     session = vbnfault.Session(config.load_scene(scene, {"event": [event]}))
@@ -479,4 +529,8 @@ def test_events_need_sequences(scene: Path) -> None:
     with pytest.raises(
         InputError, match=r"event: 'dust event' happens at a time of a sequence, and the scene has none"
     ):
-        vbnfault.Session(config.load_scene(scene))
+        vbnfault.Session(config.load_scene(scene)).simulate(0)
+    with pytest.raises(InputError, match="and the scene has none"):
+        vbnfault.build(scene, scene.parent / "s.zarr", progress=False)
+    with pytest.raises(InputError, match="event: images of one's own have no times; leave the events out"):
+        vbnfault.Injector(config.load_scene(scene))

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
+from numpy.typing import NDArray
+
 from .. import store as stores
 from ..core.errors import InputError
-from ..store import Url
+from ..store import Store, Url, event_of
 from .statistics import finished_scalars
 
 _READ = ("sequence", "frame", "parameters")
@@ -77,17 +78,17 @@ def events(path: str | os.PathLike[str] | Url) -> list[FaultEvent]:
     if not store.spec.sequence_names:
         raise InputError(f"{store.path}: has no sequences, so nothing happens in time")
     seen: dict[tuple[int, int, str, float], dict[str, Any]] = {}
-    for _, columns in finished_scalars(store, _READ):
-        rows = zip(*(columns[name].tolist() for name in _READ), strict=True)
-        for sequence, frame, k, fault, event in _in_frames(rows, store.spec.faults):
-            onset_s = event.get("onset_s")
-            key = sequence, k, event.get("cause", ""), float("-inf") if onset_s is None else onset_s
+    for samples, columns in finished_scalars(store, _READ):
+        for sequence, frame, k, fault, event in _in_frames(store, samples, columns):
+            onset_s, cause = event.get("onset_s"), str(event.get("cause", ""))
+            onset_s = float(onset_s) if isinstance(onset_s, int | float) else None
+            key = sequence, k, cause, float("-inf") if onset_s is None else onset_s
             known = seen.setdefault(
                 key,
                 {
-                    "sequence": store.spec.sequence_names[sequence],
+                    "sequence": _name(store, sequence),
                     "fault": fault,
-                    "cause": event.get("cause", ""),
+                    "cause": cause,
                     "onset_s": onset_s,
                     "end_s": event.get("end_s"),
                     "first_frame": frame,
@@ -106,15 +107,22 @@ def events(path: str | os.PathLike[str] | Url) -> list[FaultEvent]:
     return [FaultEvent(**seen[key]) for key in order]
 
 
+def _name(store: Store, sequence: int) -> str:
+    """Return the name of a sequence, or its number where a store of another program has no name of it."""
+    names = store.spec.sequence_names
+    return names[sequence] if 0 <= sequence < len(names) else str(sequence)
+
+
 def _in_frames(
-    rows: Iterable[tuple[int, int, str]], faults: Sequence[str]
-) -> Iterator[tuple[int, int, int, str, dict[str, Any]]]:
+    store: Store, samples: Sequence[int], columns: Mapping[str, NDArray[Any]]
+) -> Iterator[tuple[int, int, int, str, Mapping[str, Any]]]:
     """Yield sequence, frame, number and name of every fault of every frame, and what is stored of its event."""
-    for sequence, frame, text in rows:
-        parameters = json.loads(text)
-        for k, fault in enumerate(faults):
+    rows = zip(samples, *(columns[name].tolist() for name in _READ), strict=True)
+    for i, sequence, frame, text in rows:
+        parameters = store.table(i, "parameters", text)
+        for k, fault in enumerate(store.spec.faults):
             if fault in parameters:
-                yield sequence, frame, k, fault, parameters[fault].get("event", {})
+                yield sequence, frame, k, fault, event_of(parameters, fault)
 
 
 def as_csv(listed: Iterable[FaultEvent]) -> str:

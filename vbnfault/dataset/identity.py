@@ -64,8 +64,11 @@ _LEFT_OUT_AT_DEFAULT = (
     "camera.exposure_max_towards_sun_s",
     "camera.exposure_stops",
     "dataset.variants_per_view",
+    "event",
     "dataset.radiance_dtype",
     "image",
+    "image.frames",
+    "trajectory.frames",
     "patch.airfall",
     "patch.fractured",
     "patch.contour_scarps",
@@ -245,6 +248,7 @@ def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
         The scene asks for a layer that its world does not provide, or worker processes cannot load a fault.
     """
     scene = session.scene
+    plan.check_events(scene)
     dataset, camera = scene.dataset, session.base_camera  # base_camera first: it reports an unusable lens
     layers = tuple(name for name in stored_layers(scene, session.faults) if name != "clean")
     individuals = scene.camera.individuals

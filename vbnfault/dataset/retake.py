@@ -47,6 +47,7 @@ _FREE: dict[str, frozenset[str] | None] = {
     "title": None,
     "description": None,
     "faults": None,
+    "event": None,
     "plugins": None,
     "plan": frozenset({"mode", "faulty_fraction", "classes_per_sample", "on_invisible", "max_views"}),
     "dataset": frozenset(

@@ -7,12 +7,13 @@ in which the class is told present.
 
 from __future__ import annotations
 
-import json
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..store import event_of
 from .scores import Bootstrap, Estimate, ratio
 
 F64 = NDArray[np.float64]
@@ -50,15 +51,15 @@ class Frames(NamedTuple):
         time_s: F64,
         injected: Flags,
         said: Flags,
-        parameters: list[str],
+        drawn: Sequence[Mapping[str, Any]],
         classes: tuple[str, ...],
     ) -> Frames:
-        """Return frames in any order, with their drawn parameters as texts of JSON, in their order."""
-        drawn = [json.loads(text) for text in parameters]
+        """Return frames that are given in any order, with their drawn parameters, in their order."""
         onset_s = np.full(injected.shape, -np.inf)
         for i, faults in enumerate(drawn):
             for c, name in enumerate(classes):
-                onset_s[i, c] = faults.get(name, {}).get("event", {}).get("onset_s", -np.inf)
+                onset = event_of(faults, name).get("onset_s")
+                onset_s[i, c] = onset if isinstance(onset, int | float) else -np.inf
         order = np.lexsort((time_s, sequence))
         return cls(sequence[order], time_s[order], injected[order], said[order], onset_s[order])
 
@@ -131,7 +132,6 @@ def _hours(frames: Frames) -> F64:
 
 def _figures(counts: _Counts, hours: F64, bootstrap: Bootstrap) -> dict[str, Any]:
     """Return figures of counts for JSON."""
-    classes = counts.events.shape[1]
 
     def fraction(above: Any, below: Any) -> Estimate:
         return bootstrap.fraction(above.sum(axis=1), below.sum(axis=1) if below.ndim == 2 else below)
@@ -145,6 +145,6 @@ def _figures(counts: _Counts, hours: F64, bootstrap: Bootstrap) -> dict[str, Any
         "missed_fraction": fraction(counts.missed, counts.events).plain(),
         "delay_s_median": bootstrap.median(of_frame).plain(),
         "delay_s_largest": float(known.max()) if len(known) else None,
-        "false_alarms_per_hour": fraction(counts.alarms, hours * classes).plain(),
+        "false_alarms_per_hour": fraction(counts.alarms, hours).plain(),
         "flicker": fraction(counts.flips, counts.pairs).plain(),
     }

@@ -177,6 +177,8 @@ class Injector:
         share_arenas()  # an image passes through many arrays of its size: a tenth of the time
         self.scene, self.source, self.effects = scene, source, effects
         self.faults = configure_faults(scene, source)
+        if scene.event:
+            raise InputError(f"{source}: event: images of one's own have no times; leave the events out")
         table = scene.image or ImageTable()
         if table.black_dn is not None and table.white_dn is not None:
             check_levels(table.black_dn, table.white_dn)

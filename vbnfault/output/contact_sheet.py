@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ..core.errors import InputError
 from ..core.files.images import write_png
 from ..core.files.whole_files import writing
+from ..dataset.statistics import finished_scalars
 from ..store import STRATA, Store, open_store
 
 U8 = NDArray[np.uint8]
@@ -85,7 +86,7 @@ def preview(
         raise InputError(f"{store.path}: {store.why_none_is_finished()}, so there is nothing to show")
     short = abbreviations(store.spec.faults)
     if store.spec.sequence_names:
-        strips = _strips(store, done, max_samples)
+        strips = _strips(store, max_samples)
         columns = max(map(len, strips))
     else:
         strips = [[done[k] for k in spread(len(done), max_samples)]]
@@ -99,12 +100,12 @@ def preview(
     return count
 
 
-def _strips(store: Store, done: Sequence[int], most: int) -> list[list[int]]:
+def _strips(store: Store, most: int) -> list[list[int]]:
     """Return frames of some sequences, evenly spaced in each; about three times as many frames as sequences."""
     of: dict[int, list[int]] = {}
-    for i in done:
-        number = i // store.spec.shard_samples
-        of.setdefault(int(store.column("sequence", number)[i - store.shard(number).start]), []).append(i)
+    for samples, columns in finished_scalars(store, ("sequence",)):
+        for i, sequence in zip(samples, columns["sequence"].tolist(), strict=True):
+            of.setdefault(sequence, []).append(i)
     shown = [list(of.values())[k] for k in spread(len(of), max(1, round(np.sqrt(most / 3))))]
     return [[frames[k] for k in spread(len(frames), most // len(shown))] for frames in shown]
 

@@ -328,6 +328,7 @@ class Session:
 
     def _spec(self, index: int) -> SampleSpec:
         """Return what `spec` does; the messages of its errors do not name the scene."""
+        plan.check_events(self.scene)
         site, aims = int(self.plan.site[index]), self.scene.is_aimed
         if self.trajectory is not None:
             terrain = self.terrain(self.ground_detail(index))
@@ -434,7 +435,7 @@ class Session:
             raise InputError(
                 f"faults = {shown(faults)}: must map names of classes to True, False or values of keys"
             )
-        key = json.dumps([faults, exposure], sort_keys=True, default=repr)
+        key = json.dumps([faults, exposure, bool(row.frames)], sort_keys=True, default=repr)
         if key not in self._taken:
             scene = self.scene
             if faults is not None or exposure is not None:

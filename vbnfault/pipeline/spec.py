@@ -19,7 +19,7 @@ from ..lens import Lens
 from ..render.description import RenderInput
 from ..scene import keyed_random, plan
 from ..scene.config import Scene
-from ..scene.events import Event, events_of_sequence, strongest
+from ..scene.events import Event, events_of_sequence, striking, strongest
 from ..scene.sampling import DEFAULT_TWINS
 from ..scene.trajectory import FlownPose
 from ..world import cameras
@@ -135,8 +135,11 @@ class SampleSpec:
 
     @cached_property
     def events(self) -> tuple[Event, ...]:
-        """Return the events of the sample's sequence; () if it is no frame of one."""
-        return events_of_sequence(self.scene, int(self.plan.state[self.index])) if self.shares_state else ()
+        """Return the events that strike the sample's sequence; () if it is no frame of one."""
+        if not self.shares_state:
+            return ()
+        drawn = events_of_sequence(self.scene, int(self.plan.state[self.index]))
+        return striking(drawn, self.plan.commanded(self.index))
 
     def event_of(self, fault: str) -> Event | None:
         """Return the event that brings a fault now; None if the fault needs none."""

@@ -104,8 +104,9 @@ class Scene(Table):
     @property
     def frames(self) -> tuple[int, ...]:
         """Return the number of samples of each sequence; () if the samples are not frames of such."""
-        given = self.trajectory or self.image
-        return () if given is None else given.frames
+        if self.image is not None and self.image.frames:  # images of one's own have no poses of a table
+            return self.image.frames
+        return () if self.trajectory is None else self.trajectory.frames
 
     @property
     def is_flown(self) -> bool:

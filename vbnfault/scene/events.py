@@ -6,7 +6,7 @@ are drawn once for a sequence. Faults of no event are there from the first frame
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -108,6 +108,11 @@ def events_of_sequence(scene: Scene, state: int) -> tuple[Event, ...]:
     return tuple(out)
 
 
+def striking(events: Sequence[Event], commanded: Collection[str]) -> tuple[Event, ...]:
+    """Return the events that strike a sequence which is commanded to carry some faults: their first one is there."""
+    return tuple(event for event in events if event.faults[0] in commanded)
+
+
 def strongest(events: Sequence[Event], fault: str, time_s: float) -> Event | None:
     """Return the event that brings most of a fault at a time; None if none brings it, or none is of it."""
     mine = [event for event in events if fault in event.faults]
@@ -118,7 +123,8 @@ def commanded_now(
     scene: Scene, faults: Sequence[str], injected: Sequence[bool], state: int, time_s: float
 ) -> list[bool]:
     """Return which of the commanded faults of a frame of the sequence `state` are there at a time."""
-    events = events_of_sequence(scene, state)
+    commanded = [fault for fault, has in zip(faults, injected, strict=True) if has]
+    events = striking(events_of_sequence(scene, state), commanded)
     now = [strongest(events, fault, time_s) for fault in faults]
     return [
         bool(has) and (event is None or event.fraction(time_s) > 0)

@@ -183,7 +183,7 @@ def make_plan(
         group = np.unique(np.column_stack([block, shard, stratum]), axis=0, return_inverse=True)[1].ravel()
         draw = exchange.by_azimuth(scene.dataset.seed, draw, block, stratum, site)
         light = draw[light]
-    aim = np.concatenate([p[2] for p in parts]) if scene.is_aimed else None
+    aim = np.concatenate([p[2] for p in parts])[unit] if scene.is_aimed else None
     if aim is not None:
         variables = aims.draw(scene, draw, aim, 0)
     else:
@@ -242,11 +242,6 @@ def _sequences(scene: Scene, samples: NDArray[np.int64]) -> tuple[NDArray[np.int
     """
     frames = scene.frames
     if not frames:
-        if scene.event:
-            raise InputError(
-                f"event: {shown(scene.event[0].cause)} happens at a time of a sequence, and the scene has none; "
-                "trajectory.file must name a table of poses with sequences"
-            )
         return None, samples
     if scene.dataset.variants_per_view > 1:
         raise InputError(
@@ -263,11 +258,27 @@ def _sequences(scene: Scene, samples: NDArray[np.int64]) -> tuple[NDArray[np.int
     return sequence.astype(np.int32), starts[sequence]
 
 
+def check_events(scene: Scene) -> None:
+    """Raise InputError if a scene has events, but no sequence in whose time they could happen."""
+    if scene.event and not scene.frames:
+        raise InputError(
+            f"event: {shown(scene.event[0].cause)} happens at a time of a sequence, and the scene has none; "
+            "trajectory.file must name a table of poses with sequences"
+        )
+
+
 def _with_common_causes(scene: Scene, faults: Sequence[str], injected: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return the fault matrix, bool[sequence, fault], where the first class of each event brings its others."""
+    """Return the fault matrix, bool[sequence, fault], where the first class of each event brings its others.
+
+    A class of no plan's own choice is there only if an event brings it, which others may bring in turn.
+    """
+    order, firsts = list(faults), first_classes(scene.event)
+    free = [k for k, name in enumerate(order) if name in firsts and name not in firsts[name]]
     out = injected.copy()
-    for name, causes in first_classes(scene.event).items():
-        out[:, list(faults).index(name)] = injected[:, [list(faults).index(cause) for cause in causes]].any(axis=1)
+    out[:, free] = False
+    for _ in order:
+        for name, causes in firsts.items():
+            out[:, order.index(name)] |= out[:, [order.index(cause) for cause in causes]].any(axis=1)
     return out
 
 

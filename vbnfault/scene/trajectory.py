@@ -426,7 +426,8 @@ def _sequences(
     given = [name for name in SEQUENCE_COLUMNS if name in columns]
     if not given:
         return {"time_s": np.full(len(names), np.nan)}
-    column = [str(value) for value in columns.get("sequence", ["0"] * len(names))]
+    given_names = columns.get("sequence", ["0"] * len(names))
+    column = ["" if value is None or value != value else str(value) for value in given_names]
     for row, name in enumerate(column, 1):
         if not 1 <= len(name) <= _LONGEST_NAME or not name.isprintable():
             raise InputError(

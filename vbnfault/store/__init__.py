@@ -39,7 +39,7 @@ from .check import (
 )
 from .codec import Encoded, SharedChunks, encode, mask_union
 from .group import check_free, create, is_store, open_dataset, open_store, write_samples
-from .layout import drawn_table, is_sealed, sealed
+from .layout import drawn_table, event_of, is_sealed, sealed
 from .metadata import append_samples, recover
 from .opened import Store
 from .schema import FORMAT_VERSION, SPLITS, STRATA, VOLATILE_ATTRIBUTES, StoreSpec

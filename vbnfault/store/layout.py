@@ -155,6 +155,13 @@ def drawn_table(text: object) -> dict[str, Any]:
     return table
 
 
+def event_of(drawn: Mapping[str, Any], fault: str) -> Mapping[str, Any]:
+    """Return what the parameters of a sample say of the event that brings a fault; {} for nothing."""
+    parameters = drawn.get(fault)
+    event = parameters.get("event") if isinstance(parameters, Mapping) else None
+    return event if isinstance(event, Mapping) else {}
+
+
 def coordinate_chunks(member: Member) -> Iterator[tuple[str, NDArray[Any]]]:
     """Yield the file name, relative to the array's folder, and the values of each chunk of a coordinate."""
     if member.values is None or not len(member.values):

@@ -59,7 +59,10 @@ class WindowDataset(Dataset[Batch]):
         whole = (sequence[first] == sequence[last]) & (frame[last] - frame[first] == frames - 1)
         starts = first[whole & (frame[first] % step == 0)]
         if not len(starts):
-            raise InputError(f"{store.path}: frames = {frames}: no sequence has as many frames side by side")
+            raise InputError(
+                f"{store.path}: frames = {frames}, step = {step}: no sequence has as many frames side by side, "
+                "from one whose number is a multiple of step"
+            )
         self.data, self.transform = data, transform
         self.positions = order[starts[:, None] + np.arange(frames)]
 
