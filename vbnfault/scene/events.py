@@ -109,7 +109,7 @@ def events_of_sequence(scene: Scene, state: int) -> tuple[Event, ...]:
 
 
 def striking(events: Sequence[Event], commanded: Collection[str]) -> tuple[Event, ...]:
-    """Return the events that strike a sequence which is commanded to carry some faults: their first one is there."""
+    """Return the events that strike a sequence with these commanded faults: their first one is among them."""
     return tuple(event for event in events if event.faults[0] in commanded)
 
 
