@@ -80,8 +80,8 @@ def events(path: str | os.PathLike[str] | Url) -> list[FaultEvent]:
     seen: dict[tuple[int, int, str, float], dict[str, Any]] = {}
     for samples, columns in finished_scalars(store, _READ):
         for sequence, frame, k, fault, event in _in_frames(store, samples, columns):
-            onset_s, cause = event.get("onset_s"), str(event.get("cause", ""))
-            onset_s = float(onset_s) if isinstance(onset_s, int | float) else None
+            onset_s, cause = _number(event, "onset_s"), str(event.get("cause", ""))
+            fraction = _number(event, "fraction")
             key = sequence, k, cause, float("-inf") if onset_s is None else onset_s
             known = seen.setdefault(
                 key,
@@ -90,7 +90,7 @@ def events(path: str | os.PathLike[str] | Url) -> list[FaultEvent]:
                     "fault": fault,
                     "cause": cause,
                     "onset_s": onset_s,
-                    "end_s": event.get("end_s"),
+                    "end_s": _number(event, "end_s"),
                     "first_frame": frame,
                     "last_frame": frame,
                     "frames": 0,
@@ -102,9 +102,15 @@ def events(path: str | os.PathLike[str] | Url) -> list[FaultEvent]:
                 min(known["first_frame"], frame),
                 max(known["last_frame"], frame),
             )
-            known["largest_fraction"] = max(known["largest_fraction"], event.get("fraction", 1.0))
+            known["largest_fraction"] = max(known["largest_fraction"], 1.0 if fraction is None else fraction)
     order = sorted(seen, key=lambda key: (key[0], key[1], key[3], key[2]))
     return [FaultEvent(**seen[key]) for key in order]
+
+
+def _number(event: Mapping[str, Any], name: str) -> float | None:
+    """Return a number that is stored of an event; None where there is none."""
+    value = event.get(name)
+    return float(value) if isinstance(value, int | float) else None
 
 
 def _name(store: Store, sequence: int) -> str:

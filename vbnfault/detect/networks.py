@@ -67,7 +67,7 @@ class Outputs(NamedTuple):
 
 
 class _Heads(nn.Module):
-    """Say what is in the whole image, from the coarsest features and from the masks, and lower those of none.
+    """Say which classes are in the whole image, and how severe they are, and lower the masks of the others.
 
     A class that the image seems not to have, whose presence p is below one half, has its mask lowered by the logit
     of p: a pixel is marked if it and its image look like the fault. Masks and presence are each taught by their own

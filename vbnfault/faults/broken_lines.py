@@ -100,7 +100,7 @@ class TextureBrokenLines(Fault):
         }
 
     def grown(self, params: Params, fraction: float) -> Params:
-        """Return the parameters with the first of the rows and columns."""
+        """Return the parameters with only the first `fraction` of the rows and of the columns."""
         return first_of(params, fraction, "rows", "row_values", "columns", "column_values")
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:

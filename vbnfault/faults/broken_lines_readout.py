@@ -138,7 +138,7 @@ class ReadoutBrokenLines(Fault):
         return {"lines": lines, "register": register, "node": node}
 
     def grown(self, params: Params, fraction: float) -> Params:
-        """Return the parameters with the first of the lines."""
+        """Return the parameters with only the first `fraction` of the lines."""
         return first_of(params, fraction, "lines")
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:

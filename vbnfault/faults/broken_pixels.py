@@ -123,7 +123,7 @@ class TextureBrokenPixels(Fault):
         return params
 
     def grown(self, params: Params, fraction: float) -> Params:
-        """Return the parameters with the first of the defects."""
+        """Return the parameters with only the first `fraction` of the defects."""
         return first_of(params, fraction, "x", "y", "brightness_dn", "line_offset_dn")
 
     def _positions(

@@ -119,7 +119,7 @@ class GaussianDust(Fault):
         return params
 
     def grown(self, params: Params, fraction: float) -> Params:
-        """Return the parameters with the first of the grains."""
+        """Return the parameters with only the first `fraction` of the grains."""
         return first_of(params, fraction, "x_px", "y_px", "peak_dn", "sigma_xx", "sigma_yy", "sigma_xy")
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:

@@ -152,7 +152,7 @@ class DefocusedDust(LensFault):
         return params
 
     def grown(self, params: Params, fraction: float) -> Params:
-        """Return the parameters with the first of the grains."""
+        """Return the parameters with only the first `fraction` of the grains."""
         return first_of(params, fraction, "on_window", "x_mm", "y_mm", "diameter_um", "transmission")
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:

@@ -143,7 +143,7 @@ class _Drawing:
         return self.state is not None
 
     def fraction(self, fault: str) -> float:
-        """Return that all of a fault is there."""
+        """Return 1: all of a fault is active, since images of one's own have no times."""
         return 1.0
 
     def rng(self, stage: str, name: str) -> np.random.Generator:

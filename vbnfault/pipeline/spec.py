@@ -89,7 +89,7 @@ class Drawing(Protocol):
         """Return the random generator of the sample for (stage, name)."""
 
     def fraction(self, fault: str) -> float:
-        """Return how much of a fault is there, from 0 to 1, which is all of it."""
+        """Return which fraction of a fault is active: 0 is none of it, 1 all of it."""
 
 
 def is_state(drawing: Drawing, fault: str) -> bool:
@@ -135,7 +135,7 @@ class SampleSpec:
 
     @cached_property
     def events(self) -> tuple[Event, ...]:
-        """Return the events that strike the sample's sequence; () if it is no frame of one."""
+        """Return the events that strike the sample's sequence; () for a sample of no sequence."""
         if not self.shares_state:
             return ()
         drawn = events_of_sequence(self.scene, int(self.plan.state[self.index]))
@@ -146,7 +146,7 @@ class SampleSpec:
         return strongest(self.events, fault, self.flown.time_s) if self.flown is not None else None
 
     def fraction(self, fault: str) -> float:
-        """Return how much of a fault is there now, from 0 to 1, which is all of it."""
+        """Return which fraction of a fault is active in this sample: 0 is none of it, 1 all of it."""
         event = self.event_of(fault)
         return 1.0 if event is None or self.flown is None else event.fraction(self.flown.time_s)
 

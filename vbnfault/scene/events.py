@@ -122,7 +122,7 @@ def strongest(events: Sequence[Event], fault: str, time_s: float) -> Event | Non
 def commanded_now(
     scene: Scene, faults: Sequence[str], injected: Sequence[bool], state: int, time_s: float
 ) -> list[bool]:
-    """Return which of the commanded faults of a frame of the sequence `state` are there at a time."""
+    """Return which commanded faults a frame carries at a time; `state` is the first sample of its sequence."""
     commanded = [fault for fault, has in zip(faults, injected, strict=True) if has]
     events = striking(events_of_sequence(scene, state), commanded)
     now = [strongest(events, fault, time_s) for fault in faults]

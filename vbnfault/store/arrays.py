@@ -430,7 +430,7 @@ SCALARS: dict[str, Array] = {
         most_bytes=1 << 18,
     ),
 }
-# Scalars of stores whose samples are frames of sequences.
+# Stores whose samples are frames of sequences have these scalars, too.
 OF_SEQUENCES: dict[str, Array] = {
     "sequence": Array(
         "index of the sequence",

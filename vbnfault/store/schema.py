@@ -251,7 +251,7 @@ class StoreSpec:
 
     @cached_property
     def scalars(self) -> dict[str, Array]:
-        """Return the schema row of every value of a sample that is no layer."""
+        """Return the schema row by name of every scalar: the values of a sample that are no layers."""
         return {**SCALARS, **(OF_SEQUENCES if self.sequence_names else {})}
 
     @cached_property
