@@ -87,7 +87,9 @@ def main() -> None:
         axes[r, 0].set_ylabel(title)
     figure.tight_layout(pad=0.3)
     figure.savefig(given.out, dpi=90)
-    Image.open(given.out).convert("RGB").quantize(256).save(given.out, optimize=True)  # a third of the bytes
+    picture = Image.open(given.out).convert("RGB")
+    palette = picture.quantize(256)  # a third of the bytes
+    picture.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG).save(given.out, optimize=True)
 
 
 if __name__ == "__main__":
