@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 import vbnfault
 from vbnfault import dataset, pipeline
 from vbnfault.body import PatchSpec
+from vbnfault.body.refine import EdgeLimit
 from vbnfault.core.errors import InputError
 from vbnfault.dataset import describe
 from vbnfault.scene import config, trajectory
@@ -338,6 +339,32 @@ def test_terrain_is_whole_from_afar_and_shared_and_a_patch_near_the_ground(tmp_p
         pytest.approx(2 * twice.facet_m),
         pytest.approx(2 * middle.facet_m),
     )
+
+
+def test_the_frames_of_a_sequence_share_a_terrain_as_fine_as_each_needs(tmp_path: Path, sphere: str) -> None:
+    """Below each camera of a descent, facets are as wide as for its pose alone: a pixel, or `patch.facet_m`.
+
+    Distances are rounded down to powers of sqrt 2 before a pixel is measured, which makes facets finer by as much.
+    """
+    keys = {"patch.facet_m": 0.2, "patch.max_triangles": 1_000_000, "camera.width_px": 1024}
+    scene = config.load_scene(scene_file(tmp_path, sphere), keys)
+    heights_m = np.geomspace(20e3, 3, 60)
+    table = columns_of([row(f"{k}", (0, 0, 500 + h)) for k, h in enumerate(heights_m)])
+    session = vbnfault.Session(scene, poses={**table, "time_s": np.arange(60.0).tolist()})
+    details = [session.ground_detail(k) for k in range(60)]
+    assert len(set(details)) == 1
+    shared = details[0]
+    limit = EdgeLimit(shared.facet_m, shared.radius_m)
+    below_m = np.linalg.norm(np.array([0, 0, 500]) - np.array(shared.position_T_m))
+    facet_m = limit.facet_at(np.array([[below_m, 0.0, 0.0]]))[0]
+    wanted_m = np.maximum(0.2, heights_m * ground.pixel_rad(scene))
+    assert facet_m <= wanted_m.min() * 1.001
+    # from afar all of the body is seen; at its rim, 700 m from the origin, no facet is wider than a pixel
+    rim_m = limit.facet_at(np.array([[700.0, 0.0, 0.0]]))[0]
+    assert rim_m <= 20e3 * ground.pixel_rad(scene)
+    far_alone = session.ground_detail(0), ground.ground_of_sequence(scene, session.body, [session.trajectory.pose(0)])
+    assert far_alone[1].facet_m > 10 * far_alone[0].facet_m
+
 
 
 # ------------------------------------------------------------------------------------------------ stores

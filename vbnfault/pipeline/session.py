@@ -24,10 +24,18 @@ from ..core.quantities import Sample
 from ..scene import config, plan
 from ..scene.config import Scene, configure_faults
 from ..scene.keyed_random import keyed_uniform
-from ..scene.trajectory import FlownPose, Trajectory, as_trajectory, load_trajectory, one_pose, with_rows
+from ..scene.trajectory import (
+    FlownPose,
+    Trajectory,
+    as_trajectory,
+    load_trajectory,
+    one_pose,
+    place_in_sequence,
+    with_rows,
+)
 from ..world import assemble, cameras, ephemeris
 from ..world.coma import check_coma
-from ..world.ground import GroundDetail, ground_details, sites_for_suns
+from ..world.ground import GroundDetail, ground_details, ground_of_sequence, sites_for_suns
 from ..world.spacecraft import SpacecraftMesh
 from .record import to_sample
 from .spec import Frame, SampleSpec, Terrain
@@ -134,7 +142,7 @@ class Session:
             raise InputError(f"threads = {shown(threads)}: must be a whole number from 1 to {MOST_THREADS}")
         self.source = source
         self._threads = threads
-        self._ground: dict[int, list[GroundDetail]] = {}  # of the rows of a site
+        self._ground: dict[int, list[GroundDetail]] = {}  # of the rows of a sequence or of a shard
         self._terrain: Terrain | None = None
         self._terrain_key: int | GroundDetail | None = None
         self._model: Terrain | None = None
@@ -205,11 +213,16 @@ class Session:
         trajectory = self.trajectory
         assert trajectory is not None
         number, row = divmod(index, self.scene.dataset.shard_samples)
+        rows = self.scene.dataset.shard_samples
+        if trajectory.frames:
+            number, row = place_in_sequence(trajectory.frames, index)
+            rows = trajectory.frames[number]
         if number not in self._ground:
-            first = index - row
-            last = min(first + self.scene.dataset.shard_samples, len(trajectory))
-            poses = [trajectory.pose(k) for k in range(first, last)]
-            self._ground[number] = ground_details(self.scene, self.body, poses)
+            poses = [trajectory.pose(k) for k in range(index - row, min(index - row + rows, len(trajectory)))]
+            if trajectory.frames:
+                self._ground[number] = [ground_of_sequence(self.scene, self.body, poses)] * rows
+            else:
+                self._ground[number] = ground_details(self.scene, self.body, poses)
         return self._ground[number][row]
 
     def aimed_terrain(self, pose: FlownPose) -> Terrain:

@@ -34,6 +34,8 @@ _TRIANGLE = 3**0.5 / 4
 # Fraction of the triangles for the even ground. The ground takes 0.66 of them (`body.patch`). Where one terrain
 # serves several poses, half of this is left to the ground around.
 _EVEN_FRACTION, _SHARED_FRACTION = 0.66, 0.33
+# Frames of a sequence, and points of the ground in each, that its terrain is chosen for.
+_FRAMES, _POINTS = 48, 3000
 # A pose also shares a terrain if it needs at most this many times the triangles that it needs alone.
 _MORE = 1.3
 # Rays across the frame, on each side, that look for ground between the vertices of a coarse shape model.
@@ -74,6 +76,12 @@ class _Seen:
     points_T_m: F64
     distance_m: F64
 
+    def thinned(self) -> _Seen:
+        """Return at most `_POINTS` of the points, the nearest among them."""
+        nearest, step = int(np.argmin(self.distance_m)), -(-len(self.distance_m) // _POINTS)
+        kept = slice(nearest % step, None, step)
+        return _Seen(points_T_m=self.points_T_m[kept], distance_m=self.distance_m[kept])
+
 
 def ground_details(scene: Scene, body: Body, poses: Sequence[FlownPose]) -> list[GroundDetail]:
     """Return the terrain of each of several consecutive poses.
@@ -111,6 +119,21 @@ def ground_details(scene: Scene, body: Body, poses: Sequence[FlownPose]) -> list
     return [detail for detail in details if detail is not None]
 
 
+def ground_of_sequence(scene: Scene, body: Body, poses: Sequence[FlownPose]) -> GroundDetail:
+    """Return the terrain that all frames of a sequence share, so that no ground changes from frame to frame.
+
+    It is as fine as the nearest frame needs, where the frames look, as far as its triangles suffice.
+    """
+    nearest = min(poses, key=lambda pose: float(_distances_m(body, pose).min()))
+    whole = _whole_body(scene, body, nearest)
+    if whole is not None:
+        return whole
+    model = shape_model(body)
+    spread = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), _FRAMES)).astype(int))
+    chosen = [*(poses[k] for k in spread if poses[k] is not nearest), nearest]
+    return _affordable(scene, body, _around(scene, [_seen(scene, body, pose, model).thinned() for pose in chosen]))
+
+
 def shape_model(body: Body) -> TerrainMesh:
     """Return the shape model of a body for the renderer, in T."""
     from .. import render
@@ -132,13 +155,18 @@ def _rounded(length_m: float) -> float:
     return float(_STEP ** np.floor(np.log(max(length_m, 1e-3)) / np.log(_STEP) + 1e-9))
 
 
+def _distances_m(body: Body, pose: FlownPose) -> F64:
+    """Return the distances of the vertices from the camera, float64[vertex]."""
+    return np.asarray(np.linalg.norm(body.vertices_m - pose.camera_position_T_m, axis=1))
+
+
 def _whole_body(scene: Scene, body: Body, pose: FlownPose) -> GroundDetail | None:
     """Return the terrain that is even all over the body, or None if it would take too many triangles.
 
     Its origin is the vertex with the largest x in T, the same for all poses. From so far away that the body is less
     than `_FEWEST_PX` pixels wide, the terrain stays as it is at this distance, or as fine as it may be.
     """
-    nearest_m = float(np.linalg.norm(body.vertices_m - pose.camera_position_T_m, axis=1).min())
+    nearest_m = float(_distances_m(body, pose).min())
     pixel, budget = pixel_rad(scene), _EVEN_FRACTION * scene.patch.max_triangles * _TRIANGLE
     few_px_m = float(np.ptp(body.vertices_m, axis=0).max()) / (_FEWEST_PX * pixel)
     wanted_m, close_m = (
