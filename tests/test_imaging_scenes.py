@@ -100,7 +100,7 @@ def _check_stars_are_imaged_alone(scene: config.Scene, camera: Camera, dark: Rad
     """Above ground that fills the lower half, stars have the electrons that an image of all light together has."""
     sky_part = np.arange(view.height_px)[:, None] < view.height_px // 2 + np.zeros(view.width_px)
     ground = dark.with_array(np.where(sky_part, np.float32(0), np.float32(1e-7)) + np.zeros_like(dark.array))
-    stars = assemble.visible_stars(scene, ground, camera, np.eye(3), sky_part, view)
+    stars = assemble.visible_stars(scene, ground, camera, [np.eye(3)], sky_part, view)
     assert stars is not None
     starry = stars.added_to(ground)
     light = SceneLight(lens=camera.lens, rendered=ground)
@@ -134,7 +134,7 @@ def test_stars_go_through_the_lens(sigma_px: float) -> None:
         height_px=256 + 2 * gy,
     )
     dark = Radiance(array=np.zeros((3, view.height_px, view.width_px), np.float32), wavelength_nm=nodes)
-    bright = assemble.visible_stars(stars, dark, c, np.eye(3), np.ones(dark.array.shape[1:], dtype=bool), view)
+    bright = assemble.visible_stars(stars, dark, c, [np.eye(3)], np.ones(dark.array.shape[1:], dtype=bool), view)
     assert bright is not None
     seen = bright.added_to(dark)
     image = lens.image(seen)

@@ -362,9 +362,11 @@ def test_the_frames_of_a_sequence_share_a_terrain_as_fine_as_each_needs(tmp_path
     # from afar all of the body is seen; at its rim, 700 m from the origin, no facet is wider than a pixel
     rim_m = limit.facet_at(np.array([[700.0, 0.0, 0.0]]))[0]
     assert rim_m <= 20e3 * ground.pixel_rad(scene)
-    far_alone = session.ground_detail(0), ground.ground_of_sequence(scene, session.body, [session.trajectory.pose(0)])
+    far_alone = (
+        session.ground_detail(0),
+        ground.ground_of_sequence(scene, session.body, [session.trajectory.pose(0)]),
+    )
     assert far_alone[1].facet_m > 10 * far_alone[0].facet_m
-
 
 
 # ------------------------------------------------------------------------------------------------ stores

@@ -68,6 +68,7 @@ _LEFT_OUT_AT_DEFAULT = (
     "dataset.radiance_dtype",
     "image",
     "image.frames",
+    "motion",
     "trajectory.frames",
     "patch.airfall",
     "patch.fractured",

@@ -8,6 +8,7 @@ from functools import reduce
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from ..camera import Camera
 from ..core.quantities import BODY, Electrons, Radiance, Truth
@@ -19,11 +20,13 @@ from ..world.sky import StarRadiance
 from .spec import Pose, Rendering, SampleSpec, SceneExposure, SceneLight
 
 Direction = tuple[float, float, float]
+F64 = NDArray[np.float64]
 
 # The metered exposure stays within these factors of the exposure for a facet lit at 45 degrees. So a small area of
 # grazing light does not make the whole frame noisy. Dark ground at zero phase is up to nine times as bright as that
 # facet; where this asks for a shorter exposure than the lower factor allows, it is allowed.
 _METERING_RANGE = (0.25, 8.0)
+_STAR_STEPS_PER_PX, _MOST_STAR_STEPS = 2.0, 1024  # of a camera that turns
 _NEAR_FRAME_DEG = 10.0  # from a corner: nearer, the Sun's veil limits the exposure
 _AT_45_DEG = ((0.0, 0.5**0.5, 0.5**0.5), (0.5**0.5, 0.0, 0.5**0.5))  # towards the Sun and the camera: 60° of phase
 _AT_ZERO_PHASE = ((0.0, 0.0, 1.0), (0.0, 0.0, 1.0))
@@ -164,7 +167,8 @@ def add_stars(spec: SampleSpec, pose: Pose, rendering: Rendering, exposure: Scen
         T_from_J = ephemeris.target_attitude(spec.scene, T_from_L @ pose.sun_L)
         J_from_C = T_from_J.T @ T_from_L @ pose.L_from_C
         starless = exposure.light.rendered
-        stars = assemble.visible_stars(spec.scene, starless, camera, J_from_C, open_sky, rendering.scene.view)
+        turned = [J_from_C @ turn for turn in _sky_turns(spec, rendering.scene.view, camera.exposure_s)]
+        stars = assemble.visible_stars(spec.scene, starless, camera, turned, open_sky, rendering.scene.view)
         if stars is None:
             return exposure.light, exposure.rate
         light = SceneLight(lens=exposure.light.lens, rendered=stars.added_to(starless))
@@ -173,6 +177,21 @@ def add_stars(spec: SampleSpec, pose: Pose, rendering: Rendering, exposure: Scen
     # read noise and exposure decide which stars are faint enough to be left out
     light, rate = rendering.shared.once("stars", (camera.optics, camera.detector.read_noise_e_rms), starry)
     return replace(exposure, light=light, rate=rate)
+
+
+def _sky_turns(spec: SampleSpec, view: View, exposure_s: float) -> list[F64]:
+    """Return the camera's axes at times of an exposure, in those of its middle, float64[3, 3], against the stars.
+
+    The body turns about +z of T, and the camera over the body.
+    """
+    if view.motion is None or spec.flown is None:
+        return [np.eye(3)]
+    spin_T = np.array([0, 0, 2 * np.pi / spec.terrain.body.rotation_period_s])
+    rate_C = view.motion.rate_C_rad_s + spec.flown.T_from_C.T @ spin_T
+    px = float(np.linalg.norm(rate_C)) * exposure_s * max(*view.intrinsics[:2], *view.intrinsics[2:])
+    count = min(int(np.ceil(_STAR_STEPS_PER_PX * px)) + 1, _MOST_STAR_STEPS)
+    times_s = ((np.arange(count) + 0.5) / count - 0.5) * exposure_s
+    return list(Rotation.from_rotvec(times_s[:, None] * rate_C).as_matrix())
 
 
 def _rate_with(stars: StarRadiance, exposure: SceneExposure, starry: Radiance) -> Electrons:

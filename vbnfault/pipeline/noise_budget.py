@@ -54,11 +54,12 @@ _THREADS = 2
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SampledRadiance:
-    """Hold a rendered radiance with its number of samples and its noise, as in `Rendering`."""
+    """Hold a rendered radiance with its number of samples, its noise and its cells, as in `Rendering`."""
 
     radiance: Radiance
     samples_per_pixel: float
     noise_fraction_p99: float = float("nan")
+    cells: F32 | None = None
 
 
 def sample_to_noise(
@@ -131,6 +132,7 @@ def sample_to_noise(
         radiance=whole,  # its array is that which `refine` has changed
         samples_per_pixel=float(refined.used.mean()),
         noise_fraction_p99=float(np.percentile(np.where(shows, now, 0)[lit], 99)) if lit.any() else 0.0,
+        cells=None if scene.view.motion is None else refined.cells() / np.float32(exposure),
     )
 
 
@@ -163,6 +165,7 @@ class _Refined:
         self._sensor_e, self._sun = sensor_e, sampled.radiance.sun
         self._most = spec.scene.render.max_samples_per_pixel
         self._samples = samples = sampled.samples
+        self._of_cells = None if scene.view.motion is None else samples.astype(np.float32)
         self._white_e = float(scene.sun.irradiance_W_m2_nm @ signal) / np.pi
         self._array, self._indirect = array, indirect
         self.variance = (sampled.error * (exposure_s / sensor_e)) ** 2
@@ -178,6 +181,14 @@ class _Refined:
         self._single = square.reshape(height, width) * (self._white_e / sensor_e) ** 2
         # what the later samples of a pixel leave of it
         self._left = np.ones_like(self._single)
+
+    def cells(self) -> F32:
+        """Return the signal of each cell of the pixels in electrons, float32[y·n, x·n], of direct light."""
+        assert self._of_cells is not None
+        height, width = self.used.shape
+        side = round(self._of_cells.shape[1] ** 0.5)
+        of_pixels = (self._of_cells * np.float32(self._white_e)).reshape(height, width, side, side)
+        return np.ascontiguousarray(of_pixels.transpose(0, 2, 1, 3)).reshape(height * side, width * side)
 
     def _next(self, samples: int, use: int = 0) -> RenderInput:
         """Return the scene with a number of samples, and with random numbers that no earlier render had."""
@@ -244,6 +255,8 @@ class _Refined:
                 light, signal, error = render.direct_in_cells(self._surface, scene, self._signal, listed, samples)
                 for band, values in zip(total[:, span], light, strict=True):
                     band += np.bincount(owner, values, len(band))
+                if self._of_cells is not None:
+                    self._of_cells[listed.pixel, listed.cell] = signal / self._white_e
                 variance[span] += self._variance(owner, listed, samples, signal, error, len(variance[span]))
         return total / cells, variance / cells**2
 

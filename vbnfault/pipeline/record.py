@@ -161,8 +161,9 @@ def _of_event(spec: SampleSpec, fault: str) -> dict[str, Any]:
 
 
 def of_sequence(flown: FlownPose) -> dict[str, Any]:
-    """Return the place of a pose in its sequence."""
-    return {"sequence": flown.sequence, "frame": flown.frame, "time_s": flown.time_s}
+    """Return the place of a pose in its sequence, and how the camera moves there."""
+    names = ("sequence", "frame", "time_s", "velocity_T_m_s", "rate_C_rad_s")
+    return {name: getattr(flown, name) for name in names}
 
 
 def points_T_m(frame: Frame) -> F64:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +17,7 @@ from ..lens.straylight.scene import RenderGrid, surrounding_grids
 from ..render.description import RenderInput, View
 from ..world import assemble, ephemeris
 from .coma import add_coma
+from .motion import motion_of
 from .noise_budget import SampledRadiance, green_per_second, sample_to_noise
 from .spec import Pose, Rendering, SampleSpec, SceneLight
 
@@ -42,6 +44,7 @@ def describe(spec: SampleSpec, pose: Pose) -> RenderInput:
         aperture_radius_m=camera.lens.aperture_radius_m,
         focus_distance_m=camera.lens.focus_distance_m,
         projection=camera.lens.calibration,
+        motion=motion_of(spec),
     )
     return RenderInput(
         view=view,
@@ -75,12 +78,15 @@ def render_view(spec: SampleSpec, pose: Pose) -> Rendering:
         guide = render.truth(surface, scene.view, scene.sun) if needed else None
     body = body_of_few_pixels(spec, pose, scene)
     shown = scene if body is None else replace(scene, shows_ground=False)
-    if spec.scene.render.noise_fraction is None:
+    fraction = spec.scene.render.noise_fraction
+    if fraction is None and scene.view.motion is not None:
+        fraction = math.inf  # one round of samples, whose cells are kept
+    if fraction is None:
         image = render.radiance(surface, shown, guide, None if body is None else body.light)
         sampled = SampledRadiance(radiance=image, samples_per_pixel=float(scene.samples_per_pixel))
     else:
         extra = None if body is None else (body.light, body.error)
-        sampled = sample_to_noise(spec, shown, truth, guide, spec.scene.render.noise_fraction, extra)
+        sampled = sample_to_noise(spec, shown, truth, guide, fraction, extra)
     rendered = sampled.radiance
     if has_air and guide is not None and body is None:
         rendered = add_atmosphere(spec, scene, guide, rendered)
@@ -93,6 +99,7 @@ def render_view(spec: SampleSpec, pose: Pose) -> Rendering:
         open_sky=guide.semantic == SKY if stars and guide is not None else None,
         samples_per_pixel=sampled.samples_per_pixel,
         noise_fraction_p99=sampled.noise_fraction_p99,
+        cells=sampled.cells,
         surroundings=surroundings(spec, scene),
         far_sources=far_sources(spec, pose),
     )
@@ -260,6 +267,7 @@ def surroundings(spec: SampleSpec, scene: RenderInput) -> tuple[Radiance, ...]:
             width_px=width,
             height_px=height,
             aperture_radius_m=0.0,
+            motion=None,
         )
         out.append(
             render.radiance(

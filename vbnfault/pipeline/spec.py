@@ -214,6 +214,9 @@ class Rendering:
     noise_fraction_p99
         99th percentile over the lit pixels of the sampling noise as a fraction of the sensor's noise. NaN if
         `render.noise_fraction` is not set.
+    cells
+        float32[y·n, x·n]: signal of n × n cells of each pixel of the render, in electrons per s of direct light;
+        None unless the camera moves.
     surroundings
         Radiance around the render, for the faults that need it; empty if the scene has none.
     far_sources
@@ -228,6 +231,7 @@ class Rendering:
     open_sky: Mask | None
     samples_per_pixel: float
     noise_fraction_p99: float = float("nan")
+    cells: NDArray[np.float32] | None = None
     surroundings: tuple[Radiance, ...] = ()
     far_sources: tuple[FarSource, ...] = ()
     shared: SharedResults = field(default_factory=SharedResults)

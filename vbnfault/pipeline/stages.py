@@ -1,6 +1,6 @@
 """Run the stages that turn one planned sample into one labelled frame, in physical order.
 
-    resolve ▶ render_view ▶ meter ▶ add_stars ▶ inject_faults ▶ take_images ▶ label
+    resolve ▶ render_view ▶ meter ▶ move ▶ add_stars ▶ inject_faults ▶ take_images ▶ label
 
 Each stage is a function from frozen inputs to a frozen output. All twins share one expensive render, and so do the
 samples of a view (`dataset.variants_per_view`). If a commanded fault cannot be visible in a view, the stages up to
@@ -20,6 +20,7 @@ from .development import take_images
 from .exposure import add_stars, meter
 from .injection import asking_for_another_view, inject_faults
 from .labels import label
+from .motion import move
 from .rendering import render_view
 from .resolve import resolve
 from .spec import Frame, Injection, Pose, Rendering, SampleSpec, SceneExposure
@@ -165,8 +166,11 @@ def _expose(
 
     `redrawn` says whether another view may take the place of this one.
     """
-    exposure = run(add_stars, spec, pose, rendering, run(meter, spec, rendering))
-    starless = rendering.light.rendered if "scene_radiance" in spec.scene.dataset.layers else None
+    exposure = run(meter, spec, rendering)
+    if rendering.scene.view.motion is not None:
+        exposure = run(move, spec, rendering, exposure)
+    starless = exposure.light.rendered if "scene_radiance" in spec.scene.dataset.layers else None
+    exposure = run(add_stars, spec, pose, rendering, exposure)
     # a second copy of the light without stars takes 37 MB for 1024 pixels
     rendering = replace(rendering, light=exposure.light)
     injection = run(inject_faults, spec, pose, rendering, exposure, views, redrawn=redrawn)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,24 @@ from ..reflectance import BandReflectance
 F64 = NDArray[np.float64]
 
 _BORDER = 65  # positions along a side of the frame of a camera with distortion
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CameraMotion:
+    """Describe how a camera moves and turns over the ground while it takes an image.
+
+    Attributes
+    ----------
+    velocity_L_m_s, rate_C_rad_s
+        float64[3] in L, and float64[3] angular velocity in C.
+    line_s
+        float64[2]: by how much later a pixel is exposed than its left neighbour, and than the one above it. The
+        middle of the frame has the pose of the view at the middle of its exposure.
+    """
+
+    velocity_L_m_s: F64
+    rate_C_rad_s: F64
+    line_s: F64 = field(default_factory=lambda: np.zeros(2))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -35,6 +53,8 @@ class View:
         Distance from the camera at which its rays start. Before a far body, they keep the precision of float32.
     projection
         Calibration of a camera with distortion. None: the pinhole of the intrinsics.
+    motion
+        How the camera moves; None: it stands still.
     """
 
     position_L_m: F64
@@ -46,6 +66,7 @@ class View:
     focus_distance_m: float = float("inf")
     start_m: float = 0.0
     projection: Calibration | None = None
+    motion: CameraMotion | None = None
 
     @property
     def pixel_map(self) -> Pinhole | Calibration:

@@ -47,10 +47,10 @@ def truth(
     rays = optics.centre_rays() if directions is None else optics.rays_of(directions)
     hit = surface.seen_from(view).intersect(rays)
     hit.start_m = optics.start_m
-    boresight = optics.axes[2]
-    depth = dr.select(hit.valid, hit.range_m * dr.dot(rays.d, boresight), dr.inf)
+    axes = optics.axes_of(shape[1], shape[0])
+    depth = dr.select(hit.valid, hit.range_m * dr.dot(rays.d, axes[2]), dr.inf)
     normal = facing(hit.normal, -rays.d)
-    in_camera = [dr.select(hit.valid, dr.dot(normal, axis), 0) for axis in optics.axes]
+    in_camera = [dr.select(hit.valid, dr.dot(normal, axis), 0) for axis in axes]
     centre = SunDisc(sun).direction
     semantic = dr.select(hit.valid, mi.UInt32(BODY), mi.UInt32(SKY))
     if hit.material is not None:

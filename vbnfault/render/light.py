@@ -26,7 +26,7 @@ from .bsdf import Reflection, has_bands
 from .description import RenderInput, Sunlight, View, may_see_sun
 from .detail import Detail
 from .runtime import columns, dr, mi
-from .sampling import SUN_DIMENSION, Limb, Optics, Pixels, Strata, SunDisc, mu, polynomial
+from .sampling import SUN_DIMENSION, TIME_DIMENSION, Limb, Optics, Pixels, Strata, SunDisc, mu, polynomial
 from .surface import TerrainMesh
 
 # Number of values (samples × terms) kept at once. Larger images are divided into parts, so that memory is bounded
@@ -355,7 +355,12 @@ class Cells:
 
 
 def direct_in_cells(
-    surface: TerrainMesh, scene: RenderInput, weights: NDArray[np.float64], cells: Cells, samples: int
+    surface: TerrainMesh,
+    scene: RenderInput,
+    weights: NDArray[np.float64],
+    cells: Cells,
+    samples: int,
+    exposure_s: float = 0.0,
 ) -> tuple[F32, F32, F32]:
     """Return the mean radiance of sunlight reflected once in each cell, its signal, and an estimate of its error.
 
@@ -365,6 +370,8 @@ def direct_in_cells(
         float64[band]: weights of the bands in the signal.
     samples
         Number of samples of each cell, a power of two.
+    exposure_s
+        Time over which the samples are spread, while the camera moves; 0: at the middle of the exposure.
 
     Returns
     -------
@@ -385,7 +392,7 @@ def direct_in_cells(
     factors = per_term.astype(np.float64) @ weights
     done = 0
     for part in cells.parts(max(1, WAVEFRONT // (samples * len(per_term)))):
-        strata = CellStrata(part, samples, scene.key, limb)
+        strata = CellStrata(part, samples, scene.key, limb, exposure_s)
         terms = tracer.terms(strata)
         total = tracer.signal(terms, factors)
         terms = [*terms, total, total * strata.checkered()]
@@ -408,7 +415,9 @@ def direct_in_cells(
 class CellStrata(Strata):
     """Provide jittered strata of cells, each divided into `samples` of them."""
 
-    def __init__(self, cells: Cells, samples: int, key: int, limb: tuple[float, ...] | None) -> None:
+    def __init__(
+        self, cells: Cells, samples: int, key: int, limb: tuple[float, ...] | None, exposure_s: float = 0.0
+    ) -> None:
         bits = samples.bit_length() - 1
         # all numbers are opaque, so that one kernel serves any number of samples
         shift, last = dr.opaque(mi.UInt32, bits), dr.opaque(mi.UInt32, samples - 1)
@@ -426,6 +435,11 @@ class CellStrata(Strata):
         self._across = dr.opaque(mi.UInt32, across)
         self._scale = [dr.opaque(mi.Float, 2.0**-n) for n in (across, down)]
         self._last_across = dr.opaque(mi.UInt32, (1 << across) - 1)
+        self._last = last
+        # an odd number near the golden section makes times and places of the samples even together
+        self._step = dr.opaque(mi.UInt32, int(0.618 * samples) | 1)
+        self._exposure = dr.opaque(mi.Float, exposure_s / samples) if exposure_s else None
+        self._half = dr.opaque(mi.Float, exposure_s / 2)
 
     def square(self, dimension: int = 0) -> tuple[Any, Any]:
         """Return a uniform point of each stratum of its cell in the unit square, x and y in [0, 1]."""
@@ -436,6 +450,13 @@ class CellStrata(Strata):
         return (mi.Float(self._cell & (side - 1)) + x) / side, (
             mi.Float(self._cell >> (side.bit_length() - 1)) + y
         ) / side
+
+    def time_s(self) -> Any:
+        """Return the time of each sample after the middle of its pixel's exposure; None: at that time."""
+        if self._exposure is None:
+            return None
+        stratum = (self.index * self._step + self._number * 0x9E3779B1) & self._last
+        return (mi.Float(stratum) + self.jitter(TIME_DIMENSION)[0]) * self._exposure - self._half
 
     def jitter(self, dimension: int) -> tuple[Any, Any]:
         """Return two uniform numbers in [0, 1] per sample."""

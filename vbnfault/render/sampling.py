@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 
 from ..core.calibration import Calibration
 from ..core.sundisc import axes
-from .description import Sunlight, View
+from .description import CameraMotion, Sunlight, View
 from .runtime import dr, mi, packets
 
-# Dimension of a sample's random numbers for the Sun's disc. The lens uses dimension 1, bounces use the later ones.
-SUN_DIMENSION = 0
+# Dimensions of a sample's random numbers for the disc of the Sun and for time. The lens uses dimension 1, bounces
+# the next ones.
+SUN_DIMENSION, TIME_DIMENSION = 0, 1000
 
 _TO_UNIT = 2.0**-32
 
@@ -62,6 +63,10 @@ class Strata:
         u, v = mi.sample_tea_32(self._wavefront, self._key ^ (0x9E3779B9 * dimension & 0xFFFFFFFF), 4)
         # 2⁻³² · u may round to 1.0 in float32, which is harmless: it still lies in the closed stratum
         return mi.Float(u) * _TO_UNIT, mi.Float(v) * _TO_UNIT
+
+    def time_s(self) -> Any:
+        """Return the time of each sample after the middle of its pixel's exposure; None: at that time."""
+        return None
 
     def checkered(self) -> Any:
         """Return +1 and -1 as on a chessboard: two halves of the samples that each cover the pixel."""
@@ -186,6 +191,43 @@ def _ringed_sets(samples: int, dimension: int) -> tuple[NDArray[np.float64], NDA
     return np.take_along_axis(points, order[..., None], axis=1), np.take_along_axis(ring, order, axis=1)
 
 
+class _Motion:
+    """Hold the motion of a camera as opaque variables."""
+
+    def __init__(self, motion: CameraMotion, width: int, height: int) -> None:
+        self.velocity = opaque_vector(mi.Vector3f, motion.velocity_L_m_s)
+        self.rolls = bool(motion.line_s.any())
+        self._middle = width / 2, height / 2
+        self._line = opaque_vector(mi.Vector2f, motion.line_s)
+        speed = float(np.linalg.norm(motion.rate_C_rad_s))
+        self._speed = dr.opaque(mi.Float, speed)
+        self._axis = opaque_vector(mi.Vector3f, motion.rate_C_rad_s / max(speed, 1e-30))
+
+    def time_s(self, x: Any, y: Any, since_middle_s: Any = None) -> Any:
+        """Return the time at which a pixel position is exposed; the view has its pose at 0."""
+        if not self.rolls:
+            return since_middle_s
+        line_s = (x - self._middle[0]) * self._line.x + (y - self._middle[1]) * self._line.y
+        return line_s if since_middle_s is None else line_s + since_middle_s
+
+    def grid_time_s(self, width: int, height: int) -> Any:
+        """Return the time of each pixel of a grid of another size over the same frame, row by row."""
+        pixel = dr.arange(mi.UInt32, width * height)
+        x, y = mi.Float(pixel % width) + 0.5 - width / 2, mi.Float(pixel // width) + 0.5 - height / 2
+        return x * self._line.x + y * self._line.y
+
+    def turned(self, axes: list[Any], time_s: Any) -> list[Any]:
+        """Return the camera's axes in L at a time, by Rodrigues' formula for each in C."""
+        sine, cosine = dr.sincos(self._speed * time_s)
+        k = self._axis
+        columns = []
+        for unit in np.eye(3).tolist():
+            e = mi.Vector3f(*unit)
+            in_C = e * cosine + dr.cross(k, e) * sine + k * (dr.dot(k, e) * (1 - cosine))
+            columns.append(in_C.x * axes[0] + in_C.y * axes[1] + in_C.z * axes[2])
+        return columns
+
+
 class Optics:
     """Hold the numbers of a view as opaque variables, so that a new view needs no new kernel."""
 
@@ -198,18 +240,24 @@ class Optics:
         self.centre = opaque_vector(mi.Vector2f, np.array([cx, cy]))
         self._table = None if view.projection is None else _directions(view.projection)
         self.start_m = dr.opaque(mi.Float, view.start_m) if view.start_m else 0.0
+        self.motion = None if view.motion is None else _Motion(view.motion, self.width, self.height)
         self.aperture = view.aperture_radius_m
         self._radius = dr.opaque(mi.Float, view.aperture_radius_m)
         self._inverse_focus = dr.opaque(mi.Float, 1.0 / view.focus_distance_m)
 
-    def direction(self, x: Any, y: Any, on_aperture: Any = None) -> tuple[Any, Any]:
+    def direction(self, x: Any, y: Any, on_aperture: Any = None, time_s: Any = None) -> tuple[Any, Any]:
         """Return origin and unit direction in L of the ray through image point (x, y) in pixels.
 
         `on_aperture` is a point of the unit disc on the aperture; without it, the ray meets the lens's centre.
+        `time_s` counts from the middle of the pixel's exposure, where the ray is without it.
         """
         cx, cy, cz = self.towards(x, y)
         ax, ay, az = self.axes
         origin = self.origin
+        if self.motion is not None and (time_s is not None or self.motion.rolls):
+            time_s = self.motion.time_s(x, y, time_s)
+            origin = origin + self.motion.velocity * time_s
+            ax, ay, az = self.motion.turned(self.axes, time_s)
         if on_aperture is not None:
             lx, ly = on_aperture.x * self._radius, on_aperture.y * self._radius
             origin = origin + lx * ax + ly * ay
@@ -242,7 +290,7 @@ class Optics:
         x = mi.Float(strata.pixel % self.width) + u
         y = mi.Float(strata.pixel // self.width) + v
         on_aperture = strata.disc(1) if self.aperture > 0 else None
-        return mi.Ray3f(*self.direction(x, y, on_aperture))
+        return mi.Ray3f(*self.direction(x, y, on_aperture, strata.time_s()))
 
     def centre_rays(self, pixel: Any = None) -> Any:
         """Return pinhole rays through the centres of pixels, given by row-major number; default: all pixels."""
@@ -255,9 +303,19 @@ class Optics:
     def rays_of(self, directions: NDArray[np.float64]) -> Any:
         """Return one ray from the lens's centre for each vector in C, float64[y, x, 3]."""
         across, down, along = (packets(mi.Float, np.asarray(directions[..., k], np.float32)) for k in range(3))
-        ax, ay, az = self.axes
+        origin, (ax, ay, az) = self.origin, self.axes_of(directions.shape[1], directions.shape[0])
+        if self.motion is not None and self.motion.rolls:
+            origin = origin + self.motion.velocity * self.motion.grid_time_s(
+                directions.shape[1], directions.shape[0]
+            )
         direction = dr.normalize(across * ax + down * ay + along * az)
-        return mi.Ray3f(self.origin + self.start_m * direction, direction)
+        return mi.Ray3f(origin + self.start_m * direction, direction)
+
+    def axes_of(self, width: int, height: int) -> list[Any]:
+        """Return the camera's axes in L at the middle of the exposure of each pixel of a grid over the frame."""
+        if self.motion is None or not self.motion.rolls:
+            return self.axes
+        return self.motion.turned(self.axes, self.motion.grid_time_s(width, height))
 
 
 # Least and greatest number of nodes along the longer side of a table of directions. Between nodes h px apart,

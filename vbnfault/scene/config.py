@@ -24,6 +24,7 @@ from .bodies import with_named_body
 from .coma import ComaTable
 from .events import EventTable
 from .instrument import OF_A_SENSOR_FILE, CameraTable, ImageTable, RenderTable
+from .motion import MotionTable
 from .sampling import DEFAULT_TWINS, OF_AN_AIM, DatasetTable, GeometryTable, PlanTable, StratumTable
 from .surroundings import OrbitTable, SkyTable, SpacecraftTable, SpiceTable, SunTable
 from .target import EARTH, BodyTable, PatchTable
@@ -68,6 +69,7 @@ class Scene(Table):
     orbit: OrbitTable | None = None
     spice: SpiceTable = SpiceTable()
     trajectory: TrajectoryTable | None = None
+    motion: MotionTable | None = Field(None, description="motion of the camera during an exposure; default: none")
     spacecraft: SpacecraftTable = SpacecraftTable()
     sky: SkyTable = SkyTable()
     camera: CameraTable = CameraTable()

@@ -11,7 +11,8 @@ import csv
 import io
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -23,6 +24,7 @@ from ..core import tables
 from ..core.errors import InputError, shown, under_key
 from ..core.files import file_contents, user_files
 from ..core.tables import Table
+from .motion import between_frames
 
 if TYPE_CHECKING:
     from .config import Scene
@@ -43,6 +45,12 @@ COLUMNS = ("name", *_NUMBERS)
 # Columns that a table may have: the rows of a sequence are frames that the same camera takes one after the other.
 SEQUENCE_COLUMNS = ("sequence", "time_s")
 _TIME_S = (-1e9, 1e9)
+# Columns that a table may have: how fast the camera moves and turns over the ground, in T and in C. By default, the
+# rows before and after of a sequence say so.
+_VELOCITY = dict.fromkeys((f"velocity_{axis}_T_m_s" for axis in "xyz"), (-1e6, 1e6))
+_RATE = dict.fromkeys((f"rate_{axis}_C_rad_s" for axis in "xyz"), (-100.0, 100.0))
+_OPTIONAL = {"time_s": _TIME_S, **_VELOCITY, **_RATE}
+MOTION_COLUMNS = (*_VELOCITY, *_RATE)
 _DAY_S = 86400.0
 # Largest deviation of the norm of a quaternion or of the Sun's direction from 1; they are then scaled to 1. Four
 # decimals, as in many labels of images, keep it below 2e-4.
@@ -66,7 +74,8 @@ class TrajectoryTable(Table):
         min_length=1,
         description="CSV or Parquet file with the columns name, julian_date, camera_x_T_m, camera_y_T_m, "
         "camera_z_T_m, camera_from_T_w, camera_from_T_x, camera_from_T_y, camera_from_T_z, sun_x_T, sun_y_T, "
-        "sun_z_T and sun_distance_au; with sequence and time_s for frames that follow each other",
+        "sun_z_T and sun_distance_au; with sequence and time_s for frames that follow each other, and with "
+        "velocity_x_T_m_s to velocity_z_T_m_s and rate_x_C_rad_s to rate_z_C_rad_s where they are known",
     )
     frames: tuple[Frames, ...] = Field(
         (), description="Number of rows of each sequence, which vbnfault fills in from the file"
@@ -78,7 +87,8 @@ class FlownPose:
     """Hold one row: camera and Sun in T.
 
     `T_from_C` float64[3, 3] has the camera's axes as columns. `sun_direction_T` float64[3] is a unit vector towards
-    the Sun. `sequence` is -1 for a row of none; `time_s` counts as the table does.
+    the Sun. `sequence` is -1 for a row of none; `time_s` counts as the table does. `velocity_T_m_s` and
+    `rate_C_rad_s`, float64[3] in T and in C, say how the camera moves and turns over the ground.
     """
 
     name: str
@@ -90,6 +100,8 @@ class FlownPose:
     sequence: int = -1
     frame: int = 0
     time_s: float = np.nan
+    velocity_T_m_s: F64 = field(default_factory=lambda: np.zeros(3))
+    rate_C_rad_s: F64 = field(default_factory=lambda: np.zeros(3))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -118,6 +130,9 @@ class Trajectory:
         Number of rows of each sequence.
     time_s
         float64[n], rising through each sequence; nan without sequences.
+    velocity_T_m_s, rate_C_rad_s
+        float64[n, 3] in T and in C: how the camera moves and turns over the ground; None: as the rows of the
+        sequences say.
     """
 
     source: str
@@ -130,6 +145,8 @@ class Trajectory:
     time_s: F64
     sequence_names: tuple[str, ...] = ()
     frames: tuple[int, ...] = ()
+    velocity_T_m_s: F64 | None = None
+    rate_C_rad_s: F64 | None = None
 
     def __len__(self) -> int:
         return len(self.name)
@@ -140,9 +157,19 @@ class Trajectory:
             return self
         names = tuple(f"{name}/{k}" for name in self.name for k in range(count))
         arrays: dict[str, Any] = {
-            key: np.repeat(v, count, axis=0) for key, v in vars(self).items() if isinstance(v, np.ndarray)
+            f.name: np.repeat(getattr(self, f.name), count, axis=0)
+            for f in fields(self)
+            if isinstance(getattr(self, f.name), np.ndarray)
         }
         return replace(self, name=names, frames=tuple(count * k for k in self.frames), **arrays)
+
+    @cached_property
+    def motion(self) -> tuple[F64, F64]:
+        """Return velocity and rate of every row, float64[row, 3] in T and in C, as given or from row to row."""
+        moves = between_frames(self.camera_position_T_m, self.camera_from_T, self.time_s, self.frames)
+        given = self.velocity_T_m_s, self.rate_C_rad_s
+        velocity, rate = (found if known is None else known for known, found in zip(given, moves, strict=True))
+        return velocity, rate
 
     @property
     def boresight_T(self) -> F64:
@@ -171,6 +198,8 @@ class Trajectory:
             sequence=sequence,
             frame=frame,
             time_s=float(self.time_s[index]),
+            velocity_T_m_s=self.motion[0][index],
+            rate_C_rad_s=self.motion[1][index],
         )
 
 
@@ -380,13 +409,20 @@ def _check_names(names: Sequence[str], source: str) -> None:
         if times > 1:
             raise InputError(f"{source}: column {shown(name)} stands twice; must stand once")
     missing = [name for name in COLUMNS if name not in names]
-    unknown = [name for name in names if name not in COLUMNS + SEQUENCE_COLUMNS]
+    unknown = [name for name in names if name not in COLUMNS + SEQUENCE_COLUMNS + MOTION_COLUMNS]
+    for columns in (_VELOCITY, _RATE):
+        lacking = [name for name in columns if name not in names]
+        if 0 < len(lacking) < len(columns):
+            raise InputError(
+                f"{source}: columns are missing: {', '.join(lacking)}; must be there together with "
+                f"{', '.join(name for name in columns if name in names)}"
+            )
     if missing or unknown:
         clauses = [f"columns are missing: {', '.join(missing)}"] if missing else []
         clauses += [f"unknown columns: {', '.join(shown(name) for name in unknown[:5])}"] if unknown else []
         raise InputError(
             f"{source}: {'; '.join(clauses)}; must have exactly the columns {', '.join(COLUMNS)}, and may have "
-            f"{' and '.join(SEQUENCE_COLUMNS)}"
+            f"{', '.join(SEQUENCE_COLUMNS)}, {', '.join(_VELOCITY)} and {', '.join(_RATE)}"
         )
 
 
@@ -412,6 +448,8 @@ def _checked(columns: Mapping[str, Sequence[Any]], source: str) -> Trajectory:
         sun_direction_T=_units(values, [f"sun_{axis}_T" for axis in "xyz"], source),
         sun_distance_au=values["sun_distance_au"],
         **_sequences(columns, names, values["julian_date"], source),
+        velocity_T_m_s=_vectors(columns, list(_VELOCITY), source),
+        rate_C_rad_s=_vectors(columns, list(_RATE), source),
     )
 
 
@@ -479,7 +517,7 @@ def _names(column: Sequence[Any], source: str) -> tuple[str, ...]:
 
 def _numbers(column: Sequence[Any], name: str, source: str) -> F64:
     """Return a column as float64[n]. Raises InputError for a value that is no number, or out of its range."""
-    low, high = _NUMBERS.get(name, _TIME_S)
+    low, high = {**_NUMBERS, **_OPTIONAL}[name]
     out = np.empty(len(column))
     for row, value in enumerate(column):
         try:
@@ -496,6 +534,13 @@ def _numbers(column: Sequence[Any], name: str, source: str) -> F64:
             f"be a number from {low:.10g} to {high:.10g}"
         )
     return out
+
+
+def _vectors(columns: Mapping[str, Sequence[Any]], names: Sequence[str], source: str) -> F64 | None:
+    """Return columns as vectors float64[n, k]; None where they are missing. Raises InputError."""
+    if names[0] not in columns:
+        return None
+    return np.stack([_numbers(columns[name], name, source) for name in names], axis=1)
 
 
 def _units(values: Mapping[str, F64], names: Sequence[str], source: str) -> F64:

@@ -443,6 +443,18 @@ OF_SEQUENCES: dict[str, Array] = {
         "As the table of poses counts it, or from the date of the sequence's first frame.",
         units="s",
     ),
+    "velocity_T_m_s": Array(
+        "velocity of the camera over the ground, in T",
+        "As the table of poses has it, or from the frames before and after.",
+        axes="sample xyz",
+        units="m s-1",
+    ),
+    "rate_C_rad_s": Array(
+        "rate at which the camera turns over the ground, in C",
+        "Angular velocity; as the table of poses has it, or from the frames before and after.",
+        axes="sample xyz",
+        units="rad s-1",
+    ),
 }
 # What says that the others are whole.
 CRC32C = Array(

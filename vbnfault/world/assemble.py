@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -305,7 +306,7 @@ def visible_stars(
     scene: Scene,
     radiance: Radiance,
     camera: Camera,
-    J_from_C: F64,
+    J_from_C: Sequence[F64],
     open_sky: NDArray[np.bool_],
     view: View | None = None,
 ) -> sky.StarRadiance | None:
@@ -320,7 +321,7 @@ def visible_stars(
     camera
         The camera with its exposure.
     J_from_C
-        Camera axes in J, float64[3, 3].
+        Camera axes in J, float64[3, 3], at one or more times that share the exposure.
     open_sky
         Pixels that see neither a body nor the Sun, bool[y, x].
     view
@@ -336,21 +337,26 @@ def visible_stars(
     if faintest < sky.BRIGHTEST_V:
         return None
     grid = camera if view is None else view
-    stars = sky.star_radiance(
-        sky.load_catalogue().brighter_than(faintest),
-        sky.SkyFrame(
-            J_from_C=J_from_C,
-            intrinsics=grid.intrinsics,
-            width_px=grid.width_px,
-            height_px=grid.height_px,
-            projection=camera.lens.calibration,
-        ),
-        wavelength_nm=radiance.wavelength_nm,
-        sigma_px=sigma_px,
-        julian_date=scene.sun.julian_date,
-        sky=open_sky,
-        lens_falloff=camera.lens.falls_off,
-    )
+    catalogue = sky.load_catalogue().brighter_than(faintest)
+    at_times = [
+        sky.star_radiance(
+            catalogue,
+            sky.SkyFrame(
+                J_from_C=attitude,
+                intrinsics=grid.intrinsics,
+                width_px=grid.width_px,
+                height_px=grid.height_px,
+                projection=camera.lens.calibration,
+            ),
+            wavelength_nm=radiance.wavelength_nm,
+            sigma_px=sigma_px,
+            julian_date=scene.sun.julian_date,
+            sky=open_sky,
+            lens_falloff=camera.lens.falls_off,
+        )
+        for attitude in J_from_C
+    ]
+    stars = sky.StarRadiance.mean(at_times, grid.width_px)
     return stars if len(stars.rows) else None
 
 

@@ -14,6 +14,7 @@ light of both.
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -169,6 +170,17 @@ class StarRadiance:
     rows: I64
     columns: I64
     radiance: NDArray[np.float32]
+
+    @classmethod
+    def mean(cls, parts: Sequence[StarRadiance], width_px: int) -> StarRadiance:
+        """Return the mean of what stars add at several times of an exposure, in a frame of this width."""
+        if len(parts) == 1:
+            return parts[0]
+        pixel = np.concatenate([part.rows * width_px + part.columns for part in parts])
+        pixels, index = np.unique(pixel, return_inverse=True)
+        bands = np.concatenate([part.radiance for part in parts], axis=1) / len(parts)
+        summed = np.stack([np.bincount(index.ravel(), band, len(pixels)) for band in bands])
+        return cls(rows=pixels // width_px, columns=pixels % width_px, radiance=summed.astype(np.float32))
 
     def added_to(self, radiance: Radiance, where: NDArray[np.bool_] | None = None) -> Radiance:
         """Return `radiance` with the stars added; if `where` bool[y, x] is given, only in its pixels."""

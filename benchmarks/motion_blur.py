@@ -1,0 +1,137 @@
+"""Compare images of a camera in motion with the mean of brute-force sub-frames, and give the time of each.
+
+    python benchmarks/motion_blur.py [--size 512] [--sub-frames 256]
+
+A camera 150 m above ground of 67P turns, flies sideways, or flies down. For each kind and length of motion, a line
+gives the error of the signal over the noise of the sensor (median with its sign, root mean square, median, 99th
+percentile and fraction below 0.3 of the lit pixels), the pixels that get new rays, and the time of the moved frame,
+from the render to its electrons, over that of a still one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+import vbnfault
+from vbnfault import render
+from vbnfault.pipeline import motion
+from vbnfault.pipeline.exposure import meter
+from vbnfault.pipeline.noise_budget import green_per_second
+from vbnfault.pipeline.rendering import render_view
+from vbnfault.pipeline.resolve import resolve
+from vbnfault.pipeline.spec import Pose, Rendering, SampleSpec, SceneExposure
+from vbnfault.scene.config import parse_scene
+
+F64 = NDArray[np.float64]
+
+HEIGHT_M, FIELD_DEG, EXPOSURE_S = 150.0, 30.0, 0.02
+UP_T = np.array([0.2, -0.1, 1.0]) / np.linalg.norm([0.2, -0.1, 1.0])
+
+
+def spec_above_ground(size: int, noise_fraction: float) -> SampleSpec:
+    """Return the sample of a thin-lens camera that looks down, with the Sun 50° from the zenith."""
+    camera = {"width_px": size, "height_px": size, "fov_deg": FIELD_DEG, "exposure_s": EXPOSURE_S}
+    table = {
+        "title": "motion",
+        "camera": {**camera, "detector": "cmv4000"},
+        "sun": {"limb_darkening": True},
+        "render": {"noise_fraction": noise_fraction, "bounces": 0},
+        "motion": {},
+        "dataset": {"samples": 1},
+    }
+    scene = parse_scene(table, source="motion")
+    vertices_m = vbnfault.Session(scene).body.vertices_m
+    camera_m = vertices_m[np.argmax(vertices_m @ UP_T)] + HEIGHT_M * UP_T
+    right, *_ = np.linalg.svd(UP_T[None])[2][1:]
+    T_from_C = np.stack([right, np.cross(-UP_T, right), -UP_T], axis=1)
+    sun = UP_T + 1.2 * right
+    values = [*camera_m, *Rotation.from_matrix(T_from_C.T).as_quat(scalar_first=True), *(sun / np.linalg.norm(sun))]
+    names = (
+        [f"camera_{a}_T_m" for a in "xyz"] + [f"camera_from_T_{a}" for a in "wxyz"] + [f"sun_{a}_T" for a in "xyz"]
+    )
+    row = {"name": "0", "julian_date": 2457000.0, "sun_distance_au": 2.0, **dict(zip(names, values, strict=True))}
+    return vbnfault.Session(scene, poses={name: [value] for name, value in row.items()}).spec(0)
+
+
+def motions(spec: SampleSpec, lengths_px: list[float]) -> Iterator[tuple[str, SampleSpec]]:
+    """Yield the kinds of motion that move the ground by these lengths during the exposure."""
+    assert spec.flown is not None
+    pixel_rad = np.radians(FIELD_DEG) / spec.scene.camera.width_px
+    quarter = np.radians(FIELD_DEG) / 4
+    for px in lengths_px:
+        rad_s = px * pixel_rad / EXPOSURE_S
+        sideways = spec.flown.T_from_C @ np.array([0.8, 0.6, 0.0]) * rad_s * HEIGHT_M
+        kinds = {
+            "turn": {"rate_C_rad_s": rad_s * np.array([0.36, -0.92, 0.15])},
+            "sideways": {"velocity_T_m_s": sideways},
+            "down": {"velocity_T_m_s": -UP_T * rad_s * HEIGHT_M / quarter},
+        }
+        for kind, values in kinds.items():
+            yield f"{kind:8} {px:4g} px", replace(spec, flown=replace(spec.flown, **values))
+
+
+def exposed(spec: SampleSpec, pose: Pose) -> tuple[Rendering, SceneExposure, float]:
+    """Return the render of a sample, its exposure, and the seconds that both take once kernels are compiled."""
+    for _ in range(2):
+        started = time.perf_counter()
+        rendered = render_view(spec, pose)
+        exposure = motion.move(spec, rendered, meter(spec, rendered))
+        seconds = time.perf_counter() - started
+    return rendered, exposure, seconds
+
+
+def brute_force(rendered: Rendering, spec: SampleSpec, count: int) -> F64:
+    """Return the mean radiance of sub-frames, each with its own samples."""
+    middle = rendered.scene.view
+    total = np.zeros(rendered.light.rendered.array.shape)
+    for k in range(count):
+        t = ((k + 0.5) / count - 0.5) * EXPOSURE_S
+        view = replace(
+            middle,
+            position_L_m=middle.position_L_m + middle.motion.velocity_L_m_s * t,
+            L_from_C=middle.L_from_C @ Rotation.from_rotvec(middle.motion.rate_C_rad_s * t).as_matrix(),
+            motion=None,
+        )
+        scene = replace(rendered.scene, view=view, key=(rendered.scene.key + 7919 * (k + 1)) & 0xFFFFFFFF)
+        total += render.direct(spec.terrain.surface, scene).array
+    return total / count
+
+
+def main() -> None:
+    """Print the comparison."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--size", type=int, default=512)
+    parser.add_argument("--sub-frames", type=int, default=256)
+    parser.add_argument("--noise-fraction", type=float, default=0.3)
+    parser.add_argument("--lengths", type=float, nargs="+", default=[1, 5, 20])
+    options = parser.parse_args()
+    spec = spec_above_ground(options.size, options.noise_fraction)
+    pose = resolve(spec)
+    still, _, still_s = exposed(spec, pose)
+    print(f"still frame: {still_s:.2f} s, noise of sampling {still.noise_fraction_p99:.2f} of the sensor's")
+    weights, detector = green_per_second(spec) * EXPOSURE_S, spec.camera.detector
+    for name, moving in motions(spec, options.lengths):
+        rendered, exposure, seconds = exposed(moving, pose)
+        paths = motion.Paths.of(rendered.scene.view, rendered.truth, EXPOSURE_S)
+        got = np.einsum("b,byx->yx", weights, exposure.light.rendered.array)
+        true = np.einsum("b,byx->yx", weights, brute_force(rendered, moving, options.sub_frames))
+        lit = (true > 0.01 * detector.full_well_e) & (true < detector.full_well_e)
+        error = ((got - true) / np.sqrt(np.maximum(true, 0) + detector.read_noise_e_rms**2))[lit]
+        size = np.abs(error)
+        print(
+            f"{name}: {np.median(error):+.3f}, rms {np.sqrt((error**2).mean()):.3f}, median {np.median(size):.3f}, "
+            f"p99 {np.percentile(size, 99):.3f}, below 0.3 {(size < 0.3).mean():.4f}; new rays in "
+            f"{100 * paths.appearing(rendered.truth).mean():.1f} %; {seconds / still_s:.2f} of a still frame",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()

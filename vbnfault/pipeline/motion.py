@@ -1,0 +1,233 @@
+"""Expose a view while the camera moves: spread its light along the paths of the ground over the image.
+
+The view is rendered once, at the middle of each pixel's exposure, and its light is carried along: that of the cells
+of pixels, so that no interpolation blurs it. New rays, spread over the exposure, go only where ground appears or
+hides: at steps of the motion, and at the border of the frame.
+
+The light of every piece of ground stays that of mid-exposure, and so do the Sun's disc in view and a body of few
+pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from ..core.quantities import SPACECRAFT, Radiance, Truth
+from ..render.description import CameraMotion, RenderInput, View
+from .noise_budget import green_per_second
+from .spec import Rendering, SampleSpec, SceneExposure, SceneLight
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_LEAST_PX = 0.02  # of motion that is seen
+_STEPS_PER_PX = 4.0  # of the light of cells; that of whole pixels, whose colours are taken, has one
+_MOST_STEPS = 1024
+_ROUNDS = 2  # in which the place is found from which light comes
+# Pixels whose paths depart by more than this from those around, up to either end, may hide one another.
+_APART_PX, _APART_OF_LENGTH = 0.12, 0.02
+_FARTHEST_PX = 64  # from such a step, within which pixels get new rays
+# New rays over all pixels, and range of the samples of a pixel that gets some.
+_RAYS_PER_PX, _SAMPLES = 32, (16, 1024)
+# Where the first and the last line are: direction in which pixels are exposed one after the other, x and y.
+_LATER = {"up": (0, 1), "down": (0, -1), "left": (1, 0), "right": (-1, 0)}
+
+
+def motion_of(spec: SampleSpec) -> CameraMotion | None:
+    """Return how the camera of a sample moves over its ground; None if it stands still."""
+    table, flown = spec.scene.motion, spec.flown
+    if table is None or flown is None or not (flown.velocity_T_m_s.any() or flown.rate_C_rad_s.any()):
+        return None
+    return CameraMotion(
+        velocity_L_m_s=spec.terrain.site.T_from_L.T @ flown.velocity_T_m_s,
+        rate_C_rad_s=flown.rate_C_rad_s,
+        line_s=table.line_time_s * np.array(_LATER[spec.camera.readout_direction], float),
+    )
+
+
+def move(spec: SampleSpec, rendering: Rendering, exposure: SceneExposure) -> SceneExposure:
+    """Return the exposure with the light of a camera that moves; without motion it is returned as it is."""
+    view, light = rendering.scene.view, exposure.light.rendered
+    if view.motion is None or rendering.cells is None:
+        return exposure
+    seconds = exposure.camera.exposure_s
+    truth = rendering.truth
+    if truth.depth_m.shape != light.array.shape[1:]:
+        from .. import render
+
+        truth = render.truth(spec.terrain.surface, view, rendering.scene.sun)
+    paths = Paths.of(view, truth, seconds)
+    if paths.length_px < _LEAST_PX:
+        return exposure
+    weights = green_per_second(spec)
+    moved = _carried(light, rendering.cells, weights, paths)
+    appearing = paths.appearing(truth)
+    if appearing.any():
+        _traced(spec, rendering.scene, appearing, moved, weights, seconds)
+    if light.fine is not None:
+        moved = light.fine.added_to(moved)
+    if light.sun is not None:
+        moved += light.sun
+    radiance = light.with_array(moved)
+    lit = SceneLight(lens=exposure.light.lens, rendered=radiance)
+    return replace(exposure, light=lit, rate=exposure.camera.expose(radiance, 1.0))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Paths:
+    """Hold the paths over the image of what each pixel sees at the middle of its exposure.
+
+    Attributes
+    ----------
+    speed_px_s, bend_px_s2
+        float32[y, x, 2]: after t seconds, it is at speed · t + bend · t² from its pixel's centre.
+    exposure_s
+        Time over which pixels are exposed, from half of it before to half of it after.
+    line_s
+        By how much later a pixel is exposed than its left and its upper neighbour.
+    """
+
+    speed_px_s: F32
+    bend_px_s2: F32
+    exposure_s: float
+    line_s: F64
+
+    @classmethod
+    def of(cls, view: View, truth: Truth, exposure_s: float) -> Paths:
+        """Return the paths of the ground and of the sky. What belongs to the camera, the spacecraft, stays."""
+        assert view.motion is not None
+        row, column = np.mgrid[0 : view.height_px, 0 : view.width_px] + 0.5
+        x, y, z = np.broadcast_arrays(*view.rays_C(column, row))
+        towards = np.stack([x, y, z], axis=-1)
+        far = ~np.isfinite(truth.depth_m) | (np.abs(z) < 1e-6)
+        range_m = np.where(far, 1.0, truth.depth_m / np.where(far, 1.0, z))
+        velocity_C = view.L_from_C.T @ view.motion.velocity_L_m_s * ~far[..., None]
+
+        def shift_px(time_s: float) -> F64:
+            """Return how far everything is from its pixel at a time, float64[y, x, 2]."""
+            turn = Rotation.from_rotvec(-view.motion.rate_C_rad_s * time_s).as_matrix()  # type: ignore[union-attr]
+            now = (towards * range_m[..., None] - velocity_C * time_s) @ turn.T
+            return view.pixel_map.pixel_of(now) - np.stack([column, row], axis=-1)
+
+        half_s = exposure_s / 2
+        before, after = shift_px(-half_s), shift_px(half_s)
+        stays = (truth.semantic == SPACECRAFT)[..., None] | ~np.isfinite(before + after)
+        speed, bend = (after - before) / exposure_s, (after + before) / (2 * half_s**2)
+        return cls(
+            speed_px_s=np.where(stays, 0, speed).astype(np.float32),
+            bend_px_s2=np.where(stays, 0, bend).astype(np.float32),
+            exposure_s=exposure_s,
+            line_s=view.motion.line_s,
+        )
+
+    @property
+    def length_px(self) -> float:
+        """Return the length of nearly the longest path over the exposure."""
+        return float(np.percentile(np.hypot(*np.moveaxis(self.speed_px_s, -1, 0)), 99.9)) * self.exposure_s
+
+    def sources(self, time_s: float) -> tuple[F32, F32]:
+        """Return column and row, float32[y, x] from the middle of the first pixel, of the light at a time.
+
+        It is the light that each pixel gets `time_s` after the middle of its exposure.
+        """
+        height, width = self.speed_px_s.shape[:2]
+        row, column = np.mgrid[0:height, 0:width].astype(np.float32)
+        shift = self.speed_px_s * np.float32(time_s) + self.bend_px_s2 * np.float32(time_s**2)
+        at = shift
+        for _ in range(_ROUNDS):
+            if self.line_s.any():  # the source was seen at the time of its own line
+                since_s = (time_s + at @ self.line_s).astype(np.float32)[..., None]
+                shift = self.speed_px_s * since_s + self.bend_px_s2 * since_s**2
+            at = _looked_up(shift, column - at[..., 0], row - at[..., 1])
+        return column - at[..., 0], row - at[..., 1]
+
+    def times_s(self, per_px: float) -> Sequence[float]:
+        """Return times at the middles of equal parts of the exposure, so many for a pixel of motion."""
+        count = min(int(np.ceil(per_px * self.length_px)) + 1, _MOST_STEPS)
+        return (((np.arange(count) + 0.5) / count - 0.5) * self.exposure_s).tolist()
+
+    def appearing(self, truth: Truth) -> Mask:
+        """Return the pixels in whose exposure ground appears or hides, bool[y, x], not near a spacecraft."""
+        half = self.speed_px_s * np.float32(self.exposure_s / 2)
+        height, width = half.shape[:2]
+        row, column = np.mgrid[0:height, 0:width] + 0.5
+        outside = np.zeros((height, width), bool)
+        for sign in (-1, 1):
+            x, y = column + sign * half[..., 0], row + sign * half[..., 1]
+            outside |= (x < 0) | (x > width) | (y < 0) | (y > height)
+        # on a slope, paths change evenly; at a step, they depart from the mean of those around
+        step = np.hypot(*np.moveaxis(half - cv2.blur(half, (3, 3)), -1, 0))
+        reach = 2 * min(int(np.ceil(self.length_px / 2)) + 1, _FARTHEST_PX) + 1
+        wide = np.ones((reach, reach), np.uint8)
+        vehicle = cv2.dilate((truth.semantic == SPACECRAFT).astype(np.uint8), wide) > 0
+        return (
+            outside
+            | (cv2.dilate((step > _APART_PX + _APART_OF_LENGTH * self.length_px).astype(np.uint8), wide) > 0)
+        ) & ~vehicle
+
+
+def _looked_up(array: F32, column: F32, row: F32) -> F32:
+    """Return values between pixels, float32[y, x] or [y, x, k]; those at the border go on beyond it."""
+    return np.asarray(cv2.remap(array, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+
+
+def _carried(light: Radiance, cells: F32, weights: F64, paths: Paths) -> F32:
+    """Return the light of a view carried along its paths, float32[band, y, x], without Sun and fine light.
+
+    `cells` float32[y·n, x·n] is the signal of n × n cells of each pixel, of light with `weights` of the bands. They
+    say how light varies, and the bands of whole pixels which colour it has.
+    """
+    array = light.array if light.sun is None else light.array - light.sun
+    array = array if light.fine is None else light.fine.removed_from(array)
+    height, width = array.shape[1:]
+    side = cells.shape[0] // height
+    signal = np.einsum("b,byx->yx", weights, array).astype(np.float32)
+    of_cells = cv2.resize(cells, (width, height), interpolation=cv2.INTER_AREA)
+    between_surfaces = np.repeat(np.repeat(signal - of_cells, side, axis=0), side, axis=1)
+    # The mean over a pixel whose upper left corner is at each cell. That samples count for all of their cell is a
+    # blur by a box of width h, which adds h²/24 times the second derivative.
+    fine = cv2.boxFilter(cells + between_surfaces, -1, (side, side), anchor=(0, 0), borderType=cv2.BORDER_REPLICATE)
+    if side > 1:
+        fine -= cv2.Laplacian(fine, -1, borderType=cv2.BORDER_REPLICATE) / 24
+    times = paths.times_s(_STEPS_PER_PX)
+    moved = np.zeros((height, width), np.float32)
+    for time_s in times:
+        column, row = paths.sources(time_s)
+        moved += _looked_up(fine, column * side, row * side)
+    moved /= len(times)
+    planes = np.concatenate([array, signal[None]])
+    coloured = np.zeros_like(planes)
+    times = paths.times_s(1.0)
+    for time_s in times:
+        place = paths.sources(time_s)
+        for plane, out in zip(planes, coloured, strict=True):
+            out += _looked_up(plane, *place)
+    coloured /= len(times)
+    *bands, total = coloured
+    factor = np.where(total > 0, moved / np.maximum(total, 1e-30), 1)
+    return np.stack(bands) * factor
+
+
+def _traced(spec: SampleSpec, scene: RenderInput, where: Mask, moved: F32, weights: F64, exposure_s: float) -> None:
+    """Give some pixels, bool[y, x], the light of rays that are spread over the exposure, in place."""
+    from .. import render
+
+    pixels = np.flatnonzero(where).astype(np.uint32)
+    wanted = np.clip(_RAYS_PER_PX * where.size / len(pixels), *_SAMPLES)
+    samples = 1 << int(np.log2(wanted))
+    light, _, _ = render.direct_in_cells(
+        spec.terrain.surface,
+        replace(scene, key=(scene.key ^ 0x2545F491) & 0xFFFFFFFF),
+        weights,
+        render.Cells(pixel=pixels, cell=np.zeros_like(pixels), side=1),
+        samples,
+        exposure_s,
+    )
+    moved.reshape(len(moved), -1)[:, pixels] = light
