@@ -17,6 +17,8 @@ from poses_kit import columns_of, row
 
 import vbnfault
 from vbnfault.core.errors import InputError
+from vbnfault.core.files import resources
+from vbnfault.core.quantities import RTS, RTS_HIGH
 from vbnfault.dataset import describe_scene, scene_identity
 from vbnfault.faults import registry
 from vbnfault.scene import config, plan
@@ -199,6 +201,45 @@ def test_a_fault_that_one_frame_does_not_show_is_not_drawn_again(scene: Path, tm
     taken = [session.simulate(k).scalars["parameters"].get("dust_on_optics") for k in range(8)]
     assert taken[0] is not None
     assert taken == [taken[0], None] * 4
+
+
+@pytest.mark.parametrize("fault", [False, True])
+def test_telegraph_pixels_blink_from_frame_to_frame(scene: Path, tmp_path: Path, fault: bool) -> None:
+    """Those of the device, and those of the fault: their pixels stay, and a frame needs no other one.
+
+    All dwell 10 s on average, so 4 ms apart one in 2000 has switched, and an hour apart half of them.
+    """
+    given = columns()
+    given["time_s"] = [0.0, 0.004, 3600.0, 0.0, -7.0, 0.0, 0.004, 3600.0, 7200.0]
+    write(tmp_path / "poses.csv", given)
+    text = resources.find("scenes/detectors", "generic_cmos").read_text()
+    fraction = 0 if fault else 0.05
+    dwell = f"rts_fraction = {fraction}\nrts_time_s = [9.999, 10.001]\nrts_per_interaction = 1.0"
+    sources = '[sources]\n"individual.rts_time_s" = "test"\n"individual.rts_per_interaction" = "test"'
+    text = text.replace("rts_fraction = 1e-4", dwell).replace("[sources]", sources)
+    (tmp_path / "cmos.toml").write_text(text)
+    keys: dict[str, Any] = {"camera.detector": str(tmp_path / "cmos.toml"), "dataset.layers": ["defects"]}
+    if fault:
+        keys["faults.broken_pixels"] = {"model": "hot_pixels", "dose_TeV_g": 10.0}
+        keys["plan.classes_per_sample"] = [3, 3]
+    loaded = config.load_scene(scene, keys)
+    session = vbnfault.Session(loaded)
+    defects = np.array([session.simulate(k).layers["defects"] for k in range(8, -1, -1)])[::-1]
+    signals = (defects & RTS) > 0
+    assert signals[0].sum() > 40
+    for first, frames in ((0, 3), (4, 5)):
+        of_sequence, high = signals[first : first + frames], (defects[first : first + frames] & RTS_HIGH) > 0
+        assert (of_sequence == of_sequence[0]).all()
+        level = high[:, of_sequence[0]]
+        n = level.shape[1]
+        far = [-3, -1] if first else [0, 2]
+        assert abs(level.mean(axis=1) - 0.5).max() < 4 * 0.5 / np.sqrt(n)
+        assert abs((level[far[0]] ^ level[far[1]]).mean() - 0.5) < 4 * 0.5 / np.sqrt(n)
+        near = (level[1] ^ level[2]) if first else (level[0] ^ level[1])
+        assert near.sum() <= 3  # below 0.1 are expected
+    np.testing.assert_array_equal(vbnfault.simulate(loaded, 7).layers["defects"], defects[7])
+    taken = session.take({name: values[2] for name, values in given.items()}, sample=2)
+    np.testing.assert_array_equal(taken.layers["defects"], defects[2])
 
 
 def test_readers_give_the_columns_of_sequences(scene: Path, tmp_path: Path) -> None:

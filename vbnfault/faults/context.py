@@ -57,6 +57,8 @@ class FaultContext:
     coating_loss
         Fraction of the coatings' area that another fault of the sample has removed, in [0, 1]. Only a model with
         `Fault.informed` gets it; for the others it is 0.
+    time_s
+        Time at which the exposure begins in its sequence; None for an image of no sequence.
     of_view
         Results that all samples of the view share (`dataset.variants_per_view`). What is kept here may depend on
         the camera's lens and on the light of the view; everything else belongs to the key.
@@ -75,6 +77,7 @@ class FaultContext:
     surroundings: tuple[Radiance, ...] = ()
     far_sources: tuple[FarSource, ...] = ()
     coating_loss: float = 0.0
+    time_s: float | None = None
     of_view: SharedResults = field(default_factory=SharedResults, repr=False)
     # `init=False`, because `dataclasses.replace` must not copy results of one frame to another
     _memo: dict[Any, Any] = field(default_factory=dict, init=False, repr=False)

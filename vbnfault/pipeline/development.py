@@ -7,6 +7,7 @@ are computed once. They are kept by the draws that they depend on, each identifi
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -77,7 +78,11 @@ class Development:
     @cached_property
     def noise(self) -> Any:
         """Return the variates of the exposure, which all its images share."""
-        return self.exposure.camera.detector.draw_noise(self.context.shape, lambda name: self.rng("detector", name))
+        detector, time_s = self.exposure.camera.detector, self.context.time_s
+        noise = detector.draw_noise(self.context.shape, lambda name: self.rng("detector", name))
+        if time_s is None or detector.mosaic is None:
+            return noise
+        return replace(noise, sequence=(int(self.rng("sequence", "telegraph").integers(2**63)), time_s))
 
     # --- camera and context ----------------------------------------------------------------------------------
 

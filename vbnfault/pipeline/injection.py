@@ -113,6 +113,7 @@ def fault_context(pose: Pose, rendering: Rendering, exposure: SceneExposure) -> 
         radiance=exposure.light.rendered,
         surroundings=rendering.surroundings,
         far_sources=rendering.far_sources,
+        time_s=pose.time_s,
         of_view=rendering.shared,
     )
 

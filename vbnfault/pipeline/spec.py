@@ -54,7 +54,8 @@ class Pose:
     `tries` counts the views drawn; this is the last of them. `variables` are the values of the plan, by the names
     of `redraw.VARIABLES`. `resolved` says whether every condition is met. It is False only if a trajectory places
     the camera, a fault of the sample needs the Sun, and the camera does not see the whole Sun ahead. `terrain` is
-    the terrain that was made for this pose, if it is not that of the specification.
+    the terrain that was made for this pose, if it is not that of the specification. `time_s` is its time in a
+    sequence, if it is of one.
     """
 
     position_L_m: F64
@@ -67,6 +68,7 @@ class Pose:
     variables: Mapping[str, float]
     resolved: bool
     terrain: Terrain | None = None
+    time_s: float | None = None
 
     @property
     def sees_sun(self) -> bool:
@@ -95,6 +97,11 @@ class Drawing(Protocol):
 def is_state(drawing: Drawing, fault: str) -> bool:
     """Return whether a fault is a state of the instrument, which lasts from image to image of a sequence."""
     return fault in drawing.faults and not drawing.faults[fault].per_exposure
+
+
+def lasts(drawing: Drawing, stage: str, name: str) -> bool:
+    """Return whether the random numbers of (stage, name) are those of all images of a sequence."""
+    return stage == "sequence" or (stage == "fault" and is_state(drawing, name.partition("/")[0]))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -158,8 +165,8 @@ class SampleSpec:
 
     def rng(self, stage: str, name: str) -> np.random.Generator:
         """Return the random generator of this sample for (stage, name); states of the instrument last."""
-        lasts = stage == "fault" and is_state(self, name.partition("/")[0])
-        return keyed_random.rng(self.seed, int(self.plan.state[self.index]) if lasts else self.index, stage, name)
+        index = self.plan.state[self.index] if lasts(self, stage, name) else self.index
+        return keyed_random.rng(self.seed, int(index), stage, name)
 
     @property
     def shares_state(self) -> bool:
