@@ -347,6 +347,8 @@ duration_s = 2.0
             {1.0: 1.0, 1.49: 1.0, 3.2: 1.0},
             (0.9, 1.51, 2.9, 3.6, 5.1),
         ),
+        ({"profile": "until_reset", "reset_s": 3.0}, {1.0: 1.0, 2.999: 1.0}, (0.9, 3.0, 99.0)),
+        ({"profile": "until_reset", "reset_s": 3.0, "duration_s": 1.0}, {1.0: 1.0, 1.999: 1.0}, (2.0, 3.0)),
     ],
 )
 def test_profiles_over_time(scene: Path, keys: dict[str, Any], on: dict[float, float], off: tuple[float]) -> None:
@@ -354,6 +356,26 @@ def test_profiles_over_time(scene: Path, keys: dict[str, Any], on: dict[float, f
     (event,) = events_of_sequence(config.load_scene(scene, {"event": [table]}), 0)
     assert {t: event.fraction(t) for t in on} == pytest.approx(on)
     assert [event.fraction(t) for t in off] == [0.0] * len(off)
+
+
+@pytest.mark.parametrize("duty", [0.2, 0.5, 0.9])
+def test_a_thermal_profile_follows_a_cosine_with_a_drawn_phase(scene: Path, duty: float) -> None:
+    """Its mean is ∫ (cos φ − c) dφ / (2π (1 − c)) from −π duty to π duty, so (sin(π duty)/π − c duty) / (1 − c)."""
+    table = {"cause": "c", "faults": ["dust_on_optics"], "onset_s": 0.0, "profile": "thermal", "period_s": 90.0}
+    loaded = config.load_scene(scene, {"event": [{**table, "duty": duty, "duration_s": 900.0}]})
+    time_s, least = np.arange(0, 900, 0.1), np.cos(np.pi * duty)
+    peaks_s = []
+    for state in range(40):
+        (event,) = events_of_sequence(loaded, state)
+        fraction = np.array([event.fraction(t) for t in time_s])
+        np.testing.assert_allclose(fraction[900:], fraction[:-900], atol=1e-9)
+        assert fraction.max() == pytest.approx(1, abs=1e-4)
+        assert (fraction > 0).mean() == pytest.approx(duty, abs=2 / 900)  # two edges within steps of 900
+        assert fraction.mean() == pytest.approx((np.sin(np.pi * duty) / np.pi - least * duty) / (1 - least), abs=1e-4)
+        assert event.fraction(900.0) == event.fraction(-0.1) == 0
+        peaks_s.append(time_s[np.argmax(fraction[:900])])
+    # uniform over the period: Kolmogorov's limit for 40 at 1e-3 is 1.95 / √40
+    assert np.abs(np.sort(peaks_s) / 90 - (np.arange(40) + 0.5) / 40).max() < 1.95 / np.sqrt(40)
 
 
 def test_times_of_events_are_drawn_within_their_bounds_for_each_sequence(scene: Path) -> None:
@@ -401,6 +423,29 @@ def test_an_event_brings_all_of_its_faults_and_takes_them_away(scene: Path, tmp_
         assert counts.planned(fault) == counts.realised(fault) == expected[:, c].sum()
     np.testing.assert_array_equal(changed, expected.any(axis=1))
     assert {one["dust_on_optics"]["event"]["cause"] for one in parameters if one} == {"dust event"}
+
+
+def test_a_store_tells_profiles_of_temperature_and_resets(scene: Path, tmp_path: Path) -> None:
+    """Grains follow the temperature; rays come from 0 s to the reset at 2 s, so in frames 0 and 1."""
+    tables = [
+        {"cause": "heat", "faults": ["dust_on_optics"], "onset_s": 0.0, "profile": "thermal", "period_s": 9.0},
+        {"cause": "latch-up", "faults": ["cosmic_rays"], "onset_s": 0.0, "profile": "until_reset", "reset_s": 2.0},
+    ]
+    keys = {"event": tables, "faults.dust_on_optics.count": 40}
+    loaded, out = config.load_scene(scene, keys), tmp_path / "s.zarr"
+    vbnfault.build(loaded, out, progress=False)
+    with vbnfault.open_dataset(out) as data:
+        parameters = [json.loads(text) for text in data["parameters"].values][4:]
+    (heat, _) = events_of_sequence(loaded, 4)
+    fractions = [heat.fraction(float(t)) for t in range(5)]
+    grains = [one.get("dust_on_optics", {"x_mm": [], "event": {"fraction": 0}}) for one in parameters]
+    assert [one["event"]["fraction"] for one in grains] == fractions
+    assert [len(one["x_mm"]) for one in grains] == [max(1, round(40 * f)) if f else 0 for f in fractions]
+    assert 0 < fractions.count(0.0) < 5
+    listed = {event.fault: event for event in vbnfault.events(out) if event.sequence == "leave"}
+    rays, dust = listed["cosmic_rays"], listed["dust_on_optics"]
+    assert (rays.cause, rays.end_s, rays.first_frame, rays.last_frame, rays.frames) == ("latch-up", 2, 0, 1, 2)
+    assert (dust.cause, dust.end_s, dust.largest_fraction) == ("heat", None, max(fractions))
 
 
 def test_common_causes_strike_together(scene: Path) -> None:
@@ -543,6 +588,25 @@ def test_events_are_listed_by_the_command(scene: Path, tmp_path: Path, call: Cal
         ({"cause": "c", "faults": ["dust_on_optics"], "onset_s": 1.0, "profile": "slow"}, r"event\[0\]\.profile"),
         ({"cause": "c", "faults": ["dust_on_optics"], "onset_s": 1.0, "profile": "growing"}, r"rise_s must be set"),
         ({"cause": "c", "faults": ["dust_on_optics"], "onset_s": 1.0, "rise_s": 1.0}, r"rise_s must not be set"),
+        (
+            {"cause": "c", "faults": ["dust_on_optics"], "onset_s": 1.0, "profile": "thermal"},
+            r'profile = "thermal": period_s must be set; it is for the profile intermittent and thermal',
+        ),
+        (
+            {"cause": "c", "faults": ["dust_on_optics"], "onset_s": 1.0, "profile": "until_reset"},
+            r"reset_s must be set; it is for the profile until_reset",
+        ),
+        ({"cause": "c", "faults": ["dust_on_optics"], "onset_s": 1.0, "reset_s": 2.0}, r"reset_s must not be set"),
+        (
+            {
+                "cause": "c",
+                "faults": ["dust_on_optics"],
+                "onset_s": [1.0, 5.0],
+                "profile": "until_reset",
+                "reset_s": [4.0, 9.0],
+            },
+            r"reset_s = 4: must be later than onset_s, which is up to 5",
+        ),
         (
             {
                 "cause": "c",
