@@ -341,7 +341,7 @@ def test_dwell_times_between_frames_are_exponential(high_s: float, low_s: float)
 
 
 def test_exposures_see_one_course_of_telegraph_signals() -> None:
-    """Exposures that follow each other sum to the long one, in any order; other seeds and signals are independent."""
+    """Exposures that follow each other sum to the long one, in any order. Seeds and signals are independent."""
     signal = telegraph(3.0, 7.0, 5000)
     order = np.random.default_rng(3).permutation(20)
     parts = {k: signal.expose_at(1e6 + 0.5 * k, 0.5, 5) for k in order.tolist()}

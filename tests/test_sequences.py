@@ -21,6 +21,8 @@ from vbnfault.core.files import resources
 from vbnfault.core.quantities import RTS, RTS_HIGH
 from vbnfault.dataset import describe_scene, scene_identity
 from vbnfault.faults import registry
+from vbnfault.faults.planes import displaced
+from vbnfault.pipeline.development import acting_at
 from vbnfault.scene import config, plan
 from vbnfault.scene.events import commanded_now, events_of_sequence, striking
 from vbnfault.scene.trajectory import as_trajectory, load_trajectory, place_in_sequence
@@ -242,6 +244,75 @@ def test_telegraph_pixels_blink_from_frame_to_frame(scene: Path, tmp_path: Path,
     np.testing.assert_array_equal(taken.layers["defects"], defects[2])
 
 
+def test_a_frozen_frame_is_the_frame_before_bit_for_bit(scene: Path, tmp_path: Path) -> None:
+    """Beside it, dust and rays strike; without the class, the scene has the same dust, rays and noise."""
+    frozen = {"faults.frozen_frame": {"model": "repeated", "rows_fraction": 0.4, "shift_px": 160.0}}
+    struck = config.load_scene(scene, {**frozen, "plan.classes_per_sample": [3, 3]})
+    plain = vbnfault.Session(config.load_scene(scene))
+    images = [plain.simulate(k).layers["image"] for k in range(9)]
+    out = tmp_path / "s.zarr"
+    vbnfault.build(struck, out, progress=False, workers=2)
+    with vbnfault.open_dataset(out) as data:
+        taken, clean = data["image"].values, data["clean"].values
+        masks = data["mask"].sel(fault="frozen_frame").values
+        parameters = [json.loads(text)["frozen_frame"] for text in data["parameters"].values]
+    for k, one in enumerate(parameters):
+        stale = np.zeros((48, 64), bool)
+        stale[slice(*one["rows"])] = True
+        assert stale.sum() == 19 * 64  # 0.4 of 48 rows
+        np.testing.assert_array_equal(masks[k], stale)
+        np.testing.assert_array_equal(taken[k][~stale], images[k][~stale])
+        still = k in (0, 3, 4)
+        assert ("shift_px" in one) == still
+        before = displaced(images[k], *one["shift_px"]) if still else images[k - 1]
+        np.testing.assert_array_equal(taken[k][stale], before[stale])
+        assert (clean[k] != taken[k]).any()
+    np.testing.assert_array_equal(vbnfault.simulate(struck, 6).layers["image"], taken[6])
+
+
+def test_light_of_the_frame_before_meets_the_dust_once(scene: Path) -> None:
+    """The model `displaced` in a whole frame: the light is that of the frame before; then dust acts on it."""
+    keys = {"faults.frozen_frame.rows_fraction": 1.0, "plan.classes_per_sample": [3, 3]}
+    struck, plain = (vbnfault.Session(config.load_scene(scene, some)) for some in (keys, {}))
+    now, before = struck.frame(6).injection, plain.frame(5).injection
+    assert acting_at(now.draws, "electrons") == ["frozen_frame", "dust_on_optics"]
+    for name in (["frozen_frame"], ["frozen_frame", "dust_on_optics"]):
+        expected = before.development.signal(before.draws, name[1:]).array
+        np.testing.assert_array_equal(now.development.signal(now.draws, name).array, expected)
+
+
+def test_charge_of_the_frame_before_is_released_in_the_next(scene: Path, tmp_path: Path) -> None:
+    """A frame of the near body, and one of the sky 4 s later: what it gains is the raw frame, times a fraction.
+
+    Noise, interference and non-linearity of that frame are 20 DN of up to 4000, so the slope is right to 1 %.
+    """
+    poses = [row(f"{k}", (0.0, 3e3 if k == 0 else 3e7, 300.0), (0, 1, 0)) for k in range(2)]
+    write(tmp_path / "poses.csv", {**columns_of(poses), "time_s": [10.0, 14.0]})
+    keys = {
+        "camera.detector": "generic_cmos",
+        "camera.exposure_s": 0.006,
+        "dataset.layers": ["raw"],
+        "faults": {"persistence": {"lag_fraction": 0.2, "trap_fraction": 0.01, "source": "drawn"}},
+        "plan.classes_per_sample": [1, 1],
+    }
+    text = re.sub(r"(?m)^faults.*\n|^plan.classes.*\n", "", scene.read_text())
+    scene.write_text(text)
+    session = vbnfault.Session(config.load_scene(scene, keys))
+    now = session.frame(1).injection
+    bright = session.frame(0).injection.development.raw({}).astype(float)
+    draw = now.draws["persistence"]
+    raws = [now.development.raw(draws, noisy=False).astype(float) for draws in (now.draws, {})]
+    slope, offset = np.polyfit(bright.ravel() - 64, (raws[0] - raws[1]).ravel(), 1)
+    assert np.ptp(bright) > 1000
+    assert draw.params["source"] == "before"
+    assert draw.params["wait_s"] == pytest.approx(4 - 0.006)
+    released = 0.2 + 0.01 * np.log(4.0 / 3.994)
+    assert draw.params["released"] == pytest.approx(released)
+    assert slope == pytest.approx(released, rel=0.01)
+    assert abs(offset) < 5
+    assert session.frame(0).injection.draws["persistence"].params["source"] in ("frame", "sun")
+
+
 def test_readers_give_the_columns_of_sequences(scene: Path, tmp_path: Path) -> None:
     from vbnfault.store import open_store
     from vbnfault.train import Columns
@@ -371,7 +442,9 @@ def test_a_thermal_profile_follows_a_cosine_with_a_drawn_phase(scene: Path, duty
         np.testing.assert_allclose(fraction[900:], fraction[:-900], atol=1e-9)
         assert fraction.max() == pytest.approx(1, abs=1e-4)
         assert (fraction > 0).mean() == pytest.approx(duty, abs=2 / 900)  # two edges within steps of 900
-        assert fraction.mean() == pytest.approx((np.sin(np.pi * duty) / np.pi - least * duty) / (1 - least), abs=1e-4)
+        assert fraction.mean() == pytest.approx(
+            (np.sin(np.pi * duty) / np.pi - least * duty) / (1 - least), abs=1e-4
+        )
         assert event.fraction(900.0) == event.fraction(-0.1) == 0
         peaks_s.append(time_s[np.argmax(fraction[:900])])
     # uniform over the period: Kolmogorov's limit for 40 at 1e-3 is 1.95 / √40

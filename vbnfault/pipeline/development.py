@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..camera import Camera
 from ..core.quantities import RGBI, Electrons
-from ..faults import MOSAIC_STEPS, Fault, FaultContext, physical_order
+from ..faults import MOSAIC_STEPS, Fault, FaultContext, FrameBefore, physical_order
 from . import masks
 from .spec import Draw, Images, Injection, SampleSpec, SceneExposure, stored_layers
 
@@ -246,6 +246,19 @@ class Development:
             if keep:
                 self._raws[key] = raw
         return raw
+
+    def left_behind(self, draws: Draws) -> FrameBefore:
+        """Return what the exposure leaves behind for the next frame of its sequence."""
+        camera, held_e = self.camera_with(draws), None
+        if camera.detector.mosaic is not None:
+            light = self.signal(draws, acting_at(draws, "electrons")).merged
+            held_e = camera.mosaic.held_e(light, camera.exposure_s, self.noise, self.acts(draws))
+        return FrameBefore(
+            image=self.image(draws),
+            light=self.signal(draws, []).merged,
+            held_e=held_e,
+            end_s=(self.context.time_s or 0.0) + camera.exposure_s,
+        )
 
     def defects(self, draws: Draws) -> NDArray[np.uint8]:
         """Return the defects of the mosaic's pixels, uint8[y, x]: those of the device and those of the faults."""

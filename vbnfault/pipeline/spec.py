@@ -110,6 +110,8 @@ class SampleSpec:
 
     `flown` is the pose of the sample if a table of poses gives it. If the camera aims, `terrain` is the shape model
     as it is, and `terrain_of` makes the terrain of a pose. `taken_with` is a camera in place of the scene's.
+    `before` returns the frame before in a sequence. With `is_before`, the sample is taken as the frame before
+    another one, and without the faults that use one.
     """
 
     index: int
@@ -120,6 +122,8 @@ class SampleSpec:
     flown: FlownPose | None = None
     terrain_of: Callable[[FlownPose], Terrain] | None = None
     taken_with: Camera | None = None
+    before: Callable[[], SampleSpec] | None = None
+    is_before: bool = False
 
     def at(self, pose: Pose) -> SampleSpec:
         """Return the specification with the terrain of a pose."""
@@ -133,7 +137,8 @@ class SampleSpec:
     @property
     def commanded(self) -> tuple[str, ...]:
         """Return the faults that the sample is commanded to carry now, in dataset order."""
-        return tuple(name for name in self.plan.commanded(self.index) if self.fraction(name) > 0)
+        planned = (name for name in self.plan.commanded(self.index) if self.fraction(name) > 0)
+        return tuple(name for name in planned if not (self.is_before and self.faults[name].uses_before))
 
     @property
     def commanded_in_view(self) -> tuple[str, ...]:

@@ -53,7 +53,9 @@ class EventTable(Table):
     duty: Annotated[float, Field(gt=0, lt=1)] = Field(
         0.5, description="fraction of its period for which an intermittent or thermal fault is there"
     )
-    reset_s: Times | None = Field(None, description="time of the reset after which it does not come back, or bounds")
+    reset_s: Times | None = Field(
+        None, description="time of the reset after which it does not come back, or bounds"
+    )
 
     @model_validator(mode="after")
     def _has_what_its_profile_needs(self) -> EventTable:
@@ -106,8 +108,7 @@ def events_of_sequence(scene: Scene, state: int) -> tuple[Event, ...]:
     for number, table in enumerate(scene.event):
         rng = keyed_random.rng(scene.dataset.seed, state, "plan", f"event/{number}")
         onset_s, duration_s, rise_s, period_s, reset_s = (
-            _drawn(getattr(table, name), rng)
-            for name in ("onset_s", "duration_s", "rise_s", "period_s", "reset_s")
+            _drawn(getattr(table, name), rng) for name in ("onset_s", "duration_s", "rise_s", "period_s", "reset_s")
         )
         out.append(
             Event(

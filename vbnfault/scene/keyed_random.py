@@ -22,8 +22,8 @@ def rng(seed: int, sample: int, stage: str, name: str) -> np.random.Generator:
 def keyed_uniform(seed: int, samples: NDArray[np.int64], stage: str, name: str) -> NDArray[np.float64]:
     """Return uniform numbers in [0, 1), float64[n], each keyed by (seed, its sample, stage, name).
 
-    This is the vectorised counterpart of `rng` for one number per sample. It mixes the sample's number twice, offset
-    by a hash of the other keys.
+    This is the vectorised counterpart of `rng` for one number per sample. It mixes the sample's number twice,
+    offset by a hash of the other keys.
     """
     start = int.from_bytes(hashlib.sha256(f"{seed}\0{stage}\0{name}".encode()).digest()[:8], "little")
     key = np.asarray(samples).astype(np.uint64) * hashing.STEP + np.uint64(start)
