@@ -7,7 +7,8 @@ the sample is that of the new exposure, which a frame that is stale as a whole c
 one by one are those of the fault `transmission` with `fill = "previous"`.
 
 A still has no exposure before, so nothing changes but the displacement. In a sequence, the stale rows show the light
-of the frame before. The model `repeated` shows its finished image bit for bit, as a buffer that is sent again.
+of the frame before. The model `repeated` shows its finished image bit for bit, noise included; only other faults of
+the finished image act on it once more.
 """
 
 from __future__ import annotations

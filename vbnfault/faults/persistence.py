@@ -100,7 +100,7 @@ class Persistence(Fault):
         full_e = np.float32(context.camera.mosaic.sensor.readout.full_well_e)
         if params["source"] == "before":
             assert context.before is not None
-            held = context.before().held_e
+            held = np.asarray(context.before().held_e)
         elif params["source"] == "sun":
             held = full_e * _sun(params["sun_xy_px"], context)
         else:
