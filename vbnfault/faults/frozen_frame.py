@@ -6,9 +6,9 @@ noise of their own, and the same dust, defects and straylight. What lies beyond 
 the sample is that of the new exposure, which a frame that is stale as a whole contradicts. Rows that are repeated
 one by one are those of the fault `transmission` with `fill = "previous"`.
 
-A still has no exposure before, so nothing changes but the displacement. In a sequence, the stale rows show the light
-of the frame before. The model `repeated` shows its finished image bit for bit, noise included; only other faults of
-the finished image act on it once more.
+A still has no exposure before, so nothing changes but the displacement. In a sequence, the stale rows show the
+light of the frame before. The model `repeated` shows its finished image bit for bit, noise included; only other
+faults of the finished image act on it once more.
 """
 
 from __future__ import annotations
