@@ -312,6 +312,62 @@ def test_telegraph_signals_at_their_limits() -> None:
         none.expose(none.start(rng), math.inf, rng)
 
 
+def levels(signal: Telegraph, times_s: np.ndarray, seed: int) -> np.ndarray:
+    """Return the levels at times, bool[time, n], seen by exposures that are too short for a switch."""
+    return np.array([signal.expose_at(float(t), 1e-9, seed) for t in times_s]) > 0.5
+
+
+@pytest.mark.parametrize(("high_s", "low_s"), [(8.0, 20.0), (10.0, 10.0), (20.0, 6.0)])
+def test_dwell_times_between_frames_are_exponential(high_s: float, low_s: float) -> None:
+    """Frames 1 s apart see a chain that stays with a probability q, so dwell times exceed k frames with q^k.
+
+    This is an exponential law at whole numbers, with the largest distance of Kolmogorov's test at 1e-3, 1.95/√n.
+    The first dwell times of each signal count, all of which end long before the last frame.
+    """
+    signal, wanted = telegraph(high_s, low_s, 400), 4
+    seen = levels(signal, np.arange(-300, 300, 1.0), 11)
+    p, tau = signal.duty[0], signal.correlation_s[0]
+    assert abs(seen.mean() - p) < 4 * math.sqrt(2 * p * (1 - p) * (tau + 0.5) / 600 / 400)
+    for level, q in ((True, 1 - (1 - p) * -math.expm1(-1 / tau)), (False, 1 - p * -math.expm1(-1 / tau))):
+        dwells = []
+        for one in seen.T:
+            switch = np.flatnonzero(np.diff(one)) + 1
+            dwell = np.diff(switch)[one[switch[:-1]] == level][:wanted]
+            assert len(dwell) == wanted
+            dwells.extend(dwell)
+        k = np.arange(1, 300)
+        found = (np.asarray(dwells)[:, None] > k).mean(axis=0)
+        assert np.abs(found - q**k).max() < 1.95 / math.sqrt(len(dwells))
+
+
+def test_exposures_see_one_course_of_telegraph_signals() -> None:
+    """Exposures that follow each other sum to the long one, in any order. Seeds and signals are independent."""
+    signal = telegraph(3.0, 7.0, 5000)
+    order = np.random.default_rng(3).permutation(20)
+    parts = {k: signal.expose_at(1e6 + 0.5 * k, 0.5, 5) for k in order.tolist()}
+    np.testing.assert_allclose(np.mean(list(parts.values()), axis=0), signal.expose_at(1e6, 10.0, 5), atol=1e-8)
+    first, other = signal.expose_at(0.0, 1e-9, 5), signal.expose_at(0.0, 1e-9, 6)
+    for one, two in ((first, other), (first[:-1], first[1:]), (parts[0], parts[0][::-1])):
+        assert abs(np.corrcoef(one, two)[0, 1]) < 4 / math.sqrt(5000)
+    np.testing.assert_array_equal(telegraph(3.0, 7.0, 50).expose_at(0.0, 1e-9, 5), first[:50])
+
+
+@pytest.mark.parametrize(("high_s", "low_s", "exposure_s"), [(1.0, 3.0, 2.0), (5.0, 5.0, 0.5), (0.02, 0.01, 1.0)])
+def test_exposures_of_a_course_vary_as_those_of_single_images(
+    high_s: float, low_s: float, exposure_s: float
+) -> None:
+    """The last of them has 150 correlation times; see `test_exposures_of_telegraph_signals` for the closed form."""
+    signal = telegraph(high_s, low_s)
+    fraction = signal.expose_at(123.4, exposure_s, 2)
+    p, ratio = signal.duty[0], signal.correlation_s[0] / exposure_s
+    variance = 2 * p * (1 - p) * ratio * (1 - ratio * -math.expm1(-1 / ratio))
+    assert abs(fraction.mean() - p) < 4 * math.sqrt(variance / 20_000)
+    assert abs(fraction.var() - variance) < 4 * math.sqrt(0.25 * variance / 20_000)
+    assert 0 <= fraction.min() <= fraction.max() <= 1
+    mixed = Telegraph(**{name: np.concatenate([v, 1e4 * v]) for name, v in vars(signal).items()})
+    np.testing.assert_array_equal(mixed.expose_at(123.4, exposure_s, 2)[:20_000], fraction)
+
+
 def test_telegraph_pixels() -> None:
     """One in 1000 has more than 0.4 nA/cm² at 21 °C; the mean times are log-uniform; all follow temperature."""
     rts = sensor(IndividualSpec(rts_fraction=0.3, reference_K=294.15)).rts

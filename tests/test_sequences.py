@@ -17,8 +17,12 @@ from poses_kit import columns_of, row
 
 import vbnfault
 from vbnfault.core.errors import InputError
+from vbnfault.core.files import resources
+from vbnfault.core.quantities import RTS, RTS_HIGH
 from vbnfault.dataset import describe_scene, scene_identity
 from vbnfault.faults import registry
+from vbnfault.faults.planes import displaced
+from vbnfault.pipeline.development import acting_at
 from vbnfault.scene import config, plan
 from vbnfault.scene.events import commanded_now, events_of_sequence, striking
 from vbnfault.scene.trajectory import as_trajectory, load_trajectory, place_in_sequence
@@ -201,6 +205,114 @@ def test_a_fault_that_one_frame_does_not_show_is_not_drawn_again(scene: Path, tm
     assert taken == [taken[0], None] * 4
 
 
+@pytest.mark.parametrize("fault", [False, True])
+def test_telegraph_pixels_blink_from_frame_to_frame(scene: Path, tmp_path: Path, fault: bool) -> None:
+    """Those of the device, and those of the fault: their pixels stay, and a frame needs no other one.
+
+    All dwell 10 s on average, so 4 ms apart one in 2000 has switched, and an hour apart half of them.
+    """
+    given = columns()
+    given["time_s"] = [0.0, 0.004, 3600.0, 0.0, -7.0, 0.0, 0.004, 3600.0, 7200.0]
+    write(tmp_path / "poses.csv", given)
+    text = resources.find("scenes/detectors", "generic_cmos").read_text()
+    fraction = 0 if fault else 0.05
+    dwell = f"rts_fraction = {fraction}\nrts_time_s = [9.999, 10.001]\nrts_per_interaction = 1.0"
+    sources = '[sources]\n"individual.rts_time_s" = "test"\n"individual.rts_per_interaction" = "test"'
+    text = text.replace("rts_fraction = 1e-4", dwell).replace("[sources]", sources)
+    (tmp_path / "cmos.toml").write_text(text)
+    keys: dict[str, Any] = {"camera.detector": str(tmp_path / "cmos.toml"), "dataset.layers": ["defects"]}
+    if fault:
+        keys["faults.broken_pixels"] = {"model": "hot_pixels", "dose_TeV_g": 10.0}
+        keys["plan.classes_per_sample"] = [3, 3]
+    loaded = config.load_scene(scene, keys)
+    session = vbnfault.Session(loaded)
+    defects = np.array([session.simulate(k).layers["defects"] for k in range(8, -1, -1)])[::-1]
+    signals = (defects & RTS) > 0
+    assert signals[0].sum() > 40
+    for first, frames in ((0, 3), (4, 5)):
+        of_sequence, high = signals[first : first + frames], (defects[first : first + frames] & RTS_HIGH) > 0
+        assert (of_sequence == of_sequence[0]).all()
+        level = high[:, of_sequence[0]]
+        n = level.shape[1]
+        far = [-3, -1] if first else [0, 2]
+        assert abs(level.mean(axis=1) - 0.5).max() < 4 * 0.5 / np.sqrt(n)
+        assert abs((level[far[0]] ^ level[far[1]]).mean() - 0.5) < 4 * 0.5 / np.sqrt(n)
+        near = (level[1] ^ level[2]) if first else (level[0] ^ level[1])
+        assert near.sum() <= 3  # below 0.1 are expected
+    np.testing.assert_array_equal(vbnfault.simulate(loaded, 7).layers["defects"], defects[7])
+    taken = session.take({name: values[2] for name, values in given.items()}, sample=2)
+    np.testing.assert_array_equal(taken.layers["defects"], defects[2])
+
+
+def test_a_frozen_frame_is_the_frame_before_bit_for_bit(scene: Path, tmp_path: Path) -> None:
+    """Beside it, dust and rays strike; without the class, the scene has the same dust, rays and noise."""
+    frozen = {"faults.frozen_frame": {"model": "repeated", "rows_fraction": 0.4, "shift_px": 160.0}}
+    struck = config.load_scene(scene, {**frozen, "plan.classes_per_sample": [3, 3]})
+    plain = vbnfault.Session(config.load_scene(scene))
+    images = [plain.simulate(k).layers["image"] for k in range(9)]
+    out = tmp_path / "s.zarr"
+    vbnfault.build(struck, out, progress=False, workers=2)
+    with vbnfault.open_dataset(out) as data:
+        taken, clean = data["image"].values, data["clean"].values
+        masks = data["mask"].sel(fault="frozen_frame").values
+        parameters = [json.loads(text)["frozen_frame"] for text in data["parameters"].values]
+    for k, one in enumerate(parameters):
+        stale = np.zeros((48, 64), bool)
+        stale[slice(*one["rows"])] = True
+        assert stale.sum() == 19 * 64  # 0.4 of 48 rows
+        np.testing.assert_array_equal(masks[k], stale)
+        np.testing.assert_array_equal(taken[k][~stale], images[k][~stale])
+        still = k in (0, 3, 4)
+        assert ("shift_px" in one) == still
+        before = displaced(images[k], *one["shift_px"]) if still else images[k - 1]
+        np.testing.assert_array_equal(taken[k][stale], before[stale])
+        assert (clean[k] != taken[k]).any()
+    np.testing.assert_array_equal(vbnfault.simulate(struck, 6).layers["image"], taken[6])
+
+
+def test_light_of_the_frame_before_meets_the_dust_once(scene: Path) -> None:
+    """The model `displaced` in a whole frame: the light is that of the frame before; then dust acts on it."""
+    keys = {"faults.frozen_frame.rows_fraction": 1.0, "plan.classes_per_sample": [3, 3]}
+    struck, plain = (vbnfault.Session(config.load_scene(scene, some)) for some in (keys, {}))
+    now, before = struck.frame(6).injection, plain.frame(5).injection
+    assert acting_at(now.draws, "electrons") == ["frozen_frame", "dust_on_optics"]
+    for name in (["frozen_frame"], ["frozen_frame", "dust_on_optics"]):
+        expected = before.development.signal(before.draws, name[1:]).array
+        np.testing.assert_array_equal(now.development.signal(now.draws, name).array, expected)
+
+
+def test_charge_of_the_frame_before_is_released_in_the_next(scene: Path, tmp_path: Path) -> None:
+    """A frame of the near body, and one of the sky 4 s later: what it gains is the raw frame, times a fraction.
+
+    Noise, interference and non-linearity of that frame are 20 DN of up to 4000, so the slope is right to 1 %.
+    """
+    poses = [row(f"{k}", (0.0, 3e3 if k == 0 else 3e7, 300.0), (0, 1, 0)) for k in range(2)]
+    write(tmp_path / "poses.csv", {**columns_of(poses), "time_s": [10.0, 14.0]})
+    keys = {
+        "camera.detector": "generic_cmos",
+        "camera.exposure_s": 0.006,
+        "dataset.layers": ["raw"],
+        "faults": {"persistence": {"lag_fraction": 0.2, "trap_fraction": 0.01, "source": "drawn"}},
+        "plan.classes_per_sample": [1, 1],
+    }
+    text = re.sub(r"(?m)^faults.*\n|^plan.classes.*\n", "", scene.read_text())
+    scene.write_text(text)
+    session = vbnfault.Session(config.load_scene(scene, keys))
+    now = session.frame(1).injection
+    bright = session.frame(0).injection.development.raw({}).astype(float)
+    draw = now.draws["persistence"]
+    raws = [now.development.raw(draws, noisy=False).astype(float) for draws in (now.draws, {})]
+    slope, offset = np.polyfit(bright.ravel() - 64, (raws[0] - raws[1]).ravel(), 1)
+    assert np.ptp(bright) > 1000
+    assert draw.params["source"] == "before"
+    assert draw.params["wait_s"] == pytest.approx(4 - 0.006)
+    released = 0.2 + 0.01 * np.log(4.0 / 3.994)
+    assert draw.params["released"] == pytest.approx(released)
+    assert slope == pytest.approx(released, rel=0.01)
+    assert abs(offset) < 5
+    assert session.frame(0).injection.draws["persistence"].params["source"] in ("frame", "sun")
+
+
 def test_readers_give_the_columns_of_sequences(scene: Path, tmp_path: Path) -> None:
     from vbnfault.store import open_store
     from vbnfault.train import Columns
@@ -306,6 +418,8 @@ duration_s = 2.0
             {1.0: 1.0, 1.49: 1.0, 3.2: 1.0},
             (0.9, 1.51, 2.9, 3.6, 5.1),
         ),
+        ({"profile": "until_reset", "reset_s": 3.0}, {1.0: 1.0, 2.999: 1.0}, (0.9, 3.0, 99.0)),
+        ({"profile": "until_reset", "reset_s": 3.0, "duration_s": 1.0}, {1.0: 1.0, 1.999: 1.0}, (2.0, 3.0)),
     ],
 )
 def test_profiles_over_time(scene: Path, keys: dict[str, Any], on: dict[float, float], off: tuple[float]) -> None:
@@ -313,6 +427,28 @@ def test_profiles_over_time(scene: Path, keys: dict[str, Any], on: dict[float, f
     (event,) = events_of_sequence(config.load_scene(scene, {"event": [table]}), 0)
     assert {t: event.fraction(t) for t in on} == pytest.approx(on)
     assert [event.fraction(t) for t in off] == [0.0] * len(off)
+
+
+@pytest.mark.parametrize("duty", [0.2, 0.5, 0.9])
+def test_a_thermal_profile_follows_a_cosine_with_a_drawn_phase(scene: Path, duty: float) -> None:
+    """Its mean is ∫ (cos φ − c) dφ / (2π (1 − c)) from −π duty to π duty, so (sin(π duty)/π − c duty) / (1 − c)."""
+    table = {"cause": "c", "faults": ["dust_on_optics"], "onset_s": 0.0, "profile": "thermal", "period_s": 90.0}
+    loaded = config.load_scene(scene, {"event": [{**table, "duty": duty, "duration_s": 900.0}]})
+    time_s, least = np.arange(0, 900, 0.1), np.cos(np.pi * duty)
+    peaks_s = []
+    for state in range(40):
+        (event,) = events_of_sequence(loaded, state)
+        fraction = np.array([event.fraction(t) for t in time_s])
+        np.testing.assert_allclose(fraction[900:], fraction[:-900], atol=1e-9)
+        assert fraction.max() == pytest.approx(1, abs=1e-4)
+        assert (fraction > 0).mean() == pytest.approx(duty, abs=2 / 900)  # two edges within steps of 900
+        assert fraction.mean() == pytest.approx(
+            (np.sin(np.pi * duty) / np.pi - least * duty) / (1 - least), abs=1e-4
+        )
+        assert event.fraction(900.0) == event.fraction(-0.1) == 0
+        peaks_s.append(time_s[np.argmax(fraction[:900])])
+    # uniform over the period: Kolmogorov's limit for 40 at 1e-3 is 1.95 / √40
+    assert np.abs(np.sort(peaks_s) / 90 - (np.arange(40) + 0.5) / 40).max() < 1.95 / np.sqrt(40)
 
 
 def test_times_of_events_are_drawn_within_their_bounds_for_each_sequence(scene: Path) -> None:
@@ -360,6 +496,29 @@ def test_an_event_brings_all_of_its_faults_and_takes_them_away(scene: Path, tmp_
         assert counts.planned(fault) == counts.realised(fault) == expected[:, c].sum()
     np.testing.assert_array_equal(changed, expected.any(axis=1))
     assert {one["dust_on_optics"]["event"]["cause"] for one in parameters if one} == {"dust event"}
+
+
+def test_a_store_tells_profiles_of_temperature_and_resets(scene: Path, tmp_path: Path) -> None:
+    """Grains follow the temperature; rays come from 0 s to the reset at 2 s, so in frames 0 and 1."""
+    tables = [
+        {"cause": "heat", "faults": ["dust_on_optics"], "onset_s": 0.0, "profile": "thermal", "period_s": 9.0},
+        {"cause": "latch-up", "faults": ["cosmic_rays"], "onset_s": 0.0, "profile": "until_reset", "reset_s": 2.0},
+    ]
+    keys = {"event": tables, "faults.dust_on_optics.count": 40}
+    loaded, out = config.load_scene(scene, keys), tmp_path / "s.zarr"
+    vbnfault.build(loaded, out, progress=False)
+    with vbnfault.open_dataset(out) as data:
+        parameters = [json.loads(text) for text in data["parameters"].values][4:]
+    (heat, _) = events_of_sequence(loaded, 4)
+    fractions = [heat.fraction(float(t)) for t in range(5)]
+    grains = [one.get("dust_on_optics", {"x_mm": [], "event": {"fraction": 0}}) for one in parameters]
+    assert [one["event"]["fraction"] for one in grains] == fractions
+    assert [len(one["x_mm"]) for one in grains] == [max(1, round(40 * f)) if f else 0 for f in fractions]
+    assert 0 < fractions.count(0.0) < 5
+    listed = {event.fault: event for event in vbnfault.events(out) if event.sequence == "leave"}
+    rays, dust = listed["cosmic_rays"], listed["dust_on_optics"]
+    assert (rays.cause, rays.end_s, rays.first_frame, rays.last_frame, rays.frames) == ("latch-up", 2, 0, 1, 2)
+    assert (dust.cause, dust.end_s, dust.largest_fraction) == ("heat", None, max(fractions))
 
 
 def test_common_causes_strike_together(scene: Path) -> None:
@@ -502,6 +661,25 @@ def test_events_are_listed_by_the_command(scene: Path, tmp_path: Path, call: Cal
         ({"cause": "c", "faults": ["dust_on_optics"], "onset_s": 1.0, "profile": "slow"}, r"event\[0\]\.profile"),
         ({"cause": "c", "faults": ["dust_on_optics"], "onset_s": 1.0, "profile": "growing"}, r"rise_s must be set"),
         ({"cause": "c", "faults": ["dust_on_optics"], "onset_s": 1.0, "rise_s": 1.0}, r"rise_s must not be set"),
+        (
+            {"cause": "c", "faults": ["dust_on_optics"], "onset_s": 1.0, "profile": "thermal"},
+            r'profile = "thermal": period_s must be set; it is for the profile intermittent and thermal',
+        ),
+        (
+            {"cause": "c", "faults": ["dust_on_optics"], "onset_s": 1.0, "profile": "until_reset"},
+            r"reset_s must be set; it is for the profile until_reset",
+        ),
+        ({"cause": "c", "faults": ["dust_on_optics"], "onset_s": 1.0, "reset_s": 2.0}, r"reset_s must not be set"),
+        (
+            {
+                "cause": "c",
+                "faults": ["dust_on_optics"],
+                "onset_s": [1.0, 5.0],
+                "profile": "until_reset",
+                "reset_s": [4.0, 9.0],
+            },
+            r"reset_s = 4: must be later than onset_s, which is up to 5",
+        ),
         (
             {
                 "cause": "c",

@@ -227,7 +227,13 @@ def case_poses(seeds: Seeds, rng: random.Random, here: Path) -> Case:
     if rng.random() < 0.5:
         event = {"cause": "c", "faults": ["dust_on_optics"], "onset_s": [1.0, 3.0], "duration_s": 2.0}
         event |= rng.choice(
-            [{}, {"profile": "growing", "rise_s": 2.0}, {"profile": "intermittent", "period_s": 1.0}]
+            [
+                {},
+                {"profile": "growing", "rise_s": 2.0},
+                {"profile": "intermittent", "period_s": 1.0},
+                {"profile": "thermal", "period_s": 90.0},
+                {"profile": "until_reset", "reset_s": 9.0},
+            ]
         )
         scene |= {"faults": {"dust_on_optics": {}}, "event": [changed(event, rng)]}
         scene["plan"] = {"classes_per_sample": [1, 1]}

@@ -49,12 +49,19 @@ class MosaicNoise:
     """Hold the variates of one exposure.
 
     `shot` are the standard normal variates of the shot noise [y, x], `readout` those of the readout. `seed` seeds
-    the generators of effects that need few variates.
+    the generators of effects that need few variates. `sequence` is the seed of the telegraph signals of a sequence,
+    and the time in s at which the exposure begins in it.
     """
 
     shot: NormalField
     readout: ReadoutNoise
     seed: int = 0
+    sequence: tuple[int, float] | None = None
+
+    @property
+    def telegraph(self) -> tuple[int] | tuple[int, float]:
+        """Return the seed of the telegraph signals, with the time of the exposure in a sequence."""
+        return self.sequence or (self.seed,)
 
     @classmethod
     def draw(
@@ -248,7 +255,7 @@ class Device:
         """Return the defects of each mosaic pixel in one exposure, uint8[y, x], as bits of `quantities.DEFECTS`."""
         out = self._kinds.copy()
         pixels = self.individual.rts
-        high = upper_fraction(self.telegraph, exposure_s, noise.seed) > 0.5
+        high = upper_fraction(self.telegraph, exposure_s, *noise.telegraph) > 0.5
         out[pixels.row[high], pixels.column[high]] |= RTS_HIGH
         return out
 

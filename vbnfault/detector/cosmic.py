@@ -20,6 +20,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtr, ndtri
 
+from ..core import hashing
+
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -281,14 +283,8 @@ def _pieces(start: F64, step: F64, end: F64) -> tuple[I64, F64, F64]:
 
 
 def _hash_uniform(key: NDArray[np.uint64]) -> F64:
-    """Return uniform 24 bit numbers in (0, 1) from keys.
-
-    This is the output function of SplitMix64 (Steele, Lea & Flood 2014, doi 10.1145/2660193.2660195).
-    """
-    z = (key + np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15)
-    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    z ^= z >> np.uint64(31)
+    """Return uniform 24 bit numbers in (0, 1) from keys."""
+    z = hashing.mixed((key + np.uint64(1)) * hashing.STEP)
     return ((z >> np.uint64(40)).astype(np.float64) + 0.5) * 2.0**-24
 
 

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from ..core import hashing
 from ..core.errors import InputError
 from ..core.tables import table_class
 
@@ -182,6 +183,10 @@ CCD_GROWTH = HotPixelGrowth(log10_scale=-1.849, size_power=-2.25, iso_power=0.68
 
 _SWITCHES = 32  # switching times drawn at once
 _MOST_CYCLES = 1e4  # signals with more cycles in an exposure use the normal approximation
+_MOST_MEMORIES = 64.0  # correlation times in an exposure
+# Events in a correlation time, of which one is expected: the chance of more than 12 is 6e-11.
+_MOST_EVENTS = 12
+_COUNT_CHANCE = np.cumsum([math.exp(-1) / math.factorial(k) for k in range(_MOST_EVENTS)])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -253,3 +258,54 @@ class Telegraph:
             fraction[quick] = np.clip(duty + spread * rng.standard_normal(len(duty)), 0, 1)
             end[quick] = rng.random(len(duty)) < duty
         return fraction, end
+
+    def expose_at(self, time_s: float, exposure_s: float, seed: int) -> F64:
+        """Return the fraction in the upper level of an exposure that begins at a time, float64[n] in [0, 1].
+
+        The signals of a seed are the same at all times, so that exposures in any order see one course of each. It
+        is exact: events at the rate 1/correlation_s, at which a signal forgets its level and is in the upper one
+        with the probability `duty`, are the same process. The last event before the exposure thus fixes the level
+        at its start, and nothing before it matters. Of exposures over `_MOST_MEMORIES` times that long, only the
+        start is of this course; they then go on as in `expose`.
+        """
+        start, span = time_s / self.correlation_s, exposure_s / self.correlation_s
+        begin = np.floor(start)
+        long = span > _MOST_MEMORIES
+        cell, span = begin.copy(), np.where(long, np.spacing(1.0), span)
+        number = np.arange(len(begin))
+        back = number[~(self._events(seed, number, cell)[0] <= (start - begin)[:, None]).any(axis=1)]
+        while len(back):
+            cell[back] -= 1
+            back = back[np.isinf(self._events(seed, back, cell[back])[0][:, 0])]
+        total, upper = np.zeros(len(begin)), np.zeros(len(begin), bool)
+        left = number
+        while len(left):
+            moment, after = self._events(seed, left, cell[left])
+            cuts = np.pad(moment, ((0, 0), (1, 1)), constant_values=((0, 0), (0, 1)))
+            cuts = np.clip(np.minimum(cuts, 1) + (cell - start)[left, None], 0, span[left, None])
+            level = np.concatenate([upper[left, None], after], axis=1)
+            total[left] += np.sum(np.diff(cuts, axis=1), axis=1, where=level)
+            upper[left] = level[np.arange(len(left)), np.isfinite(moment).sum(axis=1)]
+            cell[left] += 1
+            left = left[(cell - start - span)[left] < 0]
+        fraction = np.minimum(total / span, 1.0)
+        if long.any():
+            quick = Telegraph(**{name: values[long] for name, values in vars(self).items()})
+            rng = np.random.default_rng([seed, int(np.float64(time_s).view(np.uint64))])
+            fraction[long] = quick.expose(fraction[long] > 0.5, exposure_s, rng)[0]
+        return fraction
+
+    def _events(self, seed: int, number: NDArray[np.intp], cell: F64) -> tuple[F64, NDArray[np.bool_]]:
+        """Return the events of signals within a cell of one correlation time, and the level after each.
+
+        The moments are float64[n, `_MOST_EVENTS`], rising in [0, 1) from the start of the cell, infinite behind the
+        last event. The levels are bool of this shape.
+        """
+        key = hashing.mixed(number.astype(np.uint64) * hashing.STEP + np.uint64(seed))
+        key = hashing.mixed(key + cell.astype(np.int64).astype(np.uint64) * hashing.STEP)
+        numbers = np.arange(1, 2 * _MOST_EVENTS + 2, dtype=np.uint64) * hashing.STEP
+        drawn = hashing.uniform(hashing.mixed(key[:, None] + numbers))
+        count = np.searchsorted(_COUNT_CHANCE, drawn[:, :1], side="right")
+        moment, level = drawn[:, 1 : 1 + _MOST_EVENTS], drawn[:, 1 + _MOST_EVENTS :]
+        moment = np.where(np.arange(_MOST_EVENTS) < count, moment, np.inf)
+        return np.sort(moment, axis=1), level < self.duty[number, None]

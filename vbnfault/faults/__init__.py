@@ -1,6 +1,6 @@
 """Define the fault classes and their models; `contract` states what every model follows."""
 
-from .context import FaultContext, Params
+from .context import FaultContext, FrameBefore, Params
 from .contract import MOSAIC_STEPS, QUANTITIES, STEPS, Fault
 from .fields import Interval, Severity, bounds, choice, flag, number, path, rows, text
 from .levels import LEVELS, Levels, ModelLevels, SeverityTable, read_table
@@ -23,6 +23,7 @@ __all__ = [
     "STEPS",
     "Fault",
     "FaultContext",
+    "FrameBefore",
     "Interval",
     "Levels",
     "ModelLevels",

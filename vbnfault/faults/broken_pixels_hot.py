@@ -7,7 +7,7 @@ that the device has by then and did not have before:
 - bulk damage of displaced atoms (Srour & Lo 2000; Belloir 2016; Le Roch 2019),
 - hot pixels with an offset (Chapman et al.: I = m (R T + b)),
 - dead and stuck pixels,
-- random telegraph signals, each in its state at the exposure.
+- random telegraph signals, each in its state at the exposure; in a sequence they blink from frame to frame.
 
 Defects spread to neighbouring pixels by demosaicing. In a CCD, charge is clocked past the defects. A hot pixel
 therefore draws a line on the side away from the register (`detector.charge.passing_dark_e`).
@@ -222,7 +222,7 @@ def _damage(params: Params, context: FaultContext) -> _Damage:
     new = {name: column[len(own.rts) :] for name, column in columns.items()}
     rts = RtsPixels(**new, reference_K=old.rts.reference_K)
     signals = rts.at(device.temperature_K)
-    high = upper_fraction(signals, exposure_s, params["telegraph_seed"]) if len(rts) else np.zeros(0)
+    high = upper_fraction(signals, exposure_s, params["telegraph_seed"], context.time_s)
     more = dark_rate_e_s(old, device.temperature_K) - dark_rate_e_s(own, device.temperature_K)
     np.maximum(more, 0, out=more)  # annealing must not remove dark current of the device itself
     jumps = np.zeros(device.shape, dtype=np.float32)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..camera import Camera
 from ..core import spectra
-from ..core.quantities import FarSource, Radiance
+from ..core.quantities import RGBI, Electrons, FarSource, Radiance
 from ..core.shared_results import SharedResults
 from ..core.sundisc import Pinhole
 from ..lens.image_frame import ImageFrame
@@ -20,6 +20,28 @@ from .fields import REFERENCE_WIDTH_PX
 
 Params = dict[str, Any]
 T = TypeVar("T")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FrameBefore:
+    """Hold what a frame of a sequence left behind, without the faults that use a frame before themselves.
+
+    Attributes
+    ----------
+    image
+        The finished image.
+    light
+        Expected electrons on the sensor, before faults act on them: those that last act in the frame itself.
+    held_e
+        float32[y, x]: electrons that each pixel held, for a detector with a mosaic.
+    end_s
+        End of its exposure, in the time of the sequence.
+    """
+
+    image: RGBI
+    light: Electrons
+    held_e: NDArray[np.float32] | None
+    end_s: float
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -57,6 +79,10 @@ class FaultContext:
     coating_loss
         Fraction of the coatings' area that another fault of the sample has removed, in [0, 1]. Only a model with
         `Fault.informed` gets it; for the others it is 0.
+    time_s
+        Time at which the exposure begins in its sequence; None for an image of no sequence.
+    before
+        Function that makes the frame before this one in its sequence; None if there is none.
     of_view
         Results that all samples of the view share (`dataset.variants_per_view`). What is kept here may depend on
         the camera's lens and on the light of the view; everything else belongs to the key.
@@ -75,6 +101,8 @@ class FaultContext:
     surroundings: tuple[Radiance, ...] = ()
     far_sources: tuple[FarSource, ...] = ()
     coating_loss: float = 0.0
+    time_s: float | None = None
+    before: Callable[[], FrameBefore] | None = field(default=None, repr=False)
     of_view: SharedResults = field(default_factory=SharedResults, repr=False)
     # `init=False`, because `dataclasses.replace` must not copy results of one frame to another
     _memo: dict[Any, Any] = field(default_factory=dict, init=False, repr=False)

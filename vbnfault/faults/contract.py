@@ -92,6 +92,8 @@ class Fault:
     per_exposure
         True if the fault happens during one exposure, as a cosmic ray does, so that each image of a sequence has
         its own draw. False: it is a state of the instrument, which lasts.
+    uses_before
+        True if the model reads the frame before in a sequence, which is then made without such faults.
     effect_mask
         True if the mask holds the pixels that change (see `effect_level_dn`) instead of the footprint.
     soft_layer
@@ -124,6 +126,7 @@ class Fault:
     needs_ccd: ClassVar[bool] = False
     severity: ClassVar[Severity | None] = None
     per_exposure: ClassVar[bool] = False
+    uses_before: ClassVar[bool] = False
     effect_mask: ClassVar[bool] = False
     soft_layer: ClassVar[str] = ""
     lens_of_thin_camera: ClassVar[str] = ""

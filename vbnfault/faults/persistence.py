@@ -14,7 +14,8 @@ and never more than N. A trap_fraction of 0.003 is of the order of Hubble's WFC3
 
 A still has no exposure before. The light of `source = "frame"` is that of this frame as the camera saw it before it
 turned: displaced, with what lies beyond the edges mirrored, and brighter or fainter by a factor. That of "sun" is
-the Sun's disc, full wells at a drawn place. A sequence would hand over the real one.
+the Sun's disc, full wells at a drawn place. In a sequence, both "drawn" and "frame" are the charge that the frame
+before left in the pixels, and w is the time since then.
 """
 
 from __future__ import annotations
@@ -31,6 +32,8 @@ from .contract import Fault
 from .fields import Interval, Severity, bounds, choice, number
 from .planes import F32, displaced, draw_shift
 
+_SHORTEST_WAIT_S = 1e-3
+
 
 @dataclass(frozen=True, kw_only=True)
 class Persistence(Fault):
@@ -44,6 +47,7 @@ class Persistence(Fault):
     severity = Severity(key="lag_fraction", low=1e-4, high=0.5)
     needs_mosaic = True
     per_exposure = True
+    uses_before = True
     localised = False
     effect_mask = True
 
@@ -58,7 +62,11 @@ class Persistence(Fault):
     )
     power: float = number(1.0, limits=(0.1, 3), doc="power of the time by which the release falls")
     wait_s: Interval = bounds(
-        0.1, 10.0, limits=(1e-3, 1e6), unit="s", doc="from the end of that exposure to the start of this; assumed"
+        0.1,
+        10.0,
+        limits=(_SHORTEST_WAIT_S, 1e6),
+        unit="s",
+        doc="from the end of that exposure to the start of this; assumed",
     )
     exposure_factor: Interval = bounds(
         1.0, 30.0, limits=(0, 1e6), doc="light of that exposure over that of this, for frame; assumed"
@@ -76,8 +84,13 @@ class Persistence(Fault):
         keys = (self.lag_fraction, self.trap_fraction, self.wait_s, self.exposure_factor)
         lag, trapped, wait_s, factor = (bound.uniform(rng) for bound in keys)
         params: Params = {"source": source if self.source == "drawn" else self.source, "wait_s": wait_s}
+        if context.before is not None and context.time_s is not None and self.source != "sun":
+            wait_s = max(context.time_s - context.before().end_s, _SHORTEST_WAIT_S)
+            params = {"source": "before", "wait_s": wait_s}
         later = trapped * power_integral(self.power, wait_s, wait_s + context.camera.exposure_s)
         params["released"] = min(lag + later, 1.0)
+        if params["source"] == "before":
+            return params
         if params["source"] == "sun":
             return params | {"sun_xy_px": [round(float(k), 2) for k in place]}
         return params | {"shift_px": shift, "exposure_factor": factor}
@@ -85,7 +98,10 @@ class Persistence(Fault):
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
         """Return the expected electrons with those that are released."""
         full_e = np.float32(context.camera.mosaic.sensor.readout.full_well_e)
-        if params["source"] == "sun":
+        if params["source"] == "before":
+            assert context.before is not None
+            held = np.asarray(context.before().held_e)
+        elif params["source"] == "sun":
             held = full_e * _sun(params["sun_xy_px"], context)
         else:
             light = displaced(quantity.array, *params["shift_px"]) * np.float32(params["exposure_factor"])

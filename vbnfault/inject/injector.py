@@ -23,7 +23,7 @@ from ..pipeline.development import Development, Draws, without
 from ..pipeline.exposure import reference_exposure_s
 from ..pipeline.injection import draw_faults, visible_draws
 from ..pipeline.labels import labels_of
-from ..pipeline.spec import Draw, Injection, Labels, SceneExposure, SceneLight, is_state, mask_any_faults
+from ..pipeline.spec import Draw, Injection, Labels, SceneExposure, SceneLight, lasts, mask_any_faults
 from ..scene import keyed_random
 from ..scene.config import Scene, configure_faults, load_scene, parse_scene
 from ..scene.instrument import CameraTable, ImageTable
@@ -148,7 +148,7 @@ class _Drawing:
 
     def rng(self, stage: str, name: str) -> np.random.Generator:
         """Return the generator for (stage, name); faults that last from image to image follow `state`."""
-        state = self.state if stage == "fault" and is_state(self, name.partition("/")[0]) else None
+        state = self.state if lasts(self, stage, name) else None
         return keyed_random.rng(self.seed, self.index if state is None else state, stage, name)
 
 

@@ -7,6 +7,7 @@ are computed once. They are kept by the draws that they depend on, each identifi
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..camera import Camera
 from ..core.quantities import RGBI, Electrons
-from ..faults import MOSAIC_STEPS, Fault, FaultContext, physical_order
+from ..faults import MOSAIC_STEPS, Fault, FaultContext, FrameBefore, physical_order
 from . import masks
 from .spec import Draw, Images, Injection, SampleSpec, SceneExposure, stored_layers
 
@@ -77,7 +78,11 @@ class Development:
     @cached_property
     def noise(self) -> Any:
         """Return the variates of the exposure, which all its images share."""
-        return self.exposure.camera.detector.draw_noise(self.context.shape, lambda name: self.rng("detector", name))
+        detector, time_s = self.exposure.camera.detector, self.context.time_s
+        noise = detector.draw_noise(self.context.shape, lambda name: self.rng("detector", name))
+        if time_s is None or detector.mosaic is None:
+            return noise
+        return replace(noise, sequence=(int(self.rng("sequence", "telegraph").integers(2**63)), time_s))
 
     # --- camera and context ----------------------------------------------------------------------------------
 
@@ -241,6 +246,19 @@ class Development:
             if keep:
                 self._raws[key] = raw
         return raw
+
+    def left_behind(self, draws: Draws) -> FrameBefore:
+        """Return what the exposure leaves behind for the next frame of its sequence."""
+        camera, held_e = self.camera_with(draws), None
+        if camera.detector.mosaic is not None:
+            light = self.signal(draws, acting_at(draws, "electrons")).merged
+            held_e = camera.mosaic.held_e(light, camera.exposure_s, self.noise, self.acts(draws))
+        return FrameBefore(
+            image=self.image(draws),
+            light=self.signal(draws, []).merged,
+            held_e=held_e,
+            end_s=(self.context.time_s or 0.0) + camera.exposure_s,
+        )
 
     def defects(self, draws: Draws) -> NDArray[np.uint8]:
         """Return the defects of the mosaic's pixels, uint8[y, x]: those of the device and those of the faults."""

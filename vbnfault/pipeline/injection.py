@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from ..faults import FaultContext
+from ..faults import FaultContext, FrameBefore
 from .development import Development, Draws, acting_at, informs
 from .spec import Draw, Drawing, Injection, Pose, Rendering, SampleSpec, SceneExposure, is_state, stored_layers
 
@@ -25,11 +26,13 @@ def inject_faults(
     commanded: Sequence[str] | None = None,
     *,
     redrawn: bool = False,
+    before: Callable[[], FrameBefore] | None = None,
 ) -> Injection:
     """Draw the commanded faults of a sample. `views` is the number of its views that were rendered so far.
 
-    `commanded` are the faults; by default those that the plan commands. With `redrawn`, nothing is drawn in a view
-    in whose place another one is needed in any case (`asking_for_another_view`).
+    `commanded` are the faults; by default those that the plan commands. `before` makes the frame before in a
+    sequence. With `redrawn`, nothing is drawn in a view in whose place another one is needed in any case
+    (`asking_for_another_view`).
 
     A fault without a visible effect is drawn again a few times, then left out. So the result holds the faults that
     are in the image, and labels never claim more. A state of the instrument is not drawn again in a sequence.
@@ -39,7 +42,7 @@ def inject_faults(
         commanded = [name for name in commanded if not spec.faults[name].needs_sun]
     development = Development(
         exposure=exposure,
-        context=fault_context(pose, rendering, exposure),
+        context=replace(fault_context(pose, rendering, exposure), before=before),
         rng=spec.rng,
         twins=[name for name in spec.faults if f"without_{name}" in stored_layers(spec.scene, spec.faults)],
     )
@@ -113,6 +116,7 @@ def fault_context(pose: Pose, rendering: Rendering, exposure: SceneExposure) -> 
         radiance=exposure.light.rendered,
         surroundings=rendering.surroundings,
         far_sources=rendering.far_sources,
+        time_s=pose.time_s,
         of_view=rendering.shared,
     )
 

@@ -446,6 +446,7 @@ def in_local_frame(site: Site, flown: FlownPose) -> Pose:
         tries=1,
         variables={},
         resolved=True,
+        time_s=flown.time_s if flown.sequence >= 0 else None,
     )
 
 

@@ -6,7 +6,7 @@ import json
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -347,14 +347,16 @@ class Session:
             terrain = self.terrain(self.ground_detail(index))
         else:
             terrain = self.model_terrain(site) if aims else self.terrain(site)
+        flown = None if self.trajectory is None else self.trajectory.pose(index)
         return SampleSpec(
             index=index,
             scene=self.dated_scene(index),
             plan=self.plan,
             faults=self.faults,
             terrain=terrain,
-            flown=None if self.trajectory is None else self.trajectory.pose(index),
+            flown=flown,
             terrain_of=self.aimed_terrain if aims else None,
+            before=partial(self._spec, index - 1) if flown is not None and flown.frame > 0 else None,
         )
 
     def dated_scene(self, index: int) -> Scene:

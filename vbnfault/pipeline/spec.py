@@ -54,7 +54,8 @@ class Pose:
     `tries` counts the views drawn; this is the last of them. `variables` are the values of the plan, by the names
     of `redraw.VARIABLES`. `resolved` says whether every condition is met. It is False only if a trajectory places
     the camera, a fault of the sample needs the Sun, and the camera does not see the whole Sun ahead. `terrain` is
-    the terrain that was made for this pose, if it is not that of the specification.
+    the terrain that was made for this pose, if it is not that of the specification. `time_s` is its time in a
+    sequence, if it is of one.
     """
 
     position_L_m: F64
@@ -67,6 +68,7 @@ class Pose:
     variables: Mapping[str, float]
     resolved: bool
     terrain: Terrain | None = None
+    time_s: float | None = None
 
     @property
     def sees_sun(self) -> bool:
@@ -97,12 +99,19 @@ def is_state(drawing: Drawing, fault: str) -> bool:
     return fault in drawing.faults and not drawing.faults[fault].per_exposure
 
 
+def lasts(drawing: Drawing, stage: str, name: str) -> bool:
+    """Return whether the random numbers of (stage, name) are those of all images of a sequence."""
+    return stage == "sequence" or (stage == "fault" and is_state(drawing, name.partition("/")[0]))
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SampleSpec:
     """Hold one sample of a plan, with everything that `simulate` needs.
 
     `flown` is the pose of the sample if a table of poses gives it. If the camera aims, `terrain` is the shape model
     as it is, and `terrain_of` makes the terrain of a pose. `taken_with` is a camera in place of the scene's.
+    `before` returns the frame before in a sequence. With `is_before`, the sample is taken as the frame before
+    another one, and without the faults that use one.
     """
 
     index: int
@@ -113,6 +122,8 @@ class SampleSpec:
     flown: FlownPose | None = None
     terrain_of: Callable[[FlownPose], Terrain] | None = None
     taken_with: Camera | None = None
+    before: Callable[[], SampleSpec] | None = None
+    is_before: bool = False
 
     def at(self, pose: Pose) -> SampleSpec:
         """Return the specification with the terrain of a pose."""
@@ -126,7 +137,8 @@ class SampleSpec:
     @property
     def commanded(self) -> tuple[str, ...]:
         """Return the faults that the sample is commanded to carry now, in dataset order."""
-        return tuple(name for name in self.plan.commanded(self.index) if self.fraction(name) > 0)
+        planned = (name for name in self.plan.commanded(self.index) if self.fraction(name) > 0)
+        return tuple(name for name in planned if not (self.is_before and self.faults[name].uses_before))
 
     @property
     def commanded_in_view(self) -> tuple[str, ...]:
@@ -158,8 +170,8 @@ class SampleSpec:
 
     def rng(self, stage: str, name: str) -> np.random.Generator:
         """Return the random generator of this sample for (stage, name); states of the instrument last."""
-        lasts = stage == "fault" and is_state(self, name.partition("/")[0])
-        return keyed_random.rng(self.seed, int(self.plan.state[self.index]) if lasts else self.index, stage, name)
+        index = self.plan.state[self.index] if lasts(self, stage, name) else self.index
+        return keyed_random.rng(self.seed, int(index), stage, name)
 
     @property
     def shares_state(self) -> bool:

@@ -11,11 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache, partial
 from typing import ParamSpec, Protocol, TypeVar
 
 from ..core.errors import VbnfaultError
 from ..core.quantities import Radiance
 from ..core.shared_results import SharedResults
+from ..faults import FrameBefore
 from .development import take_images
 from .exposure import add_stars, meter
 from .injection import asking_for_another_view, inject_faults
@@ -173,10 +175,18 @@ def _expose(
     exposure = run(add_stars, spec, pose, rendering, exposure)
     # a second copy of the light without stars takes 37 MB for 1024 pixels
     rendering = replace(rendering, light=exposure.light)
-    injection = run(inject_faults, spec, pose, rendering, exposure, views, redrawn=redrawn)
+    before = cache(partial(_frame_before, spec.before)) if spec.before and not spec.is_before else None
+    injection = run(inject_faults, spec, pose, rendering, exposure, views, redrawn=redrawn, before=before)
     return _RenderedView(
         spec=spec, pose=pose, rendering=rendering, starless=starless, exposure=exposure, injection=injection
     )
+
+
+def _frame_before(spec_of: Callable[[], SampleSpec]) -> FrameBefore:
+    """Return what the frame before left behind; it is made anew, so that no order of the samples matters."""
+    spec = replace(spec_of(), is_before=True)
+    injection = _take_view(spec, run_stage, SharedViews(), views=1, first_try=0).injection
+    return injection.development.left_behind(injection.draws)
 
 
 def _why_unseen(view: _RenderedView) -> str:

@@ -6,6 +6,7 @@ are drawn once for a sequence. Faults of no event are there from the first frame
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 else:
     Times = Annotated[float, Field(ge=-_LONGEST_S, le=_LONGEST_S)] | pair_within(-_LONGEST_S, _LONGEST_S)
     Spans = Annotated[float, Field(ge=_SHORTEST_S, le=_LONGEST_S)] | pair_within(_SHORTEST_S, _LONGEST_S)
-_NEEDS = {"sudden": (), "growing": ("rise_s",), "intermittent": ("period_s",)}
+_PROFILES_WITH = {"rise_s": ("growing",), "period_s": ("intermittent", "thermal"), "reset_s": ("until_reset",)}
 
 
 class EventTable(Table):
@@ -39,24 +40,35 @@ class EventTable(Table):
     duration_s: Spans | None = Field(
         None, description="how long it lasts, or bounds; by default to the end of the sequence"
     )
-    profile: Literal["sudden", "growing", "intermittent"] = Field(
+    profile: Literal["sudden", "growing", "intermittent", "thermal", "until_reset"] = Field(
         "sudden",
         description="sudden: there at once; growing: from nothing to all of it in rise_s, for the models that "
-        "grow; intermittent: on for the fraction duty of each period_s",
+        "grow; intermittent: on for the fraction duty of each period_s; thermal: rises and falls once in each "
+        "period_s, and is there for the fraction duty of it; until_reset: there at once, until reset_s",
     )
     rise_s: Spans | None = Field(None, description="time in which a growing fault is whole, or bounds")
-    period_s: Spans | None = Field(None, description="period of an intermittent fault, or bounds")
+    period_s: Spans | None = Field(
+        None, description="period of an intermittent or thermal fault, such as that of the orbit, or bounds"
+    )
     duty: Annotated[float, Field(gt=0, lt=1)] = Field(
-        0.5, description="fraction of its period for which an intermittent fault is on"
+        0.5, description="fraction of its period for which an intermittent or thermal fault is there"
+    )
+    reset_s: Times | None = Field(
+        None, description="time of the reset after which it does not come back, or bounds"
     )
 
     @model_validator(mode="after")
     def _has_what_its_profile_needs(self) -> EventTable:
-        for profile, names in _NEEDS.items():
-            for name in names:
-                if (getattr(self, name) is None) == (profile == self.profile):
-                    verb = "must be set" if profile == self.profile else "must not be set"
-                    raise ValueError(f'profile = "{self.profile}": {name} {verb}; it is for the profile {profile}')
+        for name, profiles in _PROFILES_WITH.items():
+            needed = self.profile in profiles
+            if (getattr(self, name) is None) == needed:
+                verb = "must be set" if needed else "must not be set"
+                raise ValueError(
+                    f'profile = "{self.profile}": {name} {verb}; it is for the profile {" and ".join(profiles)}'
+                )
+        if self.reset_s is not None and np.min(self.reset_s) <= np.max(self.onset_s):
+            reset_s, onset_s = float(np.min(self.reset_s)), float(np.max(self.onset_s))
+            raise ValueError(f"reset_s = {reset_s:g}: must be later than onset_s, which is up to {onset_s:g}")
         return self
 
 
@@ -72,6 +84,7 @@ class Event:
     rise_s: float
     period_s: float
     duty: float
+    phase_rad: float
 
     def fraction(self, time_s: float) -> float:
         """Return how much of the faults is there at a time, from 0, nothing, to 1."""
@@ -82,6 +95,10 @@ class Event:
             return min(since_s / self.rise_s, 1.0)
         if self.profile == "intermittent":
             return float(since_s % self.period_s < self.duty * self.period_s)
+        if self.profile == "thermal":
+            warmth = math.cos(2 * math.pi * since_s / self.period_s + self.phase_rad)
+            least = math.cos(math.pi * self.duty)
+            return max((warmth - least) / (1 - least), 0.0)
         return 1.0
 
 
@@ -90,19 +107,20 @@ def events_of_sequence(scene: Scene, state: int) -> tuple[Event, ...]:
     out = []
     for number, table in enumerate(scene.event):
         rng = keyed_random.rng(scene.dataset.seed, state, "plan", f"event/{number}")
-        onset_s, duration_s, rise_s, period_s = (
-            _drawn(getattr(table, name), rng) for name in ("onset_s", "duration_s", "rise_s", "period_s")
+        onset_s, duration_s, rise_s, period_s, reset_s = (
+            _drawn(getattr(table, name), rng) for name in ("onset_s", "duration_s", "rise_s", "period_s", "reset_s")
         )
         out.append(
             Event(
                 cause=table.cause,
                 faults=table.faults,
                 onset_s=onset_s,
-                end_s=onset_s + duration_s,
+                end_s=min(onset_s + duration_s, reset_s),
                 profile=table.profile,
                 rise_s=rise_s,
                 period_s=period_s,
                 duty=table.duty,
+                phase_rad=2 * math.pi * float(rng.random()),
             )
         )
     return tuple(out)

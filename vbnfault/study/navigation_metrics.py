@@ -21,7 +21,7 @@ from ..core.errors import VbnfaultError
 from ..core.quantities import BODY, SKY, Truth
 from ..pipeline.development import Development, informs
 from ..pipeline.injection import draw_faults, fault_context
-from ..pipeline.spec import Draw, Injection, Pose, Rendering, SampleSpec, SceneExposure, is_state
+from ..pipeline.spec import Draw, Injection, Pose, Rendering, SampleSpec, SceneExposure, lasts
 from ..scene import keyed_random
 from .spec import Metric, returned
 
@@ -122,7 +122,7 @@ class _LaterView(SampleSpec):
 
     def rng(self, stage: str, name: str) -> np.random.Generator:
         """Return the random generator of this view for (stage, name); that of the sample for lasting faults."""
-        if stage == "fault" and is_state(self, name.partition("/")[0]):
+        if lasts(self, stage, name):
             return super().rng(stage, name)
         return keyed_random.rng(self.seed, self.index, stage, f"{name}/view/{self.view}")
 

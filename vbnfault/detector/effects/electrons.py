@@ -41,7 +41,7 @@ class TelegraphSignals(Effect):
         if not len(pixels):
             return signal
         signals, noise = device.telegraph, exposure.noise
-        upper = signals.duty if noise is None else upper_fraction(signals, exposure.exposure_s, noise.seed)
+        upper = signals.duty if noise is None else upper_fraction(signals, exposure.exposure_s, *noise.telegraph)
         high_e_s = signals.amplitude_e_s * upper
         np.add.at(signal, (pixels.row, pixels.column), high_e_s * exposure.exposure_s)
         if device.transfer_dark_e is not None:  # charge that passes these pixels collects this signal, too
@@ -88,7 +88,14 @@ def dark_factor(exposure: Exposure) -> float:
     return silicon_factor(mean_K + drift_K * float(np.clip(rng.standard_normal(), -3, 3)), mean_K)
 
 
-def upper_fraction(signals: Telegraph, exposure_s: float, seed: int) -> NDArray[np.float64]:
-    """Return the fraction of an exposure that each telegraph signal spends in its upper level, float64[n]."""
+def upper_fraction(
+    signals: Telegraph, exposure_s: float, seed: int, time_s: float | None = None
+) -> NDArray[np.float64]:
+    """Return the fraction of an exposure that each telegraph signal spends in its upper level, float64[n].
+
+    With `time_s`, at which the exposure begins, all exposures of a seed see one course of the signals.
+    """
+    if time_s is not None:
+        return signals.expose_at(time_s, exposure_s, seed)
     rng = np.random.default_rng(seed)
     return signals.expose(signals.start(rng), exposure_s, rng)[0]
