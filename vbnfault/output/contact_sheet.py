@@ -144,7 +144,7 @@ def abbreviations(faults: Sequence[str]) -> dict[str, str]:
 
 
 def names_that_fit(faults: Sequence[str], width_px: int) -> dict[str, str]:
-    """Return the name of each fault, or its abbreviation where all names do not fit in a caption of a tile's width."""
+    """Return the name of each fault, or abbreviations where all names do not fit in a caption of a tile's width."""
     words = {fault: fault.replace("_", " ") for fault in faults}
     needed = 16 + sum(22 + _text_width(name, 0.4) for name in words.values())
     return words if needed <= min(width_px, _CAPTION_GROWS_PX) else abbreviations(faults)
@@ -287,7 +287,9 @@ def _header(name: str, faults: Sequence[str], short: Mapping[str, str], width: i
 def _write(image: U8, text: str, position: tuple[int, int], colour: tuple[int, int, int], scale: float) -> None:
     """Draw text into an image; `at`: the lower left corner (x, y)."""
     plain = text.encode("ascii", "replace").decode()  # OpenCV's font has ASCII characters only
-    cv2.putText(image, plain, position, cv2.FONT_HERSHEY_SIMPLEX, scale, colour, max(1, round(2 * scale)), cv2.LINE_AA)
+    cv2.putText(
+        image, plain, position, cv2.FONT_HERSHEY_SIMPLEX, scale, colour, max(1, round(2 * scale)), cv2.LINE_AA
+    )
 
 
 def _text_width(text: str, scale: float) -> int:

@@ -112,9 +112,6 @@ class Format(ABC):
                 raise TypeError(f"{cls.__qualname__}: name = {cls.name!r}: must be lower-case letters and digits")
             _registry.add(cls.name, cls, module=cls.__module__, qualname=cls.__qualname__)
 
-    def check(self, spec: StoreSpec) -> None:
-        """Refuse what cannot be exported, before anything is written. Raises InputError."""
-
     @abstractmethod
     def layers(self, spec: StoreSpec) -> Collection[str]:
         """Return the names of the layers that the format reads; each is a layer of `spec`."""

@@ -111,7 +111,6 @@ def export_store(
             + ("leaves out smaller instances" if kind.has_instances else "has no instances, so it must be 1")
         )
     _check_sequences(store, kind, fps)
-    kind.check(store.spec)
     identity = {
         "format": format,
         "vbnfault": __version__,
@@ -175,8 +174,8 @@ def _check_sequences(store: Store, kind: Format, fps: float | None) -> None:
     """Refuse films of a store without sequences, and a frame rate out of range or of another format."""
     if kind.by_sequence and not store.spec.sequence_names:
         raise InputError(
-            f"{store.path}: has no sequences, of which {kind.name} makes films: trajectory.file of its scene has neither "
-            "a column sequence nor time_s; export single images as png"
+            f"{store.path}: has no sequences, of which {kind.name} makes films: trajectory.file of its scene has "
+            "neither a column sequence nor time_s; export single images as png"
         )
     if fps is not None and not kind.by_sequence:
         raise InputError(f"--fps {shown(fps)}: {kind.name} has no films; leave it out")
@@ -206,7 +205,9 @@ def _column(store: Store, name: str, number: int) -> NDArray[Any]:
 def _parts(store: Store, kind: Format, min_area_px: int, fps: float | None) -> tuple[ExportPart, ...]:
     """Return the parts of an export: of each split, in ascending order, some samples or a sequence."""
     split = [str(name) for number in range(store.shards) for name in _column(store, "split", number)]
-    sequence = np.concatenate([_column(store, "sequence", n) for n in range(store.shards)]) if kind.by_sequence else ()
+    sequence = (
+        np.concatenate([_column(store, "sequence", n) for n in range(store.shards)]) if kind.by_sequence else ()
+    )
     parts: list[ExportPart] = []
     if not {*split} <= {*SPLITS}:  # only a sample that is not built has none: "" would name the root folder
         raise VbnfaultError(f"{store.path}: a split is none of {', '.join(SPLITS)}; the build command repairs it")

@@ -363,7 +363,7 @@ class Listing:
 
     @cached_property
     def times(self) -> bytes:
-        """Return float64[sample] and int32[sample]: time in the sequence in s, and the sequence; -1: cannot be read."""
+        """Return time in the sequence in s, float64[sample], and the sequence, int32[sample], -1 if unreadable."""
         store, begun = self.store, self.store.begun()
         time_s, sequence = np.zeros(store.samples, dtype="<f8"), np.full(store.samples, -1, dtype="<i4")
         for name, column in (("time_s", time_s), ("sequence", sequence)):
