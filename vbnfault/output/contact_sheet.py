@@ -151,7 +151,11 @@ def names_that_fit(faults: Sequence[str], width_px: int) -> dict[str, str]:
 
 
 def overlay(
-    rgb: U8, mask: NDArray[np.bool_], injected: Sequence[bool], localised: Sequence[bool] | None = None
+    rgb: U8,
+    mask: NDArray[np.bool_],
+    injected: Sequence[bool],
+    localised: Sequence[bool] | None = None,
+    line_px: int | None = None,
 ) -> U8:
     """Return an RGB image with the masks of the injected faults drawn on it, each as a tint and an outline.
 
@@ -168,10 +172,12 @@ def overlay(
         Which faults are injected, bool[fault].
     localised
         Which classes mark parts of an image, bool[fault]; by default all.
+    line_px
+        Width of the outlines; by default a 300th of the image's longer side.
     """
     out = rgb.copy()
     height, width = rgb.shape[:2]
-    line = max(1, round(max(height, width) / 300))
+    line = line_px or max(1, round(max(height, width) / 300))
     borders = 0
     for k in sorted(np.flatnonzero(injected).tolist(), key=lambda k: -int(mask[k].sum())):
         colour = COLOURS[k % len(COLOURS)]
@@ -204,7 +210,7 @@ def tile(spec: StoreSpec, sample: Sample, names: Mapping[str, str], side_px: int
     if "mask" in sample.layers:
         small = np.stack([resized_mask(m, size) for m in sample.layers["mask"]])
         localised = [fault in (spec.localised_faults or ()) for fault in spec.faults]
-        rgb = overlay(rgb, small, injected.tolist(), localised)
+        rgb = overlay(rgb, small, injected.tolist(), localised, max(1, round(side_px / 700)))
     drawn = np.full((size[1] + round(k * _CAPTION_PX), size[0], 3), _PANEL, np.uint8)
     drawn[: size[1]] = rgb
 
