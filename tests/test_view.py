@@ -573,6 +573,7 @@ def test_arrows_the_slider_and_the_end_of_a_sequence(page: Page, filmed: Served)
     page.press("ArrowRight")
     page.wait("!window.vbnfault.film.playing && window.vbnfault.view.index === 2")
     page.press("ArrowLeft")
+    page.evaluate("new Promise((done) => setTimeout(done, 700))")  # the next frame would have come after 600 ms
     page.wait(f"{title} === 'approach, frame 2 of 9'")
     page.evaluate("""(() => {
       const frame = document.getElementById("frame");
