@@ -110,7 +110,7 @@ def test_the_page_takes_nothing_from_elsewhere(served: Served) -> None:
     assert headers["Content-Security-Policy"].startswith("default-src 'self'")
     assert headers["Cross-Origin-Resource-Policy"] == "same-origin"
     assert b"http" not in body
-    for name in ("view.js", "film.js", "layers.js", "view.css"):
+    for name in ("view.js", "elements.js", "film.js", "layers.js", "view.css"):
         assert served.ask(f"/{name}")[0] == 200
 
 
@@ -599,3 +599,12 @@ def test_a_store_without_sequences_has_no_player(page: Page, served: Served) -> 
     page.wait("performance.getEntriesByName('sample').length")
     page.press(" ")
     assert page.evaluate("document.getElementById('film').hidden && !window.vbnfault.film.playing")
+
+
+@needs_browser
+def test_filters_leave_the_frames_of_a_film_that_pass(page: Page, filmed: Served) -> None:
+    ready(page, filmed)
+    page.click('[data-filter="classes:0"]')  # dust, from the fourth frame on
+    page.click('.tile[data-index="3"]')
+    page.wait("document.getElementById('sequence').textContent === 'approach, frame 1 of 6'")
+    assert page.evaluate("window.vbnfault.film.frames") == [3, 4, 5, 6, 7, 8]

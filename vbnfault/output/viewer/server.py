@@ -34,6 +34,7 @@ _BITS = 32
 _PAGE = {
     "": ("index.html", "text/html; charset=utf-8"),
     "view.js": ("view.js", "text/javascript; charset=utf-8"),
+    "elements.js": ("elements.js", "text/javascript; charset=utf-8"),
     "film.js": ("film.js", "text/javascript; charset=utf-8"),
     "layers.js": ("layers.js", "text/javascript; charset=utf-8"),
     "view.css": ("view.css", "text/css; charset=utf-8"),

@@ -1,14 +1,26 @@
 // Play the frames of a sequence one after the other, at the pace of their times.
-const $ = (id) => document.getElementById(id);
+import { $ } from "/elements.js";
+
 const SPEEDS = [0.1, 0.2, 0.5, 1, 2, 5, 10, 100, 1000, 10000]; // times real time
 const AHEAD = 3; // frames that are read before they are due
 
-// Return a player of the frames that `framesOf` gives for a sample, samples in the order of time. `time` gives the time of
-// one in s, `show` shows one and waits until it is drawn, `ahead` begins to read one, `paused` is called at each stop.
-export function player({ framesOf, time, title, show, ahead, paused }) {
+// Return a player of sequences. `names` has theirs, `times()` sequence and time of every sample, `order()` the samples that
+// pass the filters, or null. `show` shows a sample and waits until it is drawn, `ahead` begins to read one, `paused` is
+// called at each stop.
+export function player({ names, times, order, show, ahead, paused }) {
   const film = { frames: [], at: 0, playing: false, turn: 0, moved, play, pause };
-  const speed = $("speed");
-  let stepS = 0;
+  const speed = $("speed"), time = (index) => times().time_s[index];
+  let sequence = -2, passing = null, stepS = 0;
+
+  // Return the samples of a sample's sequence that pass the filters, or all; the same array until another is asked for.
+  function framesOf(index) {
+    const { sequence: all } = times(), passed = order();
+    if (all[index] === sequence && passed === passing && film.frames.includes(index)) return film.frames;
+    [sequence, passing] = [all[index], passed];
+    const of = (samples) => [...samples].filter((i) => all[i] === sequence);
+    const frames = of(passed ?? all.keys());
+    return frames.includes(index) ? frames : of(all.keys());
+  }
 
   // Show where a sample is in its sequence.
   function moved(index) {
@@ -23,7 +35,7 @@ export function player({ framesOf, time, title, show, ahead, paused }) {
     $("frame").value = film.at;
     const digits = stepS > 0 ? Math.min(6, Math.max(0, 1 - Math.floor(Math.log10(stepS)))) : 1;
     $("time").textContent = `${time(index).toFixed(digits).replace("-", "−")} s`;
-    $("sequence").textContent = `${title(index)}, frame ${film.at + 1} of ${frames.length}`;
+    $("sequence").textContent = `${names[sequence] ?? ""}, frame ${film.at + 1} of ${frames.length}`;
     $("film").hidden = false;
   }
 

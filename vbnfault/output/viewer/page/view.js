@@ -1,18 +1,9 @@
 // The page of `vbnfault view`: a grid of small images that scrolls any number of samples, and one sample at full size.
+import { $, coloured, grouped, make, words } from "/elements.js";
 import { player } from "/film.js";
 import { difference, paint, paintMasks, ramp, read, rooted } from "/layers.js";
 
-const $ = (id) => document.getElementById(id);
 const NOT_KNOWN = 255, GAP = 10, CAPTION = 26, MOST_PX = 2e7; // browsers cannot scroll elements of more than 3.3e7 px
-const make = (tag, properties = {}, ...children) => {
-  const element = Object.assign(document.createElement(tag), properties);
-  element.append(...children);
-  return element;
-};
-const coloured = (element, colour) => (element.style.setProperty("--c", `rgb(${colour.join()})`), element);
-const words = (name) => name.replaceAll("_", " ");
-const grouped = (number) => number.toLocaleString("en").replaceAll(",", "\u202f");
-
 const about = await (await fetch("/api/store")).json();
 const layerOf = new Map(about.layers.map((layer) => [layer.name, layer]));
 const clean = layerOf.has("clean");
@@ -335,23 +326,10 @@ const choices = () => {
   return names;
 };
 
-// Return the samples of a sample's sequence that pass the filters, or all; the same array where they are the same.
-const kept = { sequence: -2, order: null, frames: [] };
-function framesOf(index) {
-  const sequence = times.sequence[index];
-  if (sequence !== kept.sequence || order !== kept.order || !kept.frames.includes(index)) {
-    const isOne = (i) => times.sequence[i] === sequence;
-    const all = () => [...times.sequence.keys()].filter(isOne);
-    const passed = order ? [...order].filter(isOne) : all();
-    Object.assign(kept, { sequence, order, frames: passed.includes(index) ? passed : all() });
-  }
-  return kept.frames;
-}
-
 const film = player({
-  framesOf,
-  time: (index) => times.time_s[index],
-  title: (index) => about.sequences[times.sequence[index]] ?? "",
+  names: about.sequences,
+  times: () => times,
+  order: () => order,
   show: (index) => show(index),
   ahead: readAhead,
   paused: () => { located(); details(view.index, view.turn); },
