@@ -75,7 +75,7 @@ ONLY = {  # distribution → the packages or modules that import it
     "OpenEXR": {"core.files.images"},
     "tifffile": {"core.files.tiff"},
     "astropy": {"inject.files"},
-    "av": {"inject.films"},
+    "av": {"core.files.films"},
     "pdr": {"inject.planetary"},
     "pds4_tools": {"inject.planetary"},
 }

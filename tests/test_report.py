@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from browser import WHY_NOT, found, opened
+from sequences_kit import NAMES, sequences
 from synthetic import FAULTS, fake_sample, filled, flip, make_spec
 from typer.testing import CliRunner
 
@@ -19,6 +20,7 @@ from vbnfault import cli
 from vbnfault import store as st
 from vbnfault.core.errors import InputError
 from vbnfault.core.html_page import number_text
+from vbnfault.output.contact_sheet import film_strips
 from vbnfault.output.report import MOST_READ, MOST_SHOWN, write_report
 from vbnfault.output.report.charts import bin_edges, histogram
 from vbnfault.output.report.measure import Drawn, key_bounds, key_unit, read_drawn, read_pixels, read_scalars
@@ -314,3 +316,42 @@ def test_the_page_in_a_browser(described_store: Path, tmp_path: Path) -> None:
         assert min(h for h in page.evaluate(heights) if h) > 8
         assert page.errors == []
         assert {request.partition(":")[0] for request in page.requests} <= {"file", "data"}
+
+
+# --- sequences ----------------------------------------------------------------------------------------------------
+
+
+def test_film_strips_are_evenly_spaced_frames_of_some_sequences() -> None:
+    """Of 3 sequences of 9, 1 and 12 frames, counted by hand; of 6 sequences, the first, third, fourth and last."""
+    sequence = np.repeat([0, 1, 2], [9, 1, 12])
+    strips = [strip.tolist() for strip in film_strips(sequence, 4, 32, 8)]
+    assert strips == [[0, 1, 2, 3, 5, 6, 7, 8], [9], [10, 12, 13, 15, 16, 18, 19, 21]]
+    assert [strip.tolist() for strip in film_strips(sequence, 2, 6)] == [[0, 4, 8], [10, 16, 21]]
+    assert [sequence[0] for sequence in film_strips(np.arange(6), 4, 32, 8)] == [0, 2, 3, 5]
+    mixed = np.array([1, 0, 1, 0])
+    assert [strip.tolist() for strip in film_strips(mixed, 4, 8)] == [[1, 3], [0, 2]]
+
+
+def test_a_report_begins_with_film_strips(tmp_path: Path) -> None:
+    store = sequences(tmp_path / "s.zarr")
+    text = write_report(store, tmp_path / "r.html", samples=3).read_text(encoding="utf-8")
+    strips = re.findall(r'<h3 class="name">(.*?)</h3>\s*<div class="strip">(.*?)</div>', text, re.DOTALL)
+    assert [name for name, _ in strips] == list(NAMES)
+    shown = [[int(k) for k in re.findall(r'id="frame-(\d+)"', strip)] for _, strip in strips]
+    assert shown == [strip.tolist() for strip in film_strips(store.read("sequence"), 4, 32, 8)]
+    assert re.findall(r"</b> (\S+)\N{NO-BREAK SPACE}s ", strips[0][1])[:3] == ["5", "5.2", "5.4"]
+    assert strips[0][1].count('class="mask m0"') == sum(3 <= k <= 8 for k in shown[0])
+    assert "film strips of 3 of 3 sequences" in text
+    assert text.count('id="sample-') == 3
+    identifiers = re.findall(r'\bid="([^"]*)"', text)
+    assert len(identifiers) == len(set(identifiers))
+
+
+def test_frames_that_cannot_be_read_leave_their_strips(tmp_path: Path) -> None:
+    store = sequences(tmp_path / "s.zarr")
+    shutil.rmtree(store.path / "image" / "c" / "2")  # samples 8 to 11, among them all of the second sequence
+    with pytest.warns(UserWarning, match="the report leaves out what it cannot read"):
+        text = write_report(store, tmp_path / "r.html").read_text(encoding="utf-8")
+    frames = [int(k) for k in re.findall(r'id="frame-(\d+)"', text)]
+    assert frames == [0, 1, 2, 3, 5, 6, 7, 12, 13, 15, 16, 18, 19, 21]
+    assert "film strips of 2 of 3 sequences" in text

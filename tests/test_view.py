@@ -20,6 +20,8 @@ import numpy as np
 import pytest
 from browser import WHY_NOT, Page, found, opened
 from conftest import Called
+from sequences_kit import FRAMES, sequences
+from sequences_kit import NAMES as SEQUENCES
 from synthetic import FAULTS, fake_sample, filled, flip, make_spec
 
 from vbnfault import store as st
@@ -108,7 +110,7 @@ def test_the_page_takes_nothing_from_elsewhere(served: Served) -> None:
     assert headers["Content-Security-Policy"].startswith("default-src 'self'")
     assert headers["Cross-Origin-Resource-Policy"] == "same-origin"
     assert b"http" not in body
-    for name in ("view.js", "layers.js", "view.css"):
+    for name in ("view.js", "elements.js", "film.js", "layers.js", "view.css"):
         assert served.ask(f"/{name}")[0] == 200
 
 
@@ -302,6 +304,7 @@ def page() -> Iterator[Page]:
 def ready(page: Page, served: Served, first: str = "performance.getEntriesByName('first-image').length") -> None:
     """Open the page and wait for its listing and its first image, or what stands in its place."""
     page.goto("about:blank")
+    page.errors.clear()  # what an earlier page logs, such as refused requests, may come late
     page.goto(served.viewer.url)
     page.wait(f"window.vbnfault?.listing && {first}")
 
@@ -490,3 +493,120 @@ def test_more_samples_than_a_browser_can_scroll_px(page: Page, tmp_path: Path) -
         assert box[0] >= 40
         assert box[1] <= 768
         assert page.evaluate("document.querySelectorAll('.tile').length") < 100
+
+
+# --- sequences ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def filmed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    """A viewer of a store with sequences."""
+    with contextlib.closing(Served(sequences(tmp_path_factory.mktemp("view") / "s.zarr", step_s=600))) as one:
+        yield one
+
+
+def test_times_of_sequences_are_those_of_the_store(filmed: Served, served: Served) -> None:
+    status, body, _ = filmed.ask("/api/times")
+    samples = sum(FRAMES)
+    assert (status, len(body)) == (200, 12 * samples)
+    np.testing.assert_array_equal(np.frombuffer(body, "<f8", samples), filmed.store.read("time_s"))
+    np.testing.assert_array_equal(np.frombuffer(body, "<i4", offset=8 * samples), filmed.store.read("sequence"))
+    assert filmed.json("/api/store")["sequences"] == list(SEQUENCES)
+    assert served.ask("/api/times")[0] == 404
+
+
+SPEED = """(() => {{
+  const speed = document.getElementById("speed");
+  speed.value = "{}";
+  speed.dispatchEvent(new Event("change"));
+}})()"""
+
+
+def open_sample(page: Page, one: Served, index: int) -> None:
+    """Open a sample of a store with sequences, and note what its label of time will say."""
+    ready(page, one)
+    page.click(f'.tile[data-index="{index}"]')
+    page.wait("performance.getEntriesByName('sample').length && !document.getElementById('film').hidden")
+    page.evaluate("""(() => {
+      const time = document.getElementById("time");
+      window.noted = [];
+      new MutationObserver(() => window.noted.push(time.textContent)).observe(time, { childList: true });
+    })()""")
+
+
+@needs_browser
+def test_a_sequence_plays_frame_by_frame_and_keeps_its_buttons(page: Page, filmed: Served) -> None:
+    open_sample(page, filmed, 2)
+    assert page.evaluate("document.getElementById('sequence').textContent") == "approach, frame 3 of 9"
+    page.evaluate("window.button = document.querySelector('#masks [data-fault=\"0\"]')")
+    assert page.evaluate("document.getElementById('speed').value") == "1000"  # the least with a frame in a second
+    asked = len(page.requests)
+    page.press(" ")
+    page.wait("window.noted.length")
+    page.evaluate(SPEED.format(0.1))  # the next frame comes in 6000 s
+    page.wait("performance.getEntriesByName('sample').length === window.noted.length + 1")  # all frames are drawn
+    before = page.evaluate(_SUM)
+    page.click('#masks [data-fault="0"]')
+    assert page.evaluate(_SUM) != before
+    page.press("1")
+    assert page.evaluate(_SUM) == before
+    page.press("1")
+    assert page.evaluate("window.vbnfault.film.playing")
+    page.evaluate(SPEED.format(10000))
+    page.wait("!window.vbnfault.film.playing")
+    assert page.evaluate("window.noted") == [f"{5 + 600 * k} s" for k in range(3, 9)]
+    assert page.evaluate("window.vbnfault.view.hidden.has(0)")
+    assert page.evaluate("window.button.isConnected && window.button.getAttribute('aria-pressed')") == "false"
+    page.wait("document.querySelector('#parameters').textContent.length && location.hash === '#8'")
+    details = [url.rpartition("/")[2] for url in page.requests[asked:] if "/api/sample/" in url]
+    assert details == ["8"]  # of the frame where it stopped
+    stored = filmed.store.read("image", 8, 9)[0]
+    assert page.evaluate("[...window.vbnfault.view.pixels.data]") == stored.ravel().tolist()
+    assert page.errors == []
+
+
+@needs_browser
+def test_arrows_the_slider_and_the_end_of_a_sequence(page: Page, filmed: Served) -> None:
+    open_sample(page, filmed, 8)
+    title = "document.getElementById('sequence').textContent"
+    page.click("#play")  # from the last frame, it begins again
+    page.wait("window.vbnfault.film.playing && window.vbnfault.view.index < 8")
+    page.press("ArrowRight")
+    page.wait("!window.vbnfault.film.playing")
+    frame = page.evaluate("window.vbnfault.film.at")
+    page.press("ArrowLeft")
+    page.evaluate("new Promise((done) => setTimeout(done, 700))")  # the next frame would have come after 600 ms
+    page.wait(f"{title} === 'approach, frame {frame} of 9'")
+    page.evaluate("""(() => {
+      const frame = document.getElementById("frame");
+      frame.value = 6;
+      frame.dispatchEvent(new Event("input"));
+    })()""")
+    page.wait("window.vbnfault.view.index === 6 && document.getElementById('time').textContent === '3605 s'")
+    for _ in range(3):
+        page.press("ArrowRight")
+    page.wait(f"{title} === 'still, frame 1 of 1'")
+    page.press(" ")  # nothing follows
+    page.wait("!window.vbnfault.film.playing")
+    page.press(" ")
+    page.press("Escape")
+    assert page.evaluate("!window.vbnfault.film.playing && document.getElementById('viewer').hidden")
+    assert page.errors == []
+
+
+@needs_browser
+def test_a_store_without_sequences_has_no_player(page: Page, served: Served) -> None:
+    ready(page, served)
+    page.click('.tile[data-index="0"]')
+    page.wait("performance.getEntriesByName('sample').length")
+    page.press(" ")
+    assert page.evaluate("document.getElementById('film').hidden && !window.vbnfault.film.playing")
+
+
+@needs_browser
+def test_filters_leave_the_frames_of_a_film_that_pass(page: Page, filmed: Served) -> None:
+    ready(page, filmed)
+    page.click('[data-filter="classes:0"]')  # dust, from the fourth frame on
+    page.click('.tile[data-index="3"]')
+    page.wait("document.getElementById('sequence').textContent === 'approach, frame 1 of 6'")
+    assert page.evaluate("window.vbnfault.film.frames") == [3, 4, 5, 6, 7, 8]

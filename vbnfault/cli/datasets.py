@@ -23,6 +23,7 @@ from .options import (
     StoreArgument,
     grouped,
     local_path,
+    number,
     progress_bar,
     shard_range,
     whole,
@@ -236,7 +237,7 @@ def export(
     store: StoreArgument,
     format: Annotated[
         str,
-        typer.Option(metavar="FORMAT", help="One of coco, exr, huggingface, png, webdataset and yolo."),
+        typer.Option(metavar="FORMAT", help="One of coco, exr, huggingface, png, video, webdataset and yolo."),
     ],
     out: Annotated[Path, local_path("Folder for the files; an interrupted export in it is resumed.")],
     masks: Annotated[
@@ -244,12 +245,16 @@ def export(
         typer.Option(metavar="RULE", help="Which mask the files hold: footprint or effect; exr and png hold both."),
     ] = "footprint",
     min_area: Annotated[int, whole(1, 10_000_000, "Fewest pixels of an instance that coco and yolo write.")] = 1,
+    fps: Annotated[
+        float | None, number(0.1, 1000, "Frames a second of the films of video.", unset="those of time_s")
+    ] = None,
     workers: Annotated[int, whole(1, 64, "Number of threads; the files do not depend on it.")] = 2,
 ) -> None:
     """Write a finished store in the format of other tools, with its splits, classes and a card."""
     from ..output.export import export_store
 
-    for line in export_store(store, out, format, masks=masks, min_area_px=min_area, workers=workers).lines():
+    written = export_store(store, out, format, masks=masks, min_area_px=min_area, fps=fps, workers=workers)
+    for line in written.lines():
         typer.echo(line)
 
 

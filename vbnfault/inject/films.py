@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from ..core.errors import InputError
 from ..core.files import user_files
+from ..core.files.films import pyav
 from ..core.files.images import png_numbers, write_png
 from ..core.files.tiff import check_values
 from ..core.files.whole_files import replacing, write_json
@@ -69,7 +70,7 @@ def unpack(path: Path, folder: Path, most_values: int) -> Film:
     Frames that an earlier call wrote of the same file are kept. Raises InputError if the file cannot be read at
     all, or PyAV is not installed.
     """
-    av = _av()
+    av = pyav()
     sha256 = user_files.sha256_of_input(path, "film")
     record = folder / _RECORD
     try:
@@ -110,7 +111,7 @@ def frame_path(folder: Path, number: int) -> Path:
 
 def assemble(folder: Path, path: Path, film: Film) -> None:
     """Write the frames of a folder as a film in FFV1; equal frames give equal bytes."""
-    av = _av()
+    av = pyav()
     with (
         replacing(path) as temporary,
         av.open(str(temporary), "w", format="matroska", options={"fflags": "+bitexact"}) as container,
@@ -132,7 +133,7 @@ def assemble(folder: Path, path: Path, film: Film) -> None:
 @contextmanager
 def _opened(path: Path, most_values: int) -> Iterator[tuple[Any, Any]]:
     """Open a film, and give its container and its stream of images. Raises InputError, or FFmpegError of PyAV."""
-    with _av().open(str(path), format=_FORMATS[path.suffix.lower()], metadata_errors="replace") as container:
+    with pyav().open(str(path), format=_FORMATS[path.suffix.lower()], metadata_errors="replace") as container:
         stream = next(iter(container.streams.video), None)
         if stream is None or stream.codec_context is None:
             raise InputError(f"{path}: has no images, or images of an unknown codec")
@@ -146,7 +147,7 @@ def _opened(path: Path, most_values: int) -> Iterator[tuple[Any, Any]]:
 
 def _is_grey(path: Path, most_values: int) -> bool:
     """Return whether no frame of a film has a colour: many codecs know colours only, and grey cameras use them."""
-    with suppress(_av().error.FFmpegError), _opened(path, most_values) as (container, stream):
+    with suppress(pyav().error.FFmpegError), _opened(path, most_values) as (container, stream):
         for frame in container.decode(stream):
             levels = frame.reformat(format="rgb24").to_ndarray()
             if (np.ptp(levels, axis=2) > _GREY_LEVELS).any():
@@ -180,12 +181,3 @@ def _lack(container: Any, stream: Any, number: int, last: Any) -> str:
     if steps > 2 or (steps > 1.5 and number < stream.frames):
         return f"is missing: the film lasts {length_s:.2f} s"
     return ""
-
-
-def _av() -> Any:
-    """Return PyAV. Raises InputError if it is not installed."""
-    try:
-        import av  # takes a quarter of a second to import
-    except ImportError as error:
-        raise InputError("a film needs PyAV: pip install 'vbnfault[video]'") from error
-    return av

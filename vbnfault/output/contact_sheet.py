@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from ..core.errors import InputError
 from ..core.files.images import write_png
 from ..core.files.whole_files import writing
+from ..core.quantities import Sample
 from ..dataset.statistics import finished_scalars
-from ..store import STRATA, Store, open_store
+from ..store import STRATA, Store, StoreSpec, open_store
 
 U8 = NDArray[np.uint8]
 
@@ -38,7 +39,8 @@ COLOURS = (
     (60, 110, 255),
 )
 _BACKGROUND, _PANEL, _TEXT, _FAINT = (18, 20, 24), (30, 33, 39), (225, 228, 232), (150, 156, 166)
-_TILE_PX = 320  # longer side of a tile
+TILE_PX = 320  # longer side of a tile
+_CAPTION_GROWS_PX = 640  # from this longer side of a tile on
 _GAP_PX, _CAPTION_PX, _LINE_PX = 14, 46, 24
 _FILL = 0.30  # opacity of a mask
 _WHOLE_FRAME = 0.98  # a localised class whose mask covers more than this fraction is drawn as a border, too
@@ -86,12 +88,16 @@ def preview(
         raise InputError(f"{store.path}: {store.why_none_is_finished()}, so there is nothing to show")
     short = abbreviations(store.spec.faults)
     if store.spec.sequence_names:
-        strips = _strips(store, max_samples)
+        parts = [(samples, of["sequence"]) for samples, of in finished_scalars(store, ("sequence",))]
+        samples, sequence = (np.concatenate(column) for column in zip(*parts, strict=True))
+        found = film_strips(sequence, max(1, round(np.sqrt(max_samples / 3))), max_samples)
+        strips = [samples[positions].tolist() for positions in found]
         columns = max(map(len, strips))
     else:
         strips = [[done[k] for k in spread(len(done), max_samples)]]
         columns = min(len(strips[0]), max(1, round(np.sqrt(len(strips[0]) * 1.25))))
-    tiles = [[_tile(store, i, short, masks) for i in strip] for strip in strips]
+    layers = ("image", "mask") if masks and store.spec.faults else ("image",)
+    tiles = [[tile(store.spec, store.read_sample(i, layers), short, TILE_PX) for i in strip] for strip in strips]
     body = np.vstack([_grid(strip, columns)[0 if k == 0 else _GAP_PX :] for k, strip in enumerate(tiles)])
     count = sum(map(len, tiles))
     name = f"{store.path.name}: {count} of {store.samples} samples"
@@ -100,14 +106,18 @@ def preview(
     return count
 
 
-def _strips(store: Store, most: int) -> list[list[int]]:
-    """Return frames of some sequences, evenly spaced in each; about three times as many frames as sequences."""
-    of: dict[int, list[int]] = {}
-    for samples, columns in finished_scalars(store, ("sequence",)):
-        for i, sequence in zip(samples, columns["sequence"].tolist(), strict=True):
-            of.setdefault(sequence, []).append(i)
-    shown = [list(of.values())[k] for k in spread(len(of), max(1, round(np.sqrt(most / 3))))]
-    return [[frames[k] for k in spread(len(frames), most // len(shown))] for frames in shown]
+def film_strips(
+    sequence: NDArray[np.integer], most_sequences: int, most_frames: int, longest: int | None = None
+) -> list[NDArray[np.int64]]:
+    """Return the positions of frames of some sequences, evenly spaced in each; `sequence`: that of each sample.
+
+    A strip has at most `longest` frames, and all of them together at most `most_frames`.
+    """
+    order = np.argsort(sequence, kind="stable")
+    frames = np.split(order, 1 + np.flatnonzero(np.diff(sequence[order])))
+    shown = spread(len(frames), most_sequences)
+    most = most_frames // len(shown)
+    return [frames[k][spread(len(frames[k]), min(most, longest or most))] for k in shown]
 
 
 def spread(count: int, most: int) -> NDArray[np.int64]:
@@ -133,8 +143,19 @@ def abbreviations(faults: Sequence[str]) -> dict[str, str]:
     return short
 
 
+def names_that_fit(faults: Sequence[str], width_px: int) -> dict[str, str]:
+    """Return the name of each fault, or abbreviations where all names do not fit in a caption of a tile's width."""
+    words = {fault: fault.replace("_", " ") for fault in faults}
+    needed = 16 + sum(22 + _text_width(name, 0.4) for name in words.values())
+    return words if needed <= min(width_px, _CAPTION_GROWS_PX) else abbreviations(faults)
+
+
 def overlay(
-    rgb: U8, mask: NDArray[np.bool_], injected: Sequence[bool], localised: Sequence[bool] | None = None
+    rgb: U8,
+    mask: NDArray[np.bool_],
+    injected: Sequence[bool],
+    localised: Sequence[bool] | None = None,
+    line_px: int | None = None,
 ) -> U8:
     """Return an RGB image with the masks of the injected faults drawn on it, each as a tint and an outline.
 
@@ -151,10 +172,12 @@ def overlay(
         Which faults are injected, bool[fault].
     localised
         Which classes mark parts of an image, bool[fault]; by default all.
+    line_px
+        Width of the outlines; by default a 300th of the image's longer side.
     """
     out = rgb.copy()
     height, width = rgb.shape[:2]
-    line = max(1, round(max(height, width) / 300))
+    line = line_px or max(1, round(max(height, width) / 300))
     borders = 0
     for k in sorted(np.flatnonzero(injected).tolist(), key=lambda k: -int(mask[k].sum())):
         colour = COLOURS[k % len(COLOURS)]
@@ -171,38 +194,52 @@ def overlay(
     return out
 
 
-def _tile(store: Store, index: int, short: Mapping[str, str], masks: bool) -> U8:
-    """Draw one sample with its caption."""
-    spec = store.spec
-    sample = store.read_sample(index, ("image", "mask") if masks and spec.faults else ("image",))
-    scale = _TILE_PX / max(spec.height, spec.width)
+def tile(spec: StoreSpec, sample: Sample, names: Mapping[str, str], side_px: int) -> U8:
+    """Draw a sample with its masks, if it was read with them, and below it a caption with its faults' `names`.
+
+    Parameters
+    ----------
+    side_px
+        Longer side of the image within the tile. The caption grows with it from 640 px on.
+    """
+    scale, k = side_px / max(spec.height, spec.width), max(1.0, side_px / _CAPTION_GROWS_PX)
     size = (max(1, round(spec.width * scale)), max(1, round(spec.height * scale)))
     # a shrunk mask is True where any of its pixels is, so that a single broken pixel stays visible
     rgb = resized(sample.layers["image"][..., :3], size)
     injected = sample.scalars["injected"].astype(bool)
-    if masks and spec.faults:
+    if "mask" in sample.layers:
         small = np.stack([resized_mask(m, size) for m in sample.layers["mask"]])
         localised = [fault in (spec.localised_faults or ()) for fault in spec.faults]
-        rgb = overlay(rgb, small, injected.tolist(), localised)
-    tile = np.full((size[1] + _CAPTION_PX, size[0], 3), _PANEL, np.uint8)
-    tile[: size[1]] = rgb
-    site = int(sample.scalars["site"])
-    site_name = spec.site_names[site] if 0 <= site < len(spec.site_names) else f"site {site}"
-    _write(tile, f"#{index}", (8, size[1] + 19), _TEXT, 0.48)
-    right = f"{STRATA[int(sample.scalars['stratum'])]}  {site_name}"
-    if spec.sequence_names:
-        sequence, time_s = int(sample.scalars["sequence"]), float(sample.scalars["time_s"])
-        right = f"{spec.sequence_names[sequence]}  {time_s:.6g} s" if sequence < len(spec.sequence_names) else ""
-    _write(tile, right, (size[0] - 8 - _text_width(right, 0.4), size[1] + 19), _FAINT, 0.4)
-    x = 8
-    for k in np.flatnonzero(injected):
-        fault = spec.faults[k]
-        cv2.circle(tile, (x + 4, size[1] + 34), 4, COLOURS[k % len(COLOURS)], -1, cv2.LINE_AA)
-        _write(tile, short[fault], (x + 12, size[1] + 38), _TEXT, 0.4)
-        x += 22 + _text_width(short[fault], 0.4)
+        rgb = overlay(rgb, small, injected.tolist(), localised, max(1, round(side_px / 700)))
+    drawn = np.full((size[1] + round(k * _CAPTION_PX), size[0], 3), _PANEL, np.uint8)
+    drawn[: size[1]] = rgb
+
+    def at(x: float, y: float) -> tuple[int, int]:
+        return round(x), size[1] + round(k * y)
+
+    _write(drawn, f"#{sample.index}", at(8 * k, 19), _TEXT, 0.48 * k)
+    right = _of_tile(spec, sample)
+    _write(drawn, right, at(size[0] - 8 * k - _text_width(right, 0.4 * k), 19), _FAINT, 0.4 * k)
+    x = 8 * k
+    for fault in np.flatnonzero(injected):
+        name = names[spec.faults[fault]]
+        cv2.circle(drawn, at(x + 4 * k, 34), round(4 * k), COLOURS[fault % len(COLOURS)], -1, cv2.LINE_AA)
+        _write(drawn, name, at(x + 12 * k, 38), _TEXT, 0.4 * k)
+        x += 22 * k + _text_width(name, 0.4 * k)
     if not injected.any():
-        _write(tile, "no fault", (8, size[1] + 38), _FAINT, 0.4)
-    return tile
+        _write(drawn, "no fault", at(8 * k, 38), _FAINT, 0.4 * k)
+    return drawn
+
+
+def _of_tile(spec: StoreSpec, sample: Sample) -> str:
+    """Return what a caption says of a sample: sequence and time, or else stratum and site."""
+    scalars = sample.scalars
+    if spec.sequence_names:
+        sequence, time_s = int(scalars["sequence"]), float(scalars["time_s"])
+        return f"{spec.sequence_names[sequence]}  {time_s:.6g} s" if sequence < len(spec.sequence_names) else ""
+    site = int(scalars["site"])
+    name = spec.site_names[site] if 0 <= site < len(spec.site_names) else f"site {site}"
+    return f"{STRATA[int(scalars['stratum'])]}  {name}"
 
 
 def resized(image: U8, size: tuple[int, int]) -> U8:
@@ -256,7 +293,9 @@ def _header(name: str, faults: Sequence[str], short: Mapping[str, str], width: i
 def _write(image: U8, text: str, position: tuple[int, int], colour: tuple[int, int, int], scale: float) -> None:
     """Draw text into an image; `at`: the lower left corner (x, y)."""
     plain = text.encode("ascii", "replace").decode()  # OpenCV's font has ASCII characters only
-    cv2.putText(image, plain, position, cv2.FONT_HERSHEY_SIMPLEX, scale, colour, 1, cv2.LINE_AA)
+    cv2.putText(
+        image, plain, position, cv2.FONT_HERSHEY_SIMPLEX, scale, colour, max(1, round(2 * scale)), cv2.LINE_AA
+    )
 
 
 def _text_width(text: str, scale: float) -> int:

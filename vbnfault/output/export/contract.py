@@ -18,6 +18,8 @@ from ...core.registry import Registry, is_name
 from ...store import Store, StoreSpec
 from .folder import Folder
 
+FPS = (0.1, 1000.0)  # frames a second of a film, least and most
+
 _registry: Registry[type[Format]]
 
 
@@ -25,7 +27,7 @@ class ExportPart(NamedTuple):
     """Name a part of an export, which is written and resumed as a whole: some samples of one split.
 
     `number` counts the parts of the export. `of_split` and `parts_of_split` count those of the split. Instances of
-    fewer than `min_area_px` pixels are left out.
+    fewer than `min_area_px` pixels are left out. `fps`: frames a second of a film, None for those of the sequence.
     """
 
     number: int
@@ -34,6 +36,7 @@ class ExportPart(NamedTuple):
     of_split: int
     parts_of_split: int
     min_area_px: int = 1
+    fps: float | None = None
 
 
 class Entry(NamedTuple):
@@ -95,6 +98,7 @@ class Format(ABC):
         "extract": {"fileProperty": "filename"},
         "transform": {"regex": r"^0*(\d+)\D"},
     }
+    by_sequence: ClassVar[bool] = False  # whether a part is a sequence; stores without sequences are refused
     part_samples: ClassVar[int] = 16
     part_bytes: ClassVar[int | None] = None  # if given, a part has about this size instead
 

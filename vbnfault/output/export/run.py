@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 import os
 import threading
@@ -28,7 +29,7 @@ from ...dataset.lock import locked
 from ...dataset.progress import Progress
 from ...dataset.statistics import Statistics, statistics
 from ...store import EFFECT_RULE, MASK_RULES, SPLITS, STRATA, Store, Url, disk, mask_union, open_store
-from .contract import Closing, ExportPart, Finished, Format, formats
+from .contract import FPS, Closing, ExportPart, Finished, Format, formats
 from .folder import Folder
 
 SAMPLES = "samples.jsonl"
@@ -60,6 +61,7 @@ def export_store(
     *,
     masks: str = "footprint",
     min_area_px: int = 1,
+    fps: float | None = None,
     workers: int = 1,
     progress: bool = True,
 ) -> ExportSummary:
@@ -74,11 +76,13 @@ def export_store(
     out
         Folder of the export; made if missing.
     format
-        Name of a format: coco, exr, huggingface, png, webdataset, yolo, or one of a plug-in.
+        Name of a format: coco, exr, huggingface, png, video, webdataset, yolo, or one of a plug-in.
     masks
         "footprint" or "effect": which mask the files hold. The formats exr and png hold both, each by its name.
     min_area_px
         Instances of fewer pixels are left out of the formats coco and yolo; 1 keeps all.
+    fps
+        Frames a second of the films of the format video, 0.1 to 1000; by default by the median step of `time_s`.
     workers
         Number of threads, 1 to 64. Each holds one sample in memory.
     progress
@@ -106,16 +110,18 @@ def export_store(
             f"--min-area {shown(min_area_px)}: must be a whole number from 1; {format} "
             + ("leaves out smaller instances" if kind.has_instances else "has no instances, so it must be 1")
         )
+    _check_sequences(store, kind, fps)
     identity = {
         "format": format,
         "vbnfault": __version__,
         "samples": store.samples,
         "masks": masks,
         "min_area_px": min_area_px,
+        "fps": fps,
         "contents_sha256": contents_sha256(store),
     }
     with locked(target), disk.explained(target, "writing the export"):
-        folder, parts = Folder(target), _parts(store, kind.samples_of_part(store.spec), min_area_px)
+        folder, parts = Folder(target), _parts(store, kind, min_area_px, fps)
         if folder.begin(identity):
             folder.clear()
             return ExportSummary(path=target, format=format, samples=store.samples, written=0)
@@ -164,6 +170,19 @@ def _check_masks(store: Store, kind: Format, masks: str) -> None:
         raise InputError(f"--masks {masks}: {kind.name} writes every mask of the store by its name; leave it out")
 
 
+def _check_sequences(store: Store, kind: Format, fps: float | None) -> None:
+    """Refuse films of a store without sequences, and a frame rate out of range or of another format."""
+    if kind.by_sequence and not store.spec.sequence_names:
+        raise InputError(
+            f"{store.path}: has no sequences, of which {kind.name} makes films: trajectory.file of its scene has "
+            "neither a column sequence nor time_s; export single images as png"
+        )
+    if fps is not None and not kind.by_sequence:
+        raise InputError(f"--fps {shown(fps)}: {kind.name} has no films; leave it out")
+    if fps is not None and not (isinstance(fps, int | float) and FPS[0] <= fps <= FPS[1]):
+        raise InputError(f"--fps {shown(fps)}: must be a number from {FPS[0]:g} to {FPS[1]:g}, in frames a second")
+
+
 def contents_sha256(store: Store) -> str:
     """Return a digest of the stored checksums of all layers and scalars, and of the layout of the store."""
     total = hashlib.sha256(json.dumps(store.spec.data, sort_keys=True).encode())
@@ -183,18 +202,25 @@ def _column(store: Store, name: str, number: int) -> NDArray[Any]:
         ) from error
 
 
-def _parts(store: Store, size: int, min_area_px: int) -> tuple[ExportPart, ...]:
-    """Return the parts of an export: of each split, in ascending order, up to `size` samples."""
+def _parts(store: Store, kind: Format, min_area_px: int, fps: float | None) -> tuple[ExportPart, ...]:
+    """Return the parts of an export: of each split, in ascending order, some samples or a sequence."""
     split = [str(name) for number in range(store.shards) for name in _column(store, "split", number)]
+    sequence = (
+        np.concatenate([_column(store, "sequence", n) for n in range(store.shards)]) if kind.by_sequence else ()
+    )
     parts: list[ExportPart] = []
     if not {*split} <= {*SPLITS}:  # only a sample that is not built has none: "" would name the root folder
         raise VbnfaultError(f"{store.path}: a split is none of {', '.join(SPLITS)}; the build command repairs it")
     for name in SPLITS:
         samples = [i for i, of_sample in enumerate(split) if of_sample == name]
-        starts = range(0, len(samples), size)
-        for k, start in enumerate(starts):
-            of_part = tuple(samples[start : start + size])
-            parts.append(ExportPart(len(parts), name, of_part, k, len(starts), min_area_px))
+        if kind.by_sequence:
+            sequences = sorted(samples, key=sequence.__getitem__)
+            of_parts = [tuple(frames) for _, frames in itertools.groupby(sequences, key=sequence.__getitem__)]
+        else:
+            size = kind.samples_of_part(store.spec)
+            of_parts = [tuple(samples[k : k + size]) for k in range(0, len(samples), size)]
+        for k, of_part in enumerate(of_parts):
+            parts.append(ExportPart(len(parts), name, of_part, k, len(of_parts), min_area_px, fps))
     return tuple(parts)
 
 

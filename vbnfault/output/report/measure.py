@@ -40,6 +40,7 @@ _READ = (
     "sun_distance_au",
     "sun_visible_fraction",
 )
+_OF_SEQUENCES = ("sequence", "time_s")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -107,13 +108,14 @@ class Scalars:
 def read_scalars(store: Store) -> Scalars:
     """Return the scalars of the finished samples; samples whose files are damaged are counted and left out."""
     samples: list[int] = []
-    parts: dict[str, list[NDArray[Any]]] = {name: [] for name in _READ}
+    names = (*_READ, *_OF_SEQUENCES) if store.spec.sequence_names else _READ
+    parts: dict[str, list[NDArray[Any]]] = {name: [] for name in names}
     unreadable = 0
     for number in store.begun():
         finished = [i for i, done in store.done(number).items() if done]
         chosen = [i - store.shard(number).start for i in finished]
         try:
-            columns = {name: store.column(name, number)[chosen] for name in _READ} if finished else {}
+            columns = {name: store.column(name, number)[chosen] for name in names} if finished else {}
         except (OSError, ValueError):
             unreadable += len(finished)
             continue
@@ -122,11 +124,11 @@ def read_scalars(store: Store) -> Scalars:
             parts[name].append(column)
     columns = {name: np.concatenate(part) if part else np.zeros(0) for name, part in parts.items()}
     words = [str(word) for word in columns["split"]]
-    names = tuple(sorted(set(words), key=lambda w: (SPLITS.index(w) if w in SPLITS else len(SPLITS), w)))
+    split_names = tuple(sorted(set(words), key=lambda w: (SPLITS.index(w) if w in SPLITS else len(SPLITS), w)))
     return Scalars(
         samples=np.array(samples, dtype=np.int64),
-        split_names=names,
-        split=np.array([names.index(word) for word in words], dtype=np.int64),
+        split_names=split_names,
+        split=np.array([split_names.index(word) for word in words], dtype=np.int64),
         columns=columns,
         unreadable=unreadable,
     )

@@ -17,11 +17,11 @@ from ...core import tables
 from ...core.errors import InputError, VbnfaultError, shown
 from ...core.files.path_checks import path_of
 from ...core.files.whole_files import writing
-from ...core.html_page import data_url, image_url, write_page
+from ...core.html_page import data_url, image_url, with_minus, write_page
 from ...core.quantities import Sample
 from ...dataset.statistics import Statistics, statistics
 from ...store import STRATA, Store, open_store
-from ..contact_sheet import COLOURS, abbreviations, resized_mask, spread
+from ..contact_sheet import COLOURS, abbreviations, film_strips, resized_mask, spread
 from . import charts
 from .measure import (
     Drawn,
@@ -60,6 +60,8 @@ _SIDES_PX = (640, 400, 256, 128)  # of the images; the first whose files fit is 
 _MOST_BYTES = 15_000_000  # of all images
 _FILL, _FAINT_FILL = 77, 36  # opacity of a mask's inside, less for a class that is not localised
 _WHOLE_FRAME = 0.98
+
+_STRIPS = (4, 32, 8)  # film strips, frames in all of them, and frames in one, at most
 
 # The gallery shows at most so many samples, and the pixels of at most so many are read.
 MOST_SHOWN, MOST_READ = 200, 1_000_000
@@ -122,7 +124,10 @@ def _values(store: Store, scalars: Scalars, shown_samples: int, read_samples: in
         numbers = statistics(store)
     except VbnfaultError:  # damaged scalars: the report shows what can be read, and says what cannot
         numbers = None
-    sheet = cards(store, scalars, shown_samples, unread)
+    groups = [pick(scalars, shown_samples)]
+    if store.spec.sequence_names:
+        groups += [strip.tolist() for strip in film_strips(scalars.columns["sequence"], *_STRIPS)]
+    sheet, *strips = cards(store, scalars, groups, unread)
     if unread:
         more = f"; the same is true of {len(unread) - 1} samples more" if len(unread) > 1 else ""
         left_out = "leaves out what it cannot read" if pixels.positions.size else "shows no images"
@@ -135,6 +140,7 @@ def _values(store: Store, scalars: Scalars, shown_samples: int, read_samples: in
         "scalars": scalars,
         "pixels": pixels,
         "cards": sheet,
+        "strips": [strip for strip in strips if strip],
         "coloured": [
             (k, f, _colour(k), f in (spec.localised_faults or spec.faults)) for k, f in enumerate(spec.faults)
         ],
@@ -305,17 +311,20 @@ def pick(scalars: Scalars, most: int) -> list[int]:
     return sorted(chosen)
 
 
-def cards(store: Store, scalars: Scalars, most: int, unread: dict[int, str]) -> list[dict[str, Any]]:
-    """Return up to `most` samples as the template shows them.
+def cards(
+    store: Store, scalars: Scalars, groups: Sequence[Sequence[int]], unread: dict[int, str]
+) -> list[list[dict[str, Any]]]:
+    """Return the samples of some groups of positions as the template shows them.
 
     The reasons why samples cannot be read are added to `unread`, by position.
     """
     names = [name for name in ("image", "clean", "mask") if name in store.spec.pixel_layers]
-    picked = list(readable(store, scalars, pick(scalars, most), names, unread))
-    made: list[dict[str, Any]] = []
+    picked = dict(readable(store, scalars, sorted({k for group in groups for k in group}), names, unread))
+    made: list[list[dict[str, Any]]] = []
     for side in _SIDES_PX:
-        made = [_card(store, scalars, position, sample, side) for position, sample in picked]
-        if sum(len(url) for card in made for url in card["urls"].values()) <= _MOST_BYTES:
+        of = {position: _card(store, scalars, position, sample, side) for position, sample in picked.items()}
+        made = [[of[position] for position in group if position in of] for group in groups]
+        if sum(len(url) for group in made for card in group for url in card["urls"].values()) <= _MOST_BYTES:
             break
     return made
 
@@ -337,9 +346,20 @@ def _card(store: Store, scalars: Scalars, position: int, sample: Sample, side_px
         "words": ", ".join(spec.faults[k].replace("_", " ") for k in faults) or "no fault",
         "faults": faults,
         "where": f"{scalars.split_names[scalars.split[position]]}, {scalars.stratum(position)}",
+        **_in_sequence(store, scalars, position),
         "coarse": max(size) <= _SIDES_PX[-1],
         "urls": urls,
     }
+
+
+def _in_sequence(store: Store, scalars: Scalars, position: int) -> dict[str, str]:
+    """Return the name of a sample's sequence and its time; empty for a store without sequences."""
+    names = store.spec.sequence_names
+    if not names:
+        return {}
+    sequence, time_s = (scalars.columns[name][position] for name in ("sequence", "time_s"))
+    name = names[sequence] if 0 <= sequence < len(names) else f"sequence {sequence}"
+    return {"sequence": name, "time": with_minus(f"{time_s:.6g}\N{NO-BREAK SPACE}s")}
 
 
 def _mask_url(mask: NDArray[np.bool_], colour: tuple[int, int, int], is_localised: bool) -> str:

@@ -34,6 +34,8 @@ _BITS = 32
 _PAGE = {
     "": ("index.html", "text/html; charset=utf-8"),
     "view.js": ("view.js", "text/javascript; charset=utf-8"),
+    "elements.js": ("elements.js", "text/javascript; charset=utf-8"),
+    "film.js": ("film.js", "text/javascript; charset=utf-8"),
     "layers.js": ("layers.js", "text/javascript; charset=utf-8"),
     "view.css": ("view.css", "text/css; charset=utf-8"),
 }
@@ -115,6 +117,7 @@ class Viewer:
             "store": lambda: (_json(self.about), "application/json"),
             "listing": lambda: (self.columns(), "application/octet-stream"),
             "severity": lambda: (self.severities(), "application/octet-stream"),
+            "times": lambda: (self.times(), "application/octet-stream"),
             "sample": lambda: (_json(self.sample(_index(rest, self.store.samples))), "application/json"),
             "small": lambda: (self.small(rest, query), "image/jpeg"),
             "layer": lambda: (self.layer(rest), "application/octet-stream"),
@@ -133,6 +136,13 @@ class Viewer:
         """Return the severities; only one thread reads them."""
         with self._lock:
             return self.listing.severities
+
+    def times(self) -> bytes:
+        """Return the sequences and times; only one thread reads them. Raises Missing without sequences."""
+        if not self.store.spec.sequence_names:
+            raise Missing
+        with self._lock:
+            return self.listing.times
 
     @cached_property
     def about(self) -> dict[str, Any]:
@@ -169,6 +179,7 @@ class Viewer:
             ],
             "splits": list(SPLITS),
             "strata": list(STRATA),
+            "sequences": list(spec.sequence_names),
         }
 
     def sample(self, index: int) -> dict[str, Any]:
@@ -350,6 +361,16 @@ class Listing:
                 middle = np.cumsum(counts) - (counts + 1) / 2
                 ranked[k, index[known]] = np.round(254 * middle / (len(known) - 1)).astype(np.uint8)[position]
         return ranked.tobytes()
+
+    @cached_property
+    def times(self) -> bytes:
+        """Return time in the sequence in s, float64[sample], and the sequence, int32[sample], -1 if unreadable."""
+        store, begun = self.store, self.store.begun()
+        time_s, sequence = np.zeros(store.samples, dtype="<f8"), np.full(store.samples, -1, dtype="<i4")
+        for name, column in (("time_s", time_s), ("sequence", sequence)):
+            for number, values in self._column(name, begun):
+                column[_span(store, number)] = values
+        return time_s.tobytes() + sequence.tobytes()
 
     def _column(self, name: str, numbers: Sequence[int]) -> Iterator[tuple[int, NDArray[Any]]]:
         """Yield a scalar of each shard that can be read; equal files are decoded once."""

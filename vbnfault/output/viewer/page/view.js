@@ -1,23 +1,16 @@
 // The page of `vbnfault view`: a grid of small images that scrolls any number of samples, and one sample at full size.
+import { $, coloured, grouped, make, words } from "/elements.js";
+import { player } from "/film.js";
 import { difference, paint, paintMasks, ramp, read, rooted } from "/layers.js";
 
-const $ = (id) => document.getElementById(id);
 const NOT_KNOWN = 255, GAP = 10, CAPTION = 26, MOST_PX = 2e7; // browsers cannot scroll elements of more than 3.3e7 px
-const make = (tag, properties = {}, ...children) => {
-  const element = Object.assign(document.createElement(tag), properties);
-  element.append(...children);
-  return element;
-};
-const coloured = (element, colour) => (element.style.setProperty("--c", `rgb(${colour.join()})`), element);
-const words = (name) => name.replaceAll("_", " ");
-const grouped = (number) => number.toLocaleString("en").replaceAll(",", "\u202f");
-
 const about = await (await fetch("/api/store")).json();
 const layerOf = new Map(about.layers.map((layer) => [layer.name, layer]));
 const clean = layerOf.has("clean");
 const samples = about.samples;
 let listing = null; // columns of all samples, once they have arrived
 let severities = null;
+let times = null; // sequence and time of all samples, of a store with sequences
 let order = null; // samples that pass the filters; null: all
 const chosen = { splits: new Set(), strata: new Set(), classes: new Set(), thirds: new Set(), none: false, all: false };
 
@@ -50,6 +43,11 @@ async function load() {
   filters();
   choose();
   performance.mark("listing");
+  if (about.sequences.length) {
+    const given = await (await fetch("/api/times")).arrayBuffer();
+    times = { time_s: new Float64Array(given, 0, samples), sequence: new Int32Array(given, 8 * samples, samples) };
+    if (view.index >= 0) film.moved(view.index);
+  }
   const ranked = await fetch("/api/severity");
   severities = new Uint8Array(await ranked.arrayBuffer());
   filters();
@@ -328,8 +326,19 @@ const choices = () => {
   return names;
 };
 
+const film = player({
+  names: about.sequences,
+  times: () => times,
+  order: () => order,
+  show: (index) => show(index),
+  ahead: readAhead,
+  paused: () => { located(); details(view.index, view.turn); },
+});
+
+const located = () => history.replaceState(null, "", `#${view.index}`);
+
 async function show(index, layer = view.layer) {
-  const turn = ++view.turn;
+  const turn = ++view.turn, playing = film.playing;
   if ($("viewer").hidden) {
     $("viewer").hidden = false;
     for (const other of [document.querySelector("header"), $("filters"), scroller]) other.inert = true;
@@ -337,7 +346,8 @@ async function show(index, layer = view.layer) {
   }
   const fresh = index !== view.index;
   Object.assign(view, { index, layer });
-  history.replaceState(null, "", `#${index}`);
+  if (!playing) located(); // browsers refuse more than some 100 in half a minute
+  if (times) film.moved(index);
   $("name").textContent = `Sample ${grouped(index)}`;
   const position = order ? order.indexOf(index) : index;
   $("previous").disabled = position <= 0;
@@ -347,9 +357,11 @@ async function show(index, layer = view.layer) {
     button.tabIndex = button.dataset.layer === layer ? 0 : -1;
   }
   if (fresh) {
-    view.masks = [];
     $("probe").textContent = "";
-    details(index, turn);
+    if (!playing) {
+      view.masks = [];
+      details(index, turn);
+    }
     if (listing && !listing.finished[index]) {
       Object.assign(view, { base: null, root: null, pixels: null });
       complain("This sample is not finished yet.");
@@ -358,9 +370,11 @@ async function show(index, layer = view.layer) {
   }
   try {
     const reading = layer === "difference" ? Promise.all([read(layerOf.get("image"), index), read(layerOf.get("clean"), index)]) : read(layerOf.get(layer), index);
-    const masks = fresh ? maskLayer(index) : null;
+    const masks = !fresh ? null : playing ? masksOf(index) : maskLayer(index);
     const pixels = await reading;
+    const together = playing && masks ? await masks : null; // a frame of a film appears with its masks
     if (turn !== view.turn) return;
+    if (together) { view.masks = together; maskButtons(); }
     const painted = layer === "difference" ? difference(pixels[0], pixels[1], pixels[0].shape) : paint(layerOf.get(layer), pixels);
     view.base = painted.canvas;
     view.root = painted.photograph ? () => rooted(painted.canvas) : null;
@@ -377,10 +391,15 @@ async function show(index, layer = view.layer) {
   }
 }
 
+const layerOfMasks = () => (about.faults.length ? layerOf.get(view.effect && layerOf.has("mask_effect") ? "mask_effect" : "mask") : undefined);
+
+async function masksOf(index) {
+  const layer = layerOfMasks();
+  return layer ? paintMasks(await read(layer, index), about.faults, Math.max(about.width, about.height) / 700) : [];
+}
+
 async function maskLayer(index) {
-  const layer = layerOf.get(view.effect && layerOf.has("mask_effect") ? "mask_effect" : "mask");
-  if (!layer || !about.faults.length) return;
-  const masks = paintMasks(await read(layer, index), about.faults, Math.max(about.width, about.height) / 700);
+  const masks = await masksOf(index);
   if (index !== view.index) return;
   view.masks = masks;
   maskButtons();
@@ -388,9 +407,12 @@ async function maskLayer(index) {
 }
 
 function ahead(position) {
-  for (const next of [position + 1, position - 1])
-    if (next >= 0 && next < count() && (!listing || listing.finished[sampleAt(next)]))
-      for (const name of ["image", "mask"]) if (layerOf.has(name)) read(layerOf.get(name), sampleAt(next)).catch(() => {});
+  for (const next of [position + 1, position - 1]) if (next >= 0 && next < count()) readAhead(sampleAt(next));
+}
+
+function readAhead(index) {
+  if (listing && !listing.finished[index]) return;
+  for (const layer of [layerOf.get(layerOf.has(view.layer) ? view.layer : "image"), layerOfMasks()]) if (layer) read(layer, index).catch(() => {});
 }
 
 function complain(text) {
@@ -419,21 +441,24 @@ function redraw() {
   view.masks.forEach((mask, k) => { if (mask && !view.hidden.has(k)) context.drawImage(mask.canvas, 0, 0); });
 }
 
+// Buttons stay the same elements, so that a click succeeds while a film plays.
+const maskOf = about.faults.map((fault, k) => {
+  const button = make("button", { type: "button", className: "toggle" }, make("i"), words(fault.name));
+  if (k < 9) button.append(make("kbd", { textContent: k + 1 }));
+  button.dataset.fault = k;
+  button.addEventListener("click", () => toggle(k));
+  return coloured(button, fault.colour);
+});
+$("masks").replaceChildren(...maskOf);
+
 function maskButtons() {
-  const key = document.activeElement?.dataset?.fault;
   $("kind").hidden = !layerOf.has("mask_effect");
   $("kind").firstChild.textContent = view.effect ? "effects" : "footprints";
-  $("masks").replaceChildren(...about.faults.map((fault, k) => {
-    const button = make("button", { type: "button", className: "toggle" }, make("i"), words(fault.name));
-    if (k < 9) button.append(make("kbd", { textContent: k + 1 }));
+  for (const [k, button] of maskOf.entries()) {
     button.classList.toggle("absent", !view.masks[k]);
     button.setAttribute("aria-pressed", String(!view.hidden.has(k)));
-    button.dataset.fault = k;
     button.title = view.masks[k] ? `${(100 * view.masks[k].area).toPrecision(2)} % of the frame` : "no mask in this sample";
-    button.addEventListener("click", () => toggle(k));
-    return coloured(button, fault.colour);
-  }));
-  if (key !== undefined) $("masks").querySelector(`[data-fault="${key}"]`)?.focus();
+  }
 }
 
 function toggle(k) {
@@ -520,6 +545,7 @@ async function details(index, turn) {
 // --- moving about -------------------------------------------------------------------------------------------
 
 function leave() {
+  film.pause();
   view.turn++;
   $("viewer").hidden = true;
   for (const other of [document.querySelector("header"), $("filters"), scroller]) other.inert = false;
@@ -529,6 +555,7 @@ function leave() {
 }
 
 function step(by) {
+  film.pause();
   const position = (order ? order.indexOf(view.index) : view.index) + by;
   if (position >= 0 && position < count()) show(sampleAt(position));
 }
@@ -610,6 +637,7 @@ function inSample(key, shift) {
   const moves = { ArrowLeft: [40, 0], ArrowRight: [-40, 0], ArrowUp: [0, 40], ArrowDown: [0, -40] };
   const named = { i: "image", x: "difference", d: "depth_m", n: "normal", s: "semantic", r: "raw" };
   if (key === "Escape") leave();
+  else if (key === " " && times) $("play").click();
   else if (shift && moves[key]) { view.x += moves[key][0]; view.y += moves[key][1]; redraw(); }
   else if (key === "ArrowLeft") step(-1);
   else if (key === "ArrowRight") step(1);
@@ -643,7 +671,8 @@ function inGrid(key) {
 
 document.addEventListener("keydown", (event) => {
   if (event.ctrlKey || event.metaKey || event.altKey || $("help").open) return;
-  if (event.target.closest("input")) {
+  if (event.target.closest("select") || (event.key === " " && event.target.closest("button, summary"))) return;
+  if (event.target.closest("input:not([type=range])")) {
     if (event.key === "Escape") reveal(current, true);
     return;
   }
@@ -658,7 +687,7 @@ document.addEventListener("keydown", (event) => {
 
 // --- begin --------------------------------------------------------------------------------------------------
 
-window.vbnfault = { view, toggled: null, get listing() { return listing; }, get count() { return count(); } };
+window.vbnfault = { view, film, toggled: null, get listing() { return listing; }, get count() { return count(); } };
 tiles.fresh = true;
 status();
 layout();
