@@ -303,11 +303,13 @@ def _flights(session: Session, table: Trajectory) -> list[str]:
         range_m = np.linalg.norm(position - body.centre_of_mass_T_m, axis=1)
         speed_m_s = np.linalg.norm(table.velocity_T_m_s[rows], axis=1)
         turn_px = np.linalg.norm(table.rate_C_rad_s[rows, :2], axis=1) * flight.period_s / pixel
-        first_m, last_m = height_m[[0, np.searchsorted(some, flight.frames - 1)]]
+        first_m, last_m = height_m[0], height_m[some == flight.frames - 1][0]
         lines.append(
-            f"  {flight.kind}: {flight.sequences} of {flight.frames} frames, {flight.duration_s:g} s; "
-            f"{_span(range_m.min(), range_m.max())} m from the centre of mass, {_span(height_m.min(), height_m.max())} "
-            f"m from the ground; {_span(speed_m_s.min(), speed_m_s.max())} m/s over the ground; "
+            f"  {flight.kind}: {flight.sequences} {'sequences' if flight.sequences > 1 else 'sequence'} of "
+            f"{flight.frames} frames, {flight.duration_s:g} s; "
+            f"{_span(range_m.min(), range_m.max())} m from the centre of mass, "
+            f"{_span(height_m.min(), height_m.max())} m from the ground; "
+            f"{_span(speed_m_s.min(), speed_m_s.max())} m/s over the ground; "
             f"{pixel * first_m:.3g} m a pixel first, {pixel * last_m:.3g} last; the boresight turns "
             f"{_span(turn_px.min(), turn_px.max())} px a frame"
         )

@@ -185,7 +185,7 @@ class Session:
         Raises InputError if the spacecraft hides all of the frame, or if a trajectory passes through the ground.
         """
         with in_file(self.source):
-            if self.trajectory is not None:
+            if self.trajectory is not None and self.trajectory.source != FLIGHTS:  # flights are checked
                 check_above_ground(self.body, self.trajectory, len(self.plan))
             sentences = (
                 assemble.values_of_another_body(self.scene, self.body),

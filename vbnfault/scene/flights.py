@@ -20,9 +20,15 @@ _LENGTH_M = (0.01, 1e12)
 _SPEED_M_S = (1e-6, 1e6)
 
 if TYPE_CHECKING:
-    Number = Pair = float | tuple[float, float]
-    Length = Speed = Offset = Start = Half = Turn = Latitude = Elevation = Tilt = Number
-    Pair = tuple[float, float]
+    Length = float | tuple[float, float]
+    Speed = float | tuple[float, float]
+    Offset = float | tuple[float, float]
+    Start = float | tuple[float, float]
+    Half = float | tuple[float, float]
+    Turn = float | tuple[float, float]
+    Latitude = float | tuple[float, float]
+    Tilt = float | tuple[float, float]
+    Elevation = tuple[float, float]
 else:
 
     def _bounded(low: float, high: float) -> object:

@@ -1,9 +1,9 @@
 """Fly the flights of a scene: compute poses, velocities and rates from gravity, spin and the law of each kind.
 
 Motion is integrated in axes that do not turn, which lie along T's at a stated time. Their origin is the body's
-centre of mass, about which a free body spins; the attraction is that of the homogeneous polyhedron, at any distance.
-The tide and the pressure of sunlight are left out. SciPy's DOP853 integrates with a relative tolerance of 1e-10 and
-absolute ones of 1e-7 m and 1e-10 m/s. Positions and velocities are then taken to T, which turns about +z.
+centre of mass, about which a free body spins. The attraction is that of the homogeneous polyhedron, at any
+distance; the tide and the pressure of sunlight are left out. SciPy's DOP853 integrates with a relative tolerance of
+1e-10 and absolute ones of 1e-7 m and 1e-10 m/s. Positions and velocities are then taken to T, which turns about +z.
 
 The camera's z axis follows what it is aimed at. Its attitude has a constant offset and noise in three angles, whose
 first-order Gauss-Markov process is limited to ten times its bandwidth, so that the noise has a rate.
@@ -124,7 +124,7 @@ def fly(scene: Scene, body: Body) -> Trajectory:
 
 def _joined(parts: list[Trajectory]) -> Trajectory:
     """Return trajectories one after the other."""
-    values = {
+    values: dict[str, Any] = {
         key: np.concatenate([getattr(part, key) for part in parts])
         for key, value in vars(parts[0]).items()
         if isinstance(value, np.ndarray)
@@ -140,6 +140,7 @@ def _sequence(scene: Scene, body: Body, flight: AnyFlight, number: int) -> Traje
     """Return one sequence of a flight. Raises InputError."""
     finer = -(-_PATH_POINTS // max(flight.frames - 1, 1))
     time_s = np.arange((flight.frames - 1) * finer + 1) / finer * flight.period_s
+    inside: tuple[int, float] | None = None
     tries = _TRIES if isinstance(flight, DescentFlight | HoverFlight | RelocationFlight) else 1
     for attempt in range(tries):
         case = _Case(scene=scene, body=body, flight=flight, number=number, time_s=time_s, attempt=attempt)
@@ -147,8 +148,10 @@ def _sequence(scene: Scene, body: Body, flight: AnyFlight, number: int) -> Traje
         inside = first_inside(body, path.position_T_m)
         if inside is None:
             return _row_by_row(case, path, slice(None, None, finer))
+    assert inside is not None
     index, depth_m = inside
-    raise InputError(below_ground(_row_by_row(case, path, slice(index, index + 1), -(-index // finer)), 0, depth_m))
+    row = _row_by_row(case, path, slice(index, index + 1), first=-(-index // finer)).pose(0)
+    raise InputError(f"{FLIGHTS}: {below_ground(row, depth_m)}")
 
 
 def _row_by_row(case: _Case, path: _Path, rows: slice, first: int = 0) -> Trajectory:

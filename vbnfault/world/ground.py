@@ -298,16 +298,15 @@ def check_above_ground(body: Body, trajectory: Trajectory, count: int) -> None:
     """Raise InputError if one of the first `count` rows of a trajectory lies inside the body's shape model."""
     inside = first_inside(body, trajectory.camera_position_T_m[:count])
     if inside is not None:
-        raise InputError(below_ground(trajectory, *inside))
+        raise InputError(f"{trajectory.source}: {below_ground(trajectory.pose(inside[0]), inside[1])}")
 
 
-def below_ground(trajectory: Trajectory, row: int, depth_m: float) -> str:
+def below_ground(pose: FlownPose, depth_m: float) -> str:
     """Return the sentence about a row of a trajectory that lies below the surface of the shape model."""
-    time_s = trajectory.time_s[row]
-    when = f"Julian date {trajectory.julian_date[row]:.6f}" if np.isnan(time_s) else f"{time_s:.6g} s"
+    when = f"Julian date {pose.julian_date:.6f}" if np.isnan(pose.time_s) else f"{pose.time_s:.6g} s"
     return (
-        f"{trajectory.source}: row {shown(trajectory.name[row])}, at {when}, is {depth_m:.3g} m below the ground; "
-        "choose other poses, or the body.shape that they were made for"
+        f"row {shown(pose.name)}, at {when}, is {depth_m:.3g} m below the ground; choose other poses, or the "
+        "body.shape that they were made for"
     )
 
 
