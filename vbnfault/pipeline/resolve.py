@@ -273,8 +273,9 @@ def _on_the_trajectory(spec: SampleSpec, flown: FlownPose) -> Pose:
     """Return the pose of a trajectory, from SPICE or from a table, in L.
 
     This pose was flown, so no other view is tried. A camera within the clearance of the ground shows that poses
-    and shape do not belong together; this raises VbnfaultError, or InputError for a row inside the shape. If a fault needs the Sun, but the Sun is hidden or
-    behind the camera, the pose is marked as not resolved and the fault is not injected.
+    and shape do not belong together; this raises VbnfaultError, or InputError for a row inside the shape. If a
+    fault needs the Sun, but the Sun is hidden or behind the camera, the pose is marked as not resolved and the fault
+    is not injected.
     """
     from .. import render
 

@@ -127,7 +127,9 @@ class _SiteFlight(_Flight):
     longitude_deg: Turn = Field((0.0, 360.0), description="of the site from T's x axis, eastward; or bounds")
     max_slope_deg: float = Field(35.0, ge=0, le=90, description="of a site's facet against gravity and rotation")
     sun_elevation_deg: Elevation = Field(
-        (10.0, 90.0), description="allowed elevations of the Sun at the site, half-way through the sequence"
+        (10.0, 90.0),
+        description="allowed elevations of the Sun at the site, half-way through the sequence; if it must be up, "
+        "the site is in sunlight",
     )
     look: Literal["site", "down"] = Field(
         "site", description="what the camera is aimed at: the site, the second one of a hop; or straight down"

@@ -51,6 +51,7 @@ _DAY_S = 86400.0
 _POLE = np.array([0.0, 0.0, 1.0])
 # Sites drawn until one fits the keys, and sites from which a flight is tried until it stays above the ground.
 _SITES, _TRIES = 300, 8
+_SUN_SEEN_FROM_M = 1.0
 _PATH_POINTS = 200  # at least, at which a flight is compared with the ground
 _MISS_M = 0.01  # largest miss of the target of a free flight
 # A hop leaves the ground at an angle between these. Lower ones skim the ground, higher ones hardly move.
@@ -431,7 +432,7 @@ def _site_pair(case: _Case) -> tuple[Site, Site]:
                 return None
             actual_m = float(np.linalg.norm(other.position_T_m - site.position_T_m))
             if abs(actual_m / distance_m - 1) < _DISTANCE_FRACTION:
-                return (site, other) if _is_gentle(case, other) else None
+                return (site, other) if _fits(case, other) else None
             step_m *= distance_m / actual_m
         return None
 
@@ -442,17 +443,13 @@ def _fitting_site(case: _Case, choose: Callable[[Site, int], Chosen | None]) -> 
     """Return what `choose` makes of the first random site that fits the keys. Raises InputError if none does."""
     flight = case.flight
     assert isinstance(flight, DescentFlight | HoverFlight | RelocationFlight)
-    sun = ephemeris.sun_direction_T(case.dated(0.5 * flight.duration_s))
-    low, high = np.sin(np.radians(flight.sun_elevation_deg))
     south, north = np.sin(np.radians(bounds_of(flight.latitude_deg)))
     west, east = np.radians(bounds_of(flight.longitude_deg))
     for k in range(_SITES):
         sine = south + (north - south) * case.uniform(f"latitude/{k}")
         longitude, cosine = west + (east - west) * case.uniform(f"longitude/{k}"), np.sqrt(1 - sine**2)
         site = _ground_at(case.body, np.array([cosine * np.cos(longitude), cosine * np.sin(longitude), sine]))
-        if site is None or not low <= -sun @ site.T_from_L[:, 2] <= high or not _is_gentle(case, site):
-            continue
-        if (chosen := choose(site, k)) is not None:
+        if site is not None and _fits(case, site) and (chosen := choose(site, k)) is not None:
             return chosen
     raise InputError(
         f"{FLIGHTS}: {case.name} finds no site in {_SITES} draws; widen latitude_deg, longitude_deg, "
@@ -467,13 +464,22 @@ def _ground_at(body: Body, towards_T: F64) -> Site | None:
     return None if hit is None else site_at(body, 0, hit)
 
 
-def _is_gentle(case: _Case, site: Site) -> bool:
-    """Return whether the facet of a site is no steeper than the key allows."""
-    flight = case.flight
+def _fits(case: _Case, site: Site) -> bool:
+    """Return whether a site has the Sun and the slope that the keys allow.
+
+    If the Sun must be up, no ground hides it from `_SUN_SEEN_FROM_M` above the site.
+    """
+    flight, body = case.flight, case.body
     assert isinstance(flight, DescentFlight | HoverFlight | RelocationFlight)
-    corners = case.body.vertices_m[case.body.faces[nearest_ground(case.body, site.position_T_m)[1]]]
+    sun, up = ephemeris.sun_direction_T(case.dated(0.5 * flight.duration_s)), -site.T_from_L[:, 2]
+    low, high = np.sin(np.radians(flight.sun_elevation_deg))
+    if not low <= sun @ up <= high:
+        return False
+    if low > 0 and first_hit(body, site.position_T_m + _SUN_SEEN_FROM_M * up, sun) is not None:
+        return False
+    corners = body.vertices_m[body.faces[nearest_ground(body, site.position_T_m)[1]]]
     normal = frames.unit(np.cross(corners[1] - corners[0], corners[2] - corners[0]))
-    return bool(-normal @ site.T_from_L[:, 2] >= np.cos(np.radians(flight.max_slope_deg)))
+    return bool(normal @ up >= np.cos(np.radians(flight.max_slope_deg)))
 
 
 # --- attitude ---------------------------------------------------------------------------------------------------
