@@ -274,8 +274,8 @@ def _on_the_trajectory(spec: SampleSpec, flown: FlownPose) -> Pose:
 
     This pose was flown, so no other view is tried. A camera within the clearance of the ground shows that poses
     and shape do not belong together; this raises VbnfaultError, or InputError for a row inside the shape. If a
-    fault needs the Sun, but the Sun is hidden or behind the camera, the pose is marked as not resolved and the fault
-    is not injected.
+    fault needs the Sun, but the Sun is hidden or behind the camera, the pose is marked as not resolved and the
+    fault is not injected.
     """
     from .. import render
 

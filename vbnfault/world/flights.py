@@ -54,7 +54,7 @@ _SITES, _TRIES = 300, 8
 _SUN_SEEN_FROM_M = 1.0
 _PATH_POINTS = 200  # at least, at which a flight is compared with the ground
 _MISS_M = 0.01  # largest miss of the target of a free flight
-# A hop leaves the ground at an angle between these. Lower ones skim the ground, higher ones hardly move.
+# A hop leaves flat ground at an angle between these. Lower ones skim the ground, higher ones hardly move.
 _HOP_DEG = (10.0, 80.0)
 # Distances of the second site that are tried until it lies at the wanted distance, to this fraction.
 _STEPS, _DISTANCE_FRACTION = 6, 0.01
@@ -330,15 +330,16 @@ def _descent(case: _Case) -> _Path:
     aside = case.value("aside_m") * (np.cos(side) * north + np.sin(side) * east)
     start = site.position_T_m - case.value("height_m") * down + aside
     end = site.position_T_m - case.value("end_height_m") * down
-    position, velocity = _fall_to(case.body, start, end, case.time_s)
-    if velocity[0] @ down < 0:
-        gravity = case.body.effective_gravity(0.5 * (start + end))[0] @ down
-        longest_s = np.sqrt(2 * max(float((end - start) @ down), 0) / gravity) if gravity > 0 else 0.0
-        raise InputError(
-            f"{FLIGHTS}: {case.name} would have to rise first, as it lasts {case.time_s[-1]:g} s; a fall from rest "
-            f"takes about {longest_s:.0f} s, so choose a shorter period_s or fewer frames"
-        )
-    return _Path(position_T_m=position, velocity_T_m_s=velocity, target_T_m=_target(case, site))
+    lasts_s, gravity = case.flight.duration_s, case.body.effective_gravity(0.5 * (start + end))[0] @ down
+    longest_s = np.sqrt(2 * ((end - start) @ down) / max(gravity, 1e-12))
+    if lasts_s < 1.5 * longest_s:  # only then worth the search
+        position, velocity = _fall_to(case.body, start, end, case.time_s)
+        if velocity[0] @ down >= 0:
+            return _Path(position_T_m=position, velocity_T_m_s=velocity, target_T_m=_target(case, site))
+    raise InputError(
+        f"{FLIGHTS}: {case.name} would have to rise first, as it lasts {lasts_s:g} s; a fall from rest takes about "
+        f"{longest_s:.0f} s, so choose a shorter period_s or fewer frames"
+    )
 
 
 def _hover(case: _Case) -> _Path:
@@ -379,17 +380,16 @@ def _relocation(case: _Case) -> _Path:
     first, second = _site_pair(case)
     height = case.value("height_m")
     start, end = (site.position_T_m - height * site.T_from_L[:, 2] for site in (first, second))
-    position, velocity = _fall_to(case.body, start, end, case.time_s)
-    rise = np.degrees(np.arcsin(np.clip(-frames.unit(velocity[0]) @ first.T_from_L[:, 2], -1, 1)))
-    if not _HOP_DEG[0] <= rise <= _HOP_DEG[1]:
-        gravity = float(np.linalg.norm(case.body.effective_gravity(first.position_T_m)))
-        distance = float(np.linalg.norm(end - start))
-        low, high = (np.sqrt(2 * distance * np.tan(np.radians(angle)) / gravity) for angle in _HOP_DEG)
+    # on flat ground a hop of the distance D and the time T leaves at the angle whose tangent is g T² / (2 D)
+    lasts_s, distance = case.flight.duration_s, float(np.linalg.norm(end - start))
+    gravity = float(np.linalg.norm(case.body.effective_gravity(0.5 * (start + end))))
+    low, high = (np.sqrt(2 * distance * np.tan(np.radians(angle)) / gravity) for angle in _HOP_DEG)
+    if not low <= lasts_s <= high:
         raise InputError(
-            f"{FLIGHTS}: {case.name}: a hop of {distance:.4g} m in {case.time_s[-1]:g} s leaves at {rise:.3g} deg "
-            f"above the horizon; must be from {_HOP_DEG[0]:g} to {_HOP_DEG[1]:g}, about {low:.0f} to {high:.0f} s "
-            "all together"
+            f"{FLIGHTS}: {case.name}: a hop of {distance:.4g} m lasts {lasts_s:g} s; must last from {low:.4g} to "
+            f"{high:.4g} s in this gravity, so change period_s, frames or distance_m"
         )
+    position, velocity = _fall_to(case.body, start, end, case.time_s)
     return _Path(position_T_m=position, velocity_T_m_s=velocity, target_T_m=_target(case, second))
 
 
