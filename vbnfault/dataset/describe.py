@@ -309,7 +309,7 @@ def _flights(session: Session, table: Trajectory) -> list[str]:
             f"{flight.frames} frames, {flight.duration_s:g} s; "
             f"{_span(range_m.min(), range_m.max())} m from the centre of mass, "
             f"{_span(height_m.min(), height_m.max())} m from the ground; "
-            f"{_span(speed_m_s.min(), speed_m_s.max())} m/s over the ground; "
+            f"{_span(speed_m_s.min(), speed_m_s.max())} m/s in T; "
             f"{pixel * first_m:.3g} m a pixel first, {pixel * last_m:.3g} last; the boresight turns "
             f"{_span(turn_px.min(), turn_px.max())} px a frame"
         )
