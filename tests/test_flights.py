@@ -565,3 +565,22 @@ def test_ground_between_frames_is_met(scene: Path) -> None:
     table = flight("flyby", closest_m=300.0, frames=2, period_s=8000.0)
     with pytest.raises(InputError, match=r"row 'flyby/0/0001', at (\S+) s, is \S+ m below"):
         describe_scene(config.load_scene(scene, {"trajectory.flight": [table]}), source="s")
+
+
+def test_the_first_position_inside_is_that_of_testing_all() -> None:
+    """Against a test of every position, on paths that are smooth, jump about, and stay near the ground."""
+    rng = np.random.default_rng(5)
+    starts = rng.normal(0, 1, (12, 1, 3))
+    starts = starts / np.linalg.norm(starts, axis=2, keepdims=True) * [930, 730, 630] + [40, 0, 0]
+    paths = [
+        *(starts + np.cumsum(rng.normal(0, 6, (12, 400, 3)), axis=1)),
+        *rng.uniform(-3e3, 3e3, (3, 200, 3)),
+        np.full((3, 3), 1e5),
+    ]
+    found = [ground.first_inside(rock(), path) for path in paths]
+    for path, first in zip(paths, found, strict=True):
+        inside = np.flatnonzero([ground.encloses(rock(), place) for place in path])
+        assert (None if first is None else first[0]) == (inside[0] if len(inside) else None)
+    assert found[-1] is None
+    assert sum(first is not None and first[0] > 0 for first in found) > 2
+    assert ground.first_inside(rock(), np.array([[1e4, 0, 0], [40.0, 0, 550.0]])) == (1, pytest.approx(49, abs=3))

@@ -271,21 +271,24 @@ def nearest_ground(body: Body, point_T_m: F64) -> tuple[float, int]:
 def first_inside(body: Body, path_T_m: F64) -> tuple[int, float] | None:
     """Return the first position of a path, float64[n, 3] in T, inside the shape model, and its depth in m, or None.
 
-    From a position outside, the path is followed for the distance to the nearest ground without a further test. Of
-    a path near the ground, at most `_MOST_TESTED` positions are tested.
+    After a position outside, the next one is tested that is farther from it than its nearest ground. At most
+    `_MOST_TESTED` positions are tested, of those that the sphere about the body encloses.
     """
     from scipy.spatial import KDTree
 
-    edge_m = _longest_edge_m(body)
-    free_m = KDTree(body.vertices_m).query(path_T_m)[0] - edge_m
-    index, tested = 0, 0
-    while index < len(path_T_m) and tested < _MOST_TESTED:
-        if free_m[index] <= body_radius_m(body):  # farther away than that is outside
-            tested += 1
-            if encloses(body, path_T_m[index]):
-                return index, nearest_ground(body, path_T_m[index])[0]
+    near = np.flatnonzero(np.linalg.norm(path_T_m, axis=1) <= body_radius_m(body))
+    if not len(near):
+        return None
+    path_T_m = path_T_m[near]
+    free_m = KDTree(body.vertices_m).query(path_T_m)[0] - _longest_edge_m(body)
+    index = 0
+    for _ in range(_MOST_TESTED):
+        if encloses(body, path_T_m[index]):
+            return int(near[index]), nearest_ground(body, path_T_m[index])[0]
         moved_m = np.linalg.norm(path_T_m[index + 1 :] - path_T_m[index], axis=1)
         index += 1 + int(np.argmax(np.append(moved_m >= free_m[index], True)))
+        if index == len(path_T_m):
+            return None
     return None
 
 
