@@ -34,6 +34,7 @@ def sequences(path: Path, *, size: int = 33, step_s: float = STEP_S, **changes: 
             effect[0, 23] = False
             layers = {"image": image, "clean": image, "mask": mask, "mask_effect": effect}
             times = {"sequence": sequence, "frame": frame, "time_s": 5.0 + frame * step_s, "injected": injected}
+            times |= {"velocity_T_m_s": np.zeros(3), "rate_C_rad_s": np.zeros(3)}
             made.append(
                 dataclasses.replace(
                     sample,

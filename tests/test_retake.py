@@ -155,6 +155,12 @@ def _of_a_table(folder: Path) -> dict[str, Any]:
     return {**own, "body": body, "trajectory": {"file": str(folder / "poses.csv")}}
 
 
+def _of_a_flight(folder: Path) -> dict[str, Any]:
+    """Return a scene of a sphere above which the camera hovers for two frames."""
+    hover = {"kind": "hover", "frames": 2, "period_s": 10.0, "height_m": 50.0}
+    return {**_of_a_table(folder), "sun": {"distance_au": 2.0}, "trajectory": {"flight": [hover]}}
+
+
 def _of_spice(folder: Path) -> dict[str, Any]:
     """Return a scene of a spacecraft whose kernels are written to a folder."""
     test_spice = pytest.importorskip("test_spice")
@@ -174,7 +180,7 @@ def _aimed(folder: Path) -> dict[str, Any]:
     }
 
 
-@pytest.mark.parametrize("kind", [_of_a_table, _of_spice, _aimed])
+@pytest.mark.parametrize("kind", [_of_a_table, _of_a_flight, _of_spice, _aimed])
 def test_views_that_are_flown_or_aimed_are_taken_again_by_ranges(kind: Any, tmp_path: Path) -> None:
     """Two commands, each with a shard of one sample, make the bits of the store."""
     table = kind(tmp_path)

@@ -29,6 +29,7 @@ _LEAST_RADIUS_M = 5.0
 _PATCH_RADII = 3.0
 _LENGTHS_AWAY = 50.0
 _SITES_SEARCHED = 4  # a site that is chosen for its Suns takes 0.8 s
+_ROWS_DESCRIBED = 50  # of a flight whose heights are computed; one takes 10 ms
 _POSES_DESCRIBED = 200  # rows of a trajectory whose distance from the ground is computed
 
 
@@ -250,8 +251,8 @@ def _trajectory(session: Session, table: Trajectory) -> list[str]:
         f"{_span(*(ground.pixel_rad(session.scene) * range_m[[range_m.argmin(), range_m.argmax()]]))} m a pixel; "
         f"phase angle at the centre of mass {_span(min(phase), max(phase))} deg",
         f"Sun: {_span(distance.min(), distance.max())} au away, dates {date.min():.5f} to {date.max():.5f} TDB",
+        *_flights(session, table),
         *_rows_that_miss_the_body(session, table, count),
-        *_rows_inside_the_body(session, table, count),
         *_rows_without_the_sun(session, table, count),
     ]
 
@@ -285,20 +286,34 @@ def _rows_that_miss_the_body(session: Session, table: Trajectory, count: int) ->
     ]
 
 
-def _rows_inside_the_body(session: Session, table: Trajectory, count: int) -> list[str]:
-    """Return a warning of the rows whose camera lies below the surface of the shape; [] if there are none."""
-    body, position_T_m = session.body, table.camera_position_T_m[:count]
-    low, high = body.vertices_m.min(axis=0), body.vertices_m.max(axis=0)
-    near = np.flatnonzero(((position_T_m >= low) & (position_T_m <= high)).all(axis=1))
-    inside = [k for k in near[:_POSES_DESCRIBED].tolist() if ground.encloses(body, position_T_m[k])]
-    if not inside:
+def _flights(session: Session, table: Trajectory) -> list[str]:
+    """Return a line for each flight of the scene: time, distances, heights, speeds, pixels on the ground, turns."""
+    flights = () if session.scene.trajectory is None else session.scene.trajectory.flight
+    if not flights or table.velocity_T_m_s is None or table.rate_C_rad_s is None:
         return []
-    least = "at least " if len(near) > _POSES_DESCRIBED else ""
-    return [
-        f"warning: {least}{len(inside)} of {count} rows have the camera inside the body, the first is "
-        f"{table.name[inside[0]]}; its sample cannot be built: choose other poses, or the body.shape that the "
-        "poses were made for"
-    ]
+    body, pixel = session.body, ground.pixel_rad(session.scene)
+    lines, start = [], 0
+    for flight in flights:
+        rows = np.arange(start, start + flight.sequences * flight.frames)
+        start += len(rows)
+        position = table.camera_position_T_m[rows]
+        # first and last rows, and some in between
+        some = np.unique([0, flight.frames - 1, *np.linspace(0, len(rows) - 1, _ROWS_DESCRIBED).astype(int)])
+        height_m = np.array([ground.nearest_ground(body, place)[0] for place in position[some]])
+        range_m = np.linalg.norm(position - body.centre_of_mass_T_m, axis=1)
+        speed_m_s = np.linalg.norm(table.velocity_T_m_s[rows], axis=1)
+        turn_px = np.linalg.norm(table.rate_C_rad_s[rows, :2], axis=1) * flight.period_s / pixel
+        first_m, last_m = height_m[0], height_m[some == flight.frames - 1][0]
+        lines.append(
+            f"  {flight.kind}: {flight.sequences} {'sequences' if flight.sequences > 1 else 'sequence'} of "
+            f"{flight.frames} frames, {flight.duration_s:g} s; "
+            f"{_span(range_m.min(), range_m.max())} m from the centre of mass, "
+            f"{_span(height_m.min(), height_m.max())} m from the ground; "
+            f"{_span(speed_m_s.min(), speed_m_s.max())} m/s in T; "
+            f"{pixel * first_m:.3g} m a pixel first, {pixel * last_m:.3g} last; the boresight turns "
+            f"{_span(turn_px.min(), turn_px.max())} px a frame"
+        )
+    return lines
 
 
 def _rows_without_the_sun(session: Session, table: Trajectory, count: int) -> list[str]:

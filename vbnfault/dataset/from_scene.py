@@ -19,7 +19,7 @@ from ..core.process import environment, llvm
 from ..core.quantities import Sample
 from ..scene import config, plan
 from ..scene.config import Scene
-from ..scene.trajectory import with_rows
+from ..scene.trajectory import Trajectory, with_rows
 from . import build, card, describe
 from .identity import is_exact, planned, store_spec
 from .resume import blocks_of, planned_blocks
@@ -31,17 +31,20 @@ class SessionFactory:
     """Make the session of a scene in a worker; the object is a function that can be pickled.
 
     `threads`: render threads of the worker; VBNFAULT_THREADS by default. `contents`: the input files as they were
-    when the build was planned.
+    when the build was planned. `flown`: the trajectory of the scene's flights, which takes seconds to compute.
     """
 
     scene: Scene
     blocks: tuple[int, ...]
     threads: int | None = None
     contents: file_contents.Contents = dataclasses.field(default_factory=file_contents.Contents)
+    flown: Trajectory | None = None
 
     def __call__(self) -> SampleMaker:
         with self.contents.in_use():
             session = pipeline.Session(self.scene, blocks=self.blocks, threads=render_threads(self.threads))
+            if self.flown is not None:
+                session.trajectory = self.flown
         return CheckedSession(session, self.contents)
 
 
@@ -184,7 +187,8 @@ def _prepared(
         exact=is_exact(spec.attributes),
         estimated_seconds=estimated_seconds(session),
     )
-    return SessionFactory(scene, blocks, options.threads, contents), build_plan, description
+    flown = session.trajectory if scene.trajectory is not None and scene.trajectory.flight else None
+    return SessionFactory(scene, blocks, options.threads, contents, flown), build_plan, description
 
 
 def _description(session: pipeline.Session, spec: store.StoreSpec) -> list[str]:

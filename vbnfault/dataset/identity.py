@@ -69,6 +69,7 @@ _LEFT_OUT_AT_DEFAULT = (
     "image",
     "image.frames",
     "motion",
+    "trajectory.flight",
     "trajectory.frames",
     "patch.airfall",
     "patch.fractured",
@@ -125,7 +126,7 @@ def _identity(session: pipeline.Session) -> dict[str, Any]:
         images = sorted(resources.data_dir(folder).glob("*.png"))
         data = b"".join(user_files.read_input(path, "texture") for path in images)
         scene[f"{folder}_sha256"] = user_files.sha256(data)
-    if session.scene.trajectory is not None:
+    if session.scene.trajectory is not None and session.scene.trajectory.file is not None:
         scene["trajectory"]["file"] = _digest(session.scene.trajectory.file, "trajectory")
     _leave_out_unused(scene, session.scene)
     _identify_plugins(scene, session)

@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 from ..body import Site
 from ..core import frames
 from ..core.calibration import Calibration
-from ..core.errors import VbnfaultError, shown
+from ..core.errors import InputError, VbnfaultError, shown
 from ..render.description import Sunlight
 from ..scene import aims, exchange, names, plan, redraw
 from ..scene.instrument import CameraTable
 from ..scene.trajectory import FlownPose
 from ..world import ephemeris
 from ..world.aiming import AimedView, aimed_view
-from ..world.ground import encloses
+from ..world.ground import below_ground, encloses, nearest_ground
 from ..world.spacecraft import SpacecraftMesh
 from .spec import Pose, SampleSpec, Terrain
 
@@ -273,16 +273,20 @@ def _on_the_trajectory(spec: SampleSpec, flown: FlownPose) -> Pose:
     """Return the pose of a trajectory, from SPICE or from a table, in L.
 
     This pose was flown, so no other view is tried. A camera within the clearance of the ground shows that poses
-    and shape do not belong together; this raises VbnfaultError. If a fault needs the Sun, but the Sun is hidden or
-    behind the camera, the pose is marked as not resolved and the fault is not injected.
+    and shape do not belong together; this raises VbnfaultError, or InputError for a row inside the shape. If a
+    fault needs the Sun, but the Sun is hidden or behind the camera, the pose is marked as not resolved and the
+    fault is not injected.
     """
     from .. import render
 
     scene, surface = spec.scene, spec.terrain.surface
     pose = _placed(spec, spec.terrain, flown)
     clearance = scene.geometry.clearance_m
-    clear = render.is_clear(surface, pose.position_L_m[None], clearance)[0]
-    if not clear or encloses(spec.terrain.body, flown.camera_position_T_m):
+    body, place = spec.terrain.body, flown.camera_position_T_m
+    is_inside = encloses(body, place)
+    if is_inside and scene.trajectory is not None:
+        raise InputError(f"sample {spec.index}: {below_ground(flown, nearest_ground(body, place)[0])}")
+    if is_inside or not render.is_clear(surface, pose.position_L_m[None], clearance)[0]:
         change = "poses" if scene.trajectory else "dates"
         made_for = "poses" if scene.trajectory else "kernels"
         camera = f"the camera of row {shown(flown.name)}" if scene.trajectory else flown.name

@@ -25,6 +25,7 @@ from ..scene import config, plan
 from ..scene.config import Scene, configure_faults
 from ..scene.keyed_random import keyed_uniform
 from ..scene.trajectory import (
+    FLIGHTS,
     FlownPose,
     Trajectory,
     as_trajectory,
@@ -35,7 +36,14 @@ from ..scene.trajectory import (
 )
 from ..world import assemble, cameras, ephemeris
 from ..world.coma import check_coma
-from ..world.ground import GroundDetail, ground_details, ground_of_sequence, sites_for_suns
+from ..world.flights import fly
+from ..world.ground import (
+    GroundDetail,
+    check_above_ground,
+    ground_details,
+    ground_of_sequence,
+    sites_for_suns,
+)
 from ..world.spacecraft import SpacecraftMesh
 from .record import to_sample
 from .spec import Frame, SampleSpec, Terrain
@@ -120,27 +128,24 @@ class Session:
         if not isinstance(scene, Scene):
             raise InputError(f"scene = {shown(scene)}: must be a Scene, as vbnfault.load_scene returns it")
         share_arenas()  # before terrain and renderer start their threads
-        self.trajectory: Trajectory | None = None
+        self.source = source
         if poses is not None:
-            self.trajectory = as_trajectory(poses)
-        elif scene.trajectory is not None:
-            with in_file(source), under_key("trajectory.file"):
-                self.trajectory = load_trajectory(scene.trajectory.file)
-        if self.trajectory is not None:
-            self.trajectory = self.trajectory.repeated(scene.dataset.variants_per_view)
-        self.scene = scene = with_rows(scene, None if poses is None else self.trajectory)
+            self.trajectory = as_trajectory(poses).repeated(scene.dataset.variants_per_view)
+        with in_file(source):
+            self.scene = scene = with_rows(scene, None if poses is None else self.trajectory)
         planned = sum(blocks or (scene.dataset.samples,))
-        if self.trajectory is not None and planned > len(self.trajectory):
-            raise InputError(
-                f"{source}: {planned} samples are planned, but {self.trajectory.source} has "
-                f"{len(self.trajectory)} rows, and each is a sample; append at most its further rows"
-            )
+        if (table := scene.trajectory) is not None:
+            rows = sum(table.frames) or len(self.trajectory or ())
+            if planned > rows:
+                raise InputError(
+                    f"{source}: {planned} samples are planned, but {table.file or FLIGHTS} has {rows} rows, and "
+                    "each is a sample; append at most its further rows"
+                )
         self.faults = configure_faults(scene, source)
         need_sun = [name for name, fault in self.faults.items() if fault.needs_sun]
         self.plan = self.plan_of_sites = plan.make_plan(scene, list(self.faults), blocks, need_sun=need_sun)
         if threads is not None and not 1 <= (tables.whole(threads) or 0) <= MOST_THREADS:
             raise InputError(f"threads = {shown(threads)}: must be a whole number from 1 to {MOST_THREADS}")
-        self.source = source
         self._threads = threads
         self._ground: dict[int, list[GroundDetail]] = {}  # of the rows of a sequence or of a shard
         self._terrain: Terrain | None = None
@@ -162,17 +167,33 @@ class Session:
         activity.begin("shape of the body")
         with in_file(self.source):
             body = assemble.make_body(self.scene)
-            if self.scene.coma is not None and self.trajectory is not None:
+            given = self.scene.trajectory is not None and not self.scene.trajectory.flight
+            if self.scene.coma is not None and given and self.trajectory is not None:
                 for distance_au in (self.trajectory.sun_distance_au.min(), self.trajectory.sun_distance_au.max()):
                     check_coma(self.scene.coma, body, float(distance_au))
         return body
 
+    @cached_property
+    def trajectory(self) -> Trajectory | None:
+        """Return the table of poses, which is read or flown at the first use; None without a trajectory."""
+        table = self.scene.trajectory
+        if table is None:
+            return None
+        if table.file is None:
+            activity.begin("flights")
+            with in_file(self.source):
+                return fly(self.scene, self.body)
+        with in_file(self.source), under_key("trajectory.file"):
+            return load_trajectory(table.file).repeated(self.scene.dataset.variants_per_view)
+
     def warn_of_doubts(self) -> None:
         """Warn of a body with values of another, named one, and of a frame that lens or spacecraft leave dark.
 
-        Raises InputError if the spacecraft hides all of the frame.
+        Raises InputError if the spacecraft hides all of the frame, or if a trajectory passes through the ground.
         """
         with in_file(self.source):
+            if self.trajectory is not None and self.trajectory.source != FLIGHTS:  # flights are checked
+                check_above_ground(self.body, self.trajectory, len(self.plan))
             sentences = (
                 assemble.values_of_another_body(self.scene, self.body),
                 cameras.dark_corners(self.scene),
@@ -369,7 +390,7 @@ class Session:
         if self.trajectory is not None:
             flown = self.trajectory.pose(index)
             values = {"julian_date": flown.julian_date, "distance_au": flown.sun_distance_au}
-        return _dated(scene, **values) if values else scene
+        return ephemeris.dated(scene, **values) if values else scene
 
     def simulate(self, index: int) -> Sample:
         """Return one finished sample."""
@@ -424,7 +445,7 @@ class Session:
             sun,
             time,
             self.scene.sun.julian_date,
-            lambda date: ephemeris.sun_distance_au(_dated(self.scene, julian_date=date)),
+            lambda date: ephemeris.sun_distance_au(ephemeris.dated(self.scene, julian_date=date)),
         )
         scene, of_faults, planned = self._switched(row, faults, exposure)
         number = tables.whole(sample)
@@ -433,7 +454,7 @@ class Session:
         flown = row.pose(0)
         spec = SampleSpec(
             index=number,
-            scene=_dated(scene, julian_date=flown.julian_date, distance_au=flown.sun_distance_au),
+            scene=ephemeris.dated(scene, julian_date=flown.julian_date, distance_au=flown.sun_distance_au),
             plan=planned,
             faults=of_faults,
             terrain=self.aimed_terrain(flown),
@@ -477,8 +498,3 @@ class Session:
     def frame(self, index: int) -> Frame:
         """Return one sample with the outcome of every stage, from its pose to its labels."""
         return simulate_frame(self.spec(index), shared=self._shared_views)
-
-
-def _dated(scene: Scene, **values: float) -> Scene:
-    """Return a scene with other values of its Sun."""
-    return scene.model_copy(update={"sun": scene.sun.model_copy(update=values)})

@@ -98,8 +98,8 @@ class Scene(Table):
     def _one_trajectory(self) -> Scene:
         if self.trajectory is not None and self.spice.spacecraft:
             raise ValueError(
-                f"trajectory.file = {self.trajectory.file!r}: spice.spacecraft = {self.spice.spacecraft!r} gives "
-                "poses, too; leave one out"
+                f"trajectory.{'flight' if self.trajectory.file is None else f'file = {self.trajectory.file!r}'}: "
+                f"spice.spacecraft = {self.spice.spacecraft!r} gives poses, too; leave one out"
             )
         return self
 

@@ -18,12 +18,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from ..core import tables
 from ..core.errors import InputError, shown, under_key
 from ..core.files import file_contents, user_files
 from ..core.tables import Table
+from .flights import AnyFlight, frames_of
 from .motion import between_frames
 
 if TYPE_CHECKING:
@@ -59,27 +60,41 @@ _LONGEST_NAME = 200
 _MOST_SITES = 100_000  # of `dataset.sites`
 _MOST_ROWS = 1_000_000
 _IN_PYTHON = "poses"  # stands for the file's name where the table was given in Python
+FLIGHTS = "trajectory.flight"  # stands for the file's name where flights make the table
 
 
 Frames = Annotated[int, Field(ge=1, le=_MOST_ROWS)]
 
 
 class TrajectoryTable(Table):
-    """Name a table of poses. Every row is a sample, seen from there: its camera, its Sun, its date and its name.
+    """Name a table of poses, or flights that make one. Every row is a sample, seen from there at its date.
 
     `dataset.samples` is then the number of rows by default, and `[geometry]` with its bounds does not apply.
     """
 
-    file: str = Field(
-        min_length=1,
+    file: Annotated[str, Field(min_length=1)] | None = Field(
+        None,
         description="CSV or Parquet file with the columns name, julian_date, camera_x_T_m, camera_y_T_m, "
         "camera_z_T_m, camera_from_T_w, camera_from_T_x, camera_from_T_y, camera_from_T_z, sun_x_T, sun_y_T, "
         "sun_z_T and sun_distance_au; with sequence and time_s for frames that follow each other, and with "
         "velocity_x_T_m_s to velocity_z_T_m_s and rate_x_C_rad_s to rate_z_C_rad_s where they are known",
     )
-    frames: tuple[Frames, ...] = Field(
-        (), description="Number of rows of each sequence, which vbnfault fills in from the file"
+    frames: tuple[Frames, ...] = Field((), description="Number of rows of each sequence, which vbnfault fills in")
+    flight: tuple[AnyFlight, ...] = Field(
+        (), max_length=1000, description="flights in place of a file: each makes sequences of frames"
     )
+
+    @model_validator(mode="after")
+    def _file_or_flights(self) -> TrajectoryTable:
+        if self.file is not None and self.flight:
+            raise ValueError(f"file = {shown(self.file)}: flight makes poses, too; leave one out")
+        if self.file is None and not self.flight:
+            raise ValueError("file: is missing; a trajectory needs a file, or flights")
+        if sum(frames_of(self.flight)) > _MOST_ROWS:
+            raise ValueError(
+                f"flight: has {sum(frames_of(self.flight))} frames; must have at most {_MOST_ROWS} all together"
+            )
+        return self
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -236,28 +251,34 @@ def with_rows(scene: Scene, trajectory: Trajectory | None = None) -> Scene:
     """
     if trajectory is not None:
         scene = scene.model_copy(update={"trajectory": TrajectoryTable(file=_IN_PYTHON)})
-        samples: int | None = len(trajectory)
+        rows, frames, source = len(trajectory), trajectory.frames, trajectory.source
     elif scene.trajectory is None:
         return scene
+    elif scene.trajectory.file is None:
+        frames, source = frames_of(scene.trajectory.flight), FLIGHTS
+        rows = sum(frames)
     else:
         with under_key("trajectory.file"):
-            trajectory = load_trajectory(scene.trajectory.file).repeated(scene.dataset.variants_per_view)
-        samples = scene.dataset.samples if "samples" in scene.dataset.model_fields_set else len(trajectory)
-        if samples > len(trajectory):
-            raise InputError(
-                f"dataset.samples = {samples}: {trajectory.source} has {len(trajectory)} rows, and each is a "
-                f"sample; must be from 1 to {len(trajectory)}, or be left out"
-            )
-    assert scene.trajectory is not None
-    sites = len(trajectory.frames) or -(-len(trajectory) // scene.dataset.shard_samples)
+            table = load_trajectory(scene.trajectory.file).repeated(scene.dataset.variants_per_view)
+        rows, frames, source = len(table), table.frames, table.source
+    samples = rows
+    if trajectory is None and "samples" in scene.dataset.model_fields_set:
+        samples = scene.dataset.samples
+    if samples > rows:
+        raise InputError(
+            f"dataset.samples = {samples}: {source} has {rows} rows, and each is a "
+            f"sample; must be from 1 to {rows}, or be left out"
+        )
+    sites = len(frames) or -(-rows // scene.dataset.shard_samples)
     if sites > _MOST_SITES:
         raise InputError(
-            f"{trajectory.source}: has {len(trajectory)} rows; must have at most "
+            f"{source}: has {rows} rows; must have at most "
             f"{_MOST_SITES * scene.dataset.shard_samples}, {_MOST_SITES} times dataset.shard_samples"
         )
-    table = scene.trajectory.model_copy(update={"frames": trajectory.frames})
+    assert scene.trajectory is not None
+    flown = scene.trajectory.model_copy(update={"frames": frames})
     dataset = scene.dataset.model_copy(update={"samples": samples, "sites": sites})
-    return scene.model_copy(update={"trajectory": table, "dataset": dataset})
+    return scene.model_copy(update={"trajectory": flown, "dataset": dataset})
 
 
 @file_contents.cached_with_contents(maxsize=4)

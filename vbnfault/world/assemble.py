@@ -196,7 +196,8 @@ def values_of_another_body(scene: Scene, body: Body) -> str:
         of_67p = table.photometry.keys_of_67p
         assumed += [f"body.photometry.{key} = {getattr(table.photometry, key)!r}" for key in of_67p]
     # if the scene or its table of poses gives a distance, the orbit only rotates the stars
-    has_distance = scene.sun.distance_au is not None or scene.trajectory is not None
+    has_table = scene.trajectory is not None and not scene.trajectory.flight
+    has_distance = scene.sun.distance_au is not None or has_table
     own_orbit = None if known.orbit is None else OrbitTable.model_validate(known.orbit)
     if scene.orbit == own_orbit and not scene.spice.kernels and not has_distance:
         assumed.append("[orbit]")

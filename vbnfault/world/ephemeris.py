@@ -96,15 +96,25 @@ def trajectory_sites(scene: Scene, body: Body) -> Sites:
 def flown_pose(scene: Scene) -> FlownPose:
     """Return camera and Sun in T from SPICE, at the scene's date. Raises InputError if kernels lack the data."""
     spacecraft = spacecraft_pose(scene, scene.sun.julian_date)
-    sun_J_au, T_from_J = ephemeris(scene)
     return FlownPose(
         name=f"spice.spacecraft = {scene.spice.spacecraft!r}",
         julian_date=scene.sun.julian_date,
         camera_position_T_m=spacecraft.camera_position_T_m,
         T_from_C=spacecraft.T_from_C,
-        sun_direction_T=T_from_J @ frames.unit(sun_J_au),
+        sun_direction_T=sun_direction_T(scene),
         sun_distance_au=sun_distance_au(scene),
     )
+
+
+def dated(scene: Scene, **values: float) -> Scene:
+    """Return a scene with other values of its Sun, such as `julian_date`."""
+    return scene.model_copy(update={"sun": scene.sun.model_copy(update=values)})
+
+
+def sun_direction_T(scene: Scene) -> F64:
+    """Return the unit vector from the body to the Sun in T, float64[3], at the scene's date."""
+    sun_J_au, T_from_J = ephemeris(scene)
+    return np.asarray(T_from_J @ frames.unit(sun_J_au))
 
 
 def sun_distance_au(scene: Scene) -> float:
