@@ -470,7 +470,7 @@ def test_an_event_brings_all_of_its_faults_and_takes_them_away(scene: Path, tmp_
     """What the store says of events is what changes in the pixels of its frames."""
     scene.write_text(scene.read_text() + EVENTS)
     out = tmp_path / "s.zarr"
-    vbnfault.build(scene, out, progress=False)
+    summary = vbnfault.build(scene, out, progress=False)
     assert vbnfault.verify(out).problems == []
     with vbnfault.open_dataset(out) as data:
         injected = data["injected"].values
@@ -491,9 +491,9 @@ def test_an_event_brings_all_of_its_faults_and_takes_them_away(scene: Path, tmp_
     onsets = {event.sequence: event.onset_s for event in listed}
     assert [event.onset_s for event in listed] == [onsets[event.sequence] for event in listed]
     np.testing.assert_array_equal(injected, expected)
-    counts = vbnfault.statistics(out).counts
-    for c, fault in enumerate(("dust_on_optics", "cosmic_rays")):
-        assert counts.planned(fault) == counts.realised(fault) == expected[:, c].sum()
+    for counts in (vbnfault.statistics(out).counts, summary.counts):
+        for c, fault in enumerate(("dust_on_optics", "cosmic_rays")):
+            assert counts.planned(fault) == counts.realised(fault) == expected[:, c].sum()
     np.testing.assert_array_equal(changed, expected.any(axis=1))
     assert {one["dust_on_optics"]["event"]["cause"] for one in parameters if one} == {"dust event"}
 

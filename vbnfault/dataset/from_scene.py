@@ -19,6 +19,7 @@ from ..core.process import environment, llvm
 from ..core.quantities import Sample
 from ..scene import config, plan
 from ..scene.config import Scene
+from ..scene.events import commanded_in_time
 from ..scene.trajectory import Trajectory, with_rows
 from . import build, card, describe
 from .identity import is_exact, planned, store_spec
@@ -182,13 +183,22 @@ def _prepared(
         spec=spec,
         site=session.plan.site,
         blocks=blocks,
-        planned_faults=session.plan.injected,
+        planned_faults=_commanded(session),
         expected=planned(spec.attributes, spec.faults),
         exact=is_exact(spec.attributes),
         estimated_seconds=estimated_seconds(session),
     )
     flown = session.trajectory if scene.trajectory is not None and scene.trajectory.flight else None
     return SessionFactory(scene, blocks, options.threads, contents, flown), build_plan, description
+
+
+def _commanded(session: pipeline.Session) -> NDArray[np.bool_]:
+    """Return the commanded faults bool[sample, fault], those of events at the times at which they are there."""
+    table, trajectory = session.plan, session.trajectory
+    if trajectory is None or not session.scene.event:
+        return table.injected
+    time_s = trajectory.time_s[: len(table)].tolist()
+    return commanded_in_time(session.scene, table.faults, table.injected, table.state, time_s)
 
 
 def _description(session: pipeline.Session, spec: store.StoreSpec) -> list[str]:

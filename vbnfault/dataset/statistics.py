@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from .. import store as stores
 from ..core.errors import VbnfaultError
-from ..scene.events import commanded_now
+from ..scene.events import commanded_in_time
 from ..store import SPLITS, STRATA, FaultCounts, Store
 from .identity import plan_numbers, stored_plan
 
@@ -340,9 +340,10 @@ def _commanded(store: Store) -> NDArray[np.bool_] | None:
     injected: NDArray[np.bool_] = table.injected[numbers]
     if scene.event and store.spec.sequence_names:
         for samples, columns in finished_scalars(store, ("time_s",)):
-            for i, time_s in zip(samples, columns["time_s"].tolist(), strict=True):
-                state = int(table.state[numbers[i]])
-                injected[i] = commanded_now(scene, faults, injected[i].tolist(), state, time_s)
+            state = table.state[numbers[samples]]
+            injected[samples] = commanded_in_time(
+                scene, faults, injected[samples], state, columns["time_s"].tolist()
+            )
     return injected
 
 

@@ -116,7 +116,7 @@ def fault_context(pose: Pose, rendering: Rendering, exposure: SceneExposure) -> 
         radiance=exposure.light.rendered,
         surroundings=rendering.surroundings,
         far_sources=rendering.far_sources,
-        time_s=pose.time_s,
+        time_s=None if pose.time_s is None else pose.time_s - exposure.camera.exposure_s / 2,
         of_view=rendering.shared,
     )
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, model_validator
 
 from ..core.tables import Table, each_once, pair_within
@@ -148,6 +149,20 @@ def commanded_now(
         bool(has) and (event is None or event.fraction(time_s) > 0)
         for has, event in zip(injected, now, strict=True)
     ]
+
+
+def commanded_in_time(
+    scene: Scene,
+    faults: Sequence[str],
+    injected: NDArray[np.bool_],
+    state: NDArray[np.int64],
+    time_s: Sequence[float],
+) -> NDArray[np.bool_]:
+    """Return which commanded faults bool[frame, fault] frames carry at their times; without events all of them."""
+    if not scene.event:
+        return injected
+    rows = zip(injected.tolist(), state.tolist(), time_s, strict=True)
+    return np.array([commanded_now(scene, faults, row, first, time) for row, first, time in rows])
 
 
 def first_classes(tables: Sequence[EventTable]) -> Mapping[str, tuple[str, ...]]:
