@@ -286,6 +286,9 @@ def _on_the_trajectory(spec: SampleSpec, flown: FlownPose) -> Pose:
     is_inside = encloses(body, place)
     if is_inside and scene.trajectory is not None:
         raise InputError(f"sample {spec.index}: {below_ground(flown, nearest_ground(body, place)[0])}")
+    up_L = spec.terrain.site.T_from_L.T @ frames.unit(place - body.centre_of_mass_T_m)
+    # relief rises above the shape
+    is_inside |= not render.first_ground(surface, pose.position_L_m, up_L)[1]
     if is_inside or not render.is_clear(surface, pose.position_L_m[None], clearance)[0]:
         change = "poses" if scene.trajectory else "dates"
         made_for = "poses" if scene.trajectory else "kernels"
