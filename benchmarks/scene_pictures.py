@@ -6,15 +6,16 @@
 
 Contact sheets show samples of a dataset with their masks. Their samples are 512 pixels wide, over terrain as coarse
 as quickstart's; the sheets are then shrunk. The figures of `flares`, `navcam67p`, `paper_example`, `physical67p`
-and `rosetta67p` show single samples, rendered at the scene's own size and then shrunk. `flown_faults` and
-`flown_readout` show each fault on one frame, for the page `flown_faults`; they get a palette. A figure without
-colour is written as a grey PNG, whose file is smaller.
+and `rosetta67p` show single samples, rendered at the scene's own size and then shrunk. Those of flights are film
+strips, of samples like those of contact sheets. `flown_faults` and `flown_readout` show each fault on one frame, for
+the page `flown_faults`; they get a palette. A figure without colour is written as a grey PNG, whose file is smaller.
 """
 
 from __future__ import annotations
 
 import argparse
 import tempfile
+from functools import partial
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -48,6 +49,9 @@ SHEET_PX = 512
 SHEET_TRIANGLES = 800_000
 SHEET_WIDTH_PX = 1080
 NARROW_PX = {"approach": 700, "earth_observation": 700}  # sheets that pages of the documentation show
+# Sequences of which film strips are shown, and frames of each.
+STRIPS = {"descent67p": (0, 5), "flyby_bennu": (6, 7), "hover_ceres": (4, 19), "relocation67p": (6, 9)}
+STRIP_FRAMES, STRIP_PX = 6, 176
 # Samples with many fault classes; several share a site, whose terrain is then built once.
 # Those of NAVCAM have all nine classes of the scene between them, most of them visible in a small figure.
 FLARES, NAVCAM, PHYSICAL = (1, 2, 3), (2, 7, 13, 15), (7, 4)
@@ -195,6 +199,19 @@ def flown_readout() -> U8:
     return spaced([tiles[k : k + 4] for k in range(0, len(tiles), 4)], FLOWN_TILE_PX)
 
 
+def strips(scene: str) -> U8:
+    """Return film strips of two sequences of a scene with other faults, a row each."""
+    changes = {"camera.width_px": SHEET_PX, "camera.height_px": SHEET_PX, "patch.max_triangles": SHEET_TRIANGLES}
+    session = Session(config.load_scene(scene, changes))
+    rows = []
+    for sequence in STRIPS[scene]:
+        count = session.scene.frames[sequence]
+        first = sum(session.scene.frames[:sequence])
+        chosen = np.linspace(0, count - 1, STRIP_FRAMES).round().astype(int)
+        rows.append([rgb(session.frame(first + k), "image") for k in chosen.tolist()])
+    return spaced(rows, STRIP_PX)
+
+
 SINGLE = {
     "flares": flares,
     "flown_faults": flown_faults,
@@ -203,6 +220,7 @@ SINGLE = {
     "paper_example": paper_example,
     "physical67p": physical67p,
     "rosetta67p": rosetta67p,
+    **{scene: partial(strips, scene) for scene in STRIPS},
 }
 
 
