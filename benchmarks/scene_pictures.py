@@ -7,8 +7,9 @@
 Contact sheets show samples of a dataset with their masks. Their samples are 512 pixels wide, over terrain as coarse
 as quickstart's; the sheets are then shrunk. The figures of `flares`, `navcam67p`, `paper_example`, `physical67p`
 and `rosetta67p` show single samples, rendered at the scene's own size and then shrunk. Those of flights are film
-strips, of samples like those of contact sheets. `flown_faults` and `flown_readout` show each fault on one frame, for
-the page `flown_faults`; they get a palette. A figure without colour is written as a grey PNG, whose file is smaller.
+strips, of samples like those of contact sheets. `flown_faults` and `flown_readout` show each fault on one frame,
+for the page `flown_faults`; they get a palette. A figure without colour is written as a grey PNG, with a smaller
+file.
 """
 
 from __future__ import annotations
