@@ -52,7 +52,7 @@ SHEET_WIDTH_PX = 1080
 NARROW_PX = {"approach": 700, "earth_observation": 700}  # sheets that pages of the documentation show
 # Sequences of which film strips are shown, and frames of each.
 STRIPS = {"descent67p": (0, 5), "flyby_bennu": (6, 7), "hover_ceres": (4, 19), "relocation67p": (6, 9)}
-STRIP_FRAMES, STRIP_PX = 6, 176
+STRIP_FRAMES, STRIP_PX = 6, 144
 # Samples with many fault classes; several share a site, whose terrain is then built once.
 # Those of NAVCAM have all nine classes of the scene between them, most of them visible in a small figure.
 FLARES, NAVCAM, PHYSICAL = (1, 2, 3), (2, 7, 13, 15), (7, 4)
@@ -255,7 +255,7 @@ def main() -> None:
     for scene in given.scenes or known:
         path = given.out / f"{scene}.png"
         figure = sheet(scene) if scene in SHEETS else SINGLE[scene]()
-        if scene.startswith("flown"):
+        if scene.startswith("flown") or scene in STRIPS:
             # smooth veils would show steps of a palette without dither
             image = Image.fromarray(figure)
             palette = image.quantize(256, Image.Quantize.MAXCOVERAGE, 2)

@@ -195,7 +195,7 @@ def _carried(light: Radiance, cells: F32, weights: F64, paths: Paths) -> F32:
     # blur by a box of width h, which adds h²/24 times the second derivative.
     fine = cv2.boxFilter(cells + between_surfaces, -1, (side, side), anchor=(0, 0), borderType=cv2.BORDER_REPLICATE)
     if side > 1:
-        fine -= cv2.Laplacian(fine, -1, borderType=cv2.BORDER_REPLICATE) / 24
+        fine = np.maximum(fine - cv2.Laplacian(fine, -1, borderType=cv2.BORDER_REPLICATE) / 24, 0)
     times = paths.times_s(_STEPS_PER_PX)
     moved = np.zeros((height, width), np.float32)
     for time_s in times:
