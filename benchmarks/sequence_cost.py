@@ -3,8 +3,8 @@
     python benchmarks/sequence_cost.py [--size 512] [--frames 40] [--scene descent67p]
 
 The single sample is the first of a new session, with body, flights, terrain and detector made for it; kernels are
-compiled and terrain is in the cache before. The last line is the cost of `Session.take`: its median time for the same
-frames less that of the frames themselves.
+compiled and terrain is in the cache before. The last line is the cost of `Session.take`: its median time for the
+same frames less that of the frames themselves.
 """
 
 from __future__ import annotations
