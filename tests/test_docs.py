@@ -292,7 +292,7 @@ _DIMENSIONLESS = """
     rts_fraction rubble samples samples_per_pixel scarps seed shadow_hiding_amplitude shadow_hiding_width
     shard_samples sharpen shutter_transmission single_scattering_albedo site sites size_power slope_parameter smooth
     strata strength stretch stuck_bits stuck_fraction
-    sun sun_facing_nominal_fraction sunlit_fraction test tile train
+    sun sun_facing_nominal_fraction sunlit_fraction test threshold_off threshold_on threshold_sigma tile train
     transmission
     trap_fraction val value variants_per_view vd wing_index
 """
