@@ -85,10 +85,10 @@ def smaller(words: list[str]) -> list[str]:
     for k, (option, value) in enumerate(itertools.pairwise(words)):
         if option in FEWER:
             out[k + 1] = str(min(FEWER[option], int(value)))
-    if words[1] in ("build", "render", "describe", "retake"):
+    if words[1] in ("build", "render", "describe", "retake", "event-camera"):
         scene = words[words.index("--scene") + 1] if words[1] == "retake" else words[2]
         small = small_values(load_scene(scene))
-        if "--samples" in words or words[1] == "describe":
+        if "--samples" in words or words[1] in ("describe", "event-camera"):
             del small["dataset.samples"]
         out += [word for key, value in small.items() for word in ("--set", f"{key}={value}")]
     return out + SMALLER.get(words[1], [])
