@@ -208,7 +208,7 @@ def test_a_block_with_a_wrong_option_is_refused(tmp_path: Path) -> None:
 def test_inline_commands_name_real_commands() -> None:
     known = {words[0] for words, _ in reference.walk_commands()}
     texts = [page_text(page) for page in PAGES]
-    named = {word for text in texts for word in re.findall(r"`vbnfault ([a-z]+)", text)}
+    named = {word for text in texts for word in re.findall(r"`vbnfault ([a-z-]+)", text)}
     assert len(named) > 5
     assert named <= known
 
@@ -283,7 +283,8 @@ _DIMENSIONLESS = """
     crater_depth crater_index dark_nonuniformity
     dead_fraction default_material distance_exponent dsnu_freedom dust_contrast eccentricity
     duty equilibrium exposure_stops f_number frames
-    faulty_fraction fill_power gain gamma grain_albedo halo_index hot_clustered_fraction hot_offset_fraction hurst
+    faulty_fraction fill_power gain gamma grain_albedo halo_index hot_clustered_fraction hot_offset_fraction
+    hot_pixel_fraction hurst
     individuals
     intermittency internal_transmittance_10mm iso iso_power joints k leak limb log10_scale max_samples_per_pixel
     max_triangles max_tries max_views metering_level min_lit_fraction missing_codes n nadir nd neutral

@@ -340,6 +340,22 @@ def test_renders_are_as_far_apart_as_the_ground_moves(scene: Path) -> None:
         assert {10.0, 11.0, 12.0} <= set(flight.times_s.tolist())
 
 
+def test_events_have_neither_faults_nor_blur_nor_samples_where_noise_asks_for_them(scene: Path) -> None:
+    changes = {
+        "render.noise_fraction": 0.5,
+        "motion.shutter": "global",
+        "faults.straylight.model": "texture",
+        "faults.cosmic_rays.flux_per_cm2_s": 3000.0,
+        "event_camera.step_px": 4.0,
+    }
+    first, second = (
+        np.concatenate(list(EventFlight(vbnfault.Session(vbnfault.load_scene(scene, values)), 1).events()))
+        for values in ({"event_camera.step_px": 4.0}, changes)
+    )
+    assert len(first) > 1000
+    assert first.tobytes() == second.tobytes()
+
+
 def test_the_course_keeps_to_poses_velocities_and_the_sun(scene: Path, tmp_path: Path) -> None:
     """The cubic of two poses with given velocities; attitude and Sun are half-way between at half the time."""
     from vbnfault.pipeline.event_camera import Course

@@ -55,7 +55,7 @@ def sequences(session: Session, names: tuple[str, ...] = ()) -> dict[str, int]:
             raise InputError(f"--sequence {shown(name)}: must be one of {', '.join(known)} of {trajectory.source}")
     chosen = {name: k for name, k in known.items() if not names or name in names}
     for name, k in chosen.items():
-        if trajectory.frames[k] <= session.scene.dataset.variants_per_view:
+        if trajectory.frames[k] == 1:
             raise InputError(f"{trajectory.source}: sequence {name} has 1 frame; must have at least 2")
     return chosen
 
@@ -125,10 +125,10 @@ class EventFlight:
     """
 
     def __init__(self, session: Session, number: int) -> None:
-        trajectory, variants = session.trajectory, session.scene.dataset.variants_per_view
+        trajectory = session.trajectory
         assert trajectory is not None
         first = sum(trajectory.frames[:number])
-        rows = slice(first, first + trajectory.frames[number], variants)
+        rows = slice(first, first + trajectory.frames[number])
         self.course = Course.of(trajectory, rows, trajectory.sequence_names[number])
         self.camera = session.scene.event_camera or EventCamera()
         with in_file(session.source):
