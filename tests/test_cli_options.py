@@ -101,7 +101,7 @@ def test_a_path_to_write_is_no_url() -> None:
                 refused = CliRunner().invoke(cli.app, [command, option.opts[0], path], env={"COLUMNS": "200"})
                 assert (refused.exit_code, sentence in refused.output) == (2, True), (command, option.name)
             seen += 1
-    assert seen == 21
+    assert seen == 22
     assert not Path("s3:").exists()
 
 

@@ -85,10 +85,10 @@ def smaller(words: list[str]) -> list[str]:
     for k, (option, value) in enumerate(itertools.pairwise(words)):
         if option in FEWER:
             out[k + 1] = str(min(FEWER[option], int(value)))
-    if words[1] in ("build", "render", "describe", "retake"):
+    if words[1] in ("build", "render", "describe", "retake", "event-camera"):
         scene = words[words.index("--scene") + 1] if words[1] == "retake" else words[2]
         small = small_values(load_scene(scene))
-        if "--samples" in words or words[1] == "describe":
+        if "--samples" in words or words[1] in ("describe", "event-camera"):
             del small["dataset.samples"]
         out += [word for key, value in small.items() for word in ("--set", f"{key}={value}")]
     return out + SMALLER.get(words[1], [])
@@ -208,7 +208,7 @@ def test_a_block_with_a_wrong_option_is_refused(tmp_path: Path) -> None:
 def test_inline_commands_name_real_commands() -> None:
     known = {words[0] for words, _ in reference.walk_commands()}
     texts = [page_text(page) for page in PAGES]
-    named = {word for text in texts for word in re.findall(r"`vbnfault ([a-z]+)", text)}
+    named = {word for text in texts for word in re.findall(r"`vbnfault ([a-z-]+)", text)}
     assert len(named) > 5
     assert named <= known
 
@@ -283,7 +283,8 @@ _DIMENSIONLESS = """
     crater_depth crater_index dark_nonuniformity
     dead_fraction default_material distance_exponent dsnu_freedom dust_contrast eccentricity
     duty equilibrium exposure_stops f_number frames
-    faulty_fraction fill_power gain gamma grain_albedo halo_index hot_clustered_fraction hot_offset_fraction hurst
+    faulty_fraction fill_power gain gamma grain_albedo halo_index hot_clustered_fraction hot_offset_fraction
+    hot_pixel_fraction hurst
     individuals
     intermittency internal_transmittance_10mm iso iso_power joints k leak limb log10_scale max_samples_per_pixel
     max_triangles max_tries max_views metering_level min_lit_fraction missing_codes n nadir nd neutral
@@ -292,7 +293,7 @@ _DIMENSIONLESS = """
     rts_fraction rubble samples samples_per_pixel scarps seed sequences shadow_hiding_amplitude shadow_hiding_width
     shard_samples sharpen shutter_transmission single_scattering_albedo site sites size_power slope_parameter smooth
     strata strength stretch stuck_bits stuck_fraction
-    sun sun_facing_nominal_fraction sunlit_fraction test tile train
+    sun sun_facing_nominal_fraction sunlit_fraction test threshold_off threshold_on threshold_sigma tile train
     transmission
     trap_fraction val value variants_per_view vd wing_index
 """

@@ -322,6 +322,7 @@ def case_options(seeds: Seeds, rng: random.Random, here: Path) -> Case:
             "550",
         ],
         "list": ["list", "scenes"],
+        "event-camera": ["event-camera", scene, "--out", out],
         "score": ["score", out, str(seeds.store), "--split", "all", "--batch", "2"],
         "train": ["train", str(seeds.store), "--out", out, "--epochs", "1", "--crop-px", "32"],
         "shape": ["shape", "Bennu", "--out", out, "--url", "http://127.0.0.1:9/bennu.bds"],  # nobody listens there
@@ -345,6 +346,7 @@ def case_options(seeds: Seeds, rng: random.Random, here: Path) -> Case:
         "report": ["--samples", "--pixels", "--out"],
         "export": ["--format", "--out", "--workers"],
         "merge": ["--out", "--move"],
+        "event-camera": ["--out", "--sequence", "--seed", "--set"],
         "score": ["--out", "--split", "--masks", "--calibrate", "--batch", "--seed", "--name"],
         "train": ["--out", "--classes", "--crop-px", "--batch-size", "--learning-rate", "--weights", "--device"],
         "lens": ["--vary-seed", "--spread", "--json", "--toml", "--out"],

@@ -166,6 +166,30 @@ def render(
 
 
 @app.command(rich_help_panel=_PANEL)
+@grouped
+def event_camera(
+    scene: SceneArgument,
+    out: Annotated[Path, local_path("Folder for the files, to make or to continue.")],
+    options: SceneValues,
+    sequence: Annotated[
+        list[str] | None,
+        typer.Option(help="Name of a sequence; may be repeated.", show_default="all sequences of the scene"),
+    ] = None,
+) -> None:
+    """Fly an event camera along the sequences of a scene, and write the events of its pixels as HDF5 and Parquet.
+    The same command continues after an interruption.
+    """
+    from ..core.process import llvm
+
+    source = options.load(scene)
+    llvm.find()
+    from ..output.event_files import write_events
+
+    for line in write_events(source, out, sequence or (), source=scene):
+        typer.echo(line)
+
+
+@app.command(rich_help_panel=_PANEL)
 def verify(store: StoreArgument) -> None:
     """Check a store: exit code 0 only if every sample is whole, labelled and as planned."""
     from .. import dataset

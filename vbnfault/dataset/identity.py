@@ -144,6 +144,7 @@ def _leave_out_unused(identity: dict[str, Any], scene: Scene) -> None:
     if (spread := scene.camera.point_spread) and not spread.wing_fraction:
         for key in ("wing_fraction", "wing_urad", "wing_index"):
             del identity["camera"]["point_spread"][key]
+    del identity["event_camera"]  # no sample depends on it
     if not scene.is_aimed:
         for key in OF_AN_AIM:
             del identity["geometry"][key]

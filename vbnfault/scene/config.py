@@ -19,6 +19,7 @@ from ..core.errors import InputError, in_file, shown, under_key
 from ..core.files import path_checks, resources, toml_files
 from ..core.quantities import SOFT_KINDS
 from ..core.tables import Table
+from ..detector.event_camera import EventCamera
 from ..reflectance import is_packaged
 from .bodies import with_named_body
 from .coma import ComaTable
@@ -73,6 +74,9 @@ class Scene(Table):
     spacecraft: SpacecraftTable = SpacecraftTable()
     sky: SkyTable = SkyTable()
     camera: CameraTable = CameraTable()
+    event_camera: EventCamera | None = Field(
+        None, description="pixels of an event camera, for vbnfault event-camera; default: those of its keys"
+    )
     image: ImageTable | None = Field(None, description="images of one's own, for vbnfault inject")
     render: RenderTable = RenderTable()
     geometry: GeometryTable = GeometryTable()

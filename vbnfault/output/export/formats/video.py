@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
@@ -107,7 +107,12 @@ def _rate(store: Store, part: ExportPart) -> Fraction:
 
 def _stem(store: Store, part: ExportPart) -> str:
     """Return the name of a sequence's films without its ending."""
-    names, number = store.spec.sequence_names, int(store.read("sequence", part.samples[0], part.samples[0] + 1)[0])
+    number = int(store.read("sequence", part.samples[0], part.samples[0] + 1)[0])
+    return stem_of_sequence(number, store.spec.sequence_names)
+
+
+def stem_of_sequence(number: int, names: Sequence[str]) -> str:
+    """Return the name of a file of a sequence without its ending: its number and what a file's name takes of it."""
     name = _NAME.sub("_", names[number])[:_LONGEST] if 0 <= number < len(names) else ""
     return f"{number:0{len(str(len(names) - 1))}d}_{name}"
 
