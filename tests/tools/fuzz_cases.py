@@ -205,6 +205,16 @@ def case_image(seeds: Seeds, rng: random.Random, here: Path) -> Case:
     return [*arguments, *rng.choice([[], [], ["--labels", "zarr"], ["--seed", "-1"], ["--workers", "0"]])], {}
 
 
+_FLIGHTS: tuple[dict[str, Any], ...] = (
+    {"kind": "approach", "range_m": [60e3, 15e3]},
+    {"kind": "orbit", "radius_m": 15e3},
+    {"kind": "flyby", "closest_m": 9e3, "speed_m_s": 2.0},
+    {"kind": "descent", "height_m": 300.0, "end_height_m": 299.0},
+    {"kind": "hover", "height_m": [200.0, 300.0]},
+    {"kind": "relocation", "distance_m": 1.0, "height_m": 5.0},
+)
+
+
 def case_poses(seeds: Seeds, rng: random.Random, here: Path) -> Case:
     """Damage a table of poses: values of a CSV file, or bytes of either kind of file."""
     name = rng.choice(list(seeds.poses))
@@ -224,6 +234,10 @@ def case_poses(seeds: Seeds, rng: random.Random, here: Path) -> Case:
     scene["dataset"] = {key: value for key, value in scene["dataset"].items() if key != "samples"}
     table = {"file": str(here / name)}
     scene["trajectory"] = changed(table, rng) if rng.random() < 0.1 else table
+    if rng.random() < 0.3:
+        scene["trajectory"] = {"flight": [changed({**rng.choice(_FLIGHTS), "frames": 2, "period_s": 60.0}, rng)]}
+    if rng.random() < 0.3:
+        scene["motion"] = changed({"shutter": "rolling", "line_time_s": 1e-5}, rng)
     if rng.random() < 0.5:
         event = {"cause": "c", "faults": ["dust_on_optics"], "onset_s": [1.0, 3.0], "duration_s": 2.0}
         event |= rng.choice(

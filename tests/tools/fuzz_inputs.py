@@ -346,13 +346,14 @@ def _poses() -> dict[str, bytes]:
     import pyarrow
     import pyarrow.parquet
 
-    from vbnfault.scene.trajectory import COLUMNS, SEQUENCE_COLUMNS
+    from vbnfault.scene.trajectory import COLUMNS, MOTION_COLUMNS, SEQUENCE_COLUMNS
 
+    motion = (0.0, 0.0, -1.0, 0.0, 0.01, 0.0)
     rows = [
-        ("a", 2456875.4, 0.0, 0.0, 9000.0, 0.0, 1.0, 0.0, 0.0, 0.6, 0.0, 0.8, 3.6, "s", 0.0),
-        ("b", 2456876.4, 0.0, 0.0, 900.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.6, 0.8, 3.6, "s", 5.0),
+        ("a", 2456875.4, 0.0, 0.0, 9000.0, 0.0, 1.0, 0.0, 0.0, 0.6, 0.0, 0.8, 3.6, "s", 0.0, *motion),
+        ("b", 2456876.4, 0.0, 0.0, 900.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.6, 0.8, 3.6, "s", 5.0, *motion),
     ]
-    names = (*COLUMNS, *SEQUENCE_COLUMNS)
+    names = (*COLUMNS, *SEQUENCE_COLUMNS, *MOTION_COLUMNS)
     lines = [",".join(names), *(",".join(map(str, row)) for row in rows)]
     file = io.BytesIO()
     columns = dict(zip(names, map(list, zip(*rows, strict=True)), strict=True))
