@@ -180,6 +180,15 @@ LAYERS: dict[str, Array] = {
         codec=_DOUBLE,
         ratio=0.9,
     ),
+    "flow": Array(
+        "motion to the next frame of the sequence, NaN where it is hidden or outside there",
+        "Where what the pixel's centre shows appears in the next frame, minus where it is: columns and rows.",
+        axes="sample y x xy",
+        dtype="float32",
+        units="px",
+        codec=_SINGLE,
+        ratio=0.8,
+    ),
     "incidence_deg": Array(
         "normal to Sun, NaN on the sky",
         "Angle between the surface normal and the direction to the Sun; above 90 the ground faces away from it.",
