@@ -27,7 +27,7 @@ SKY, BODY, VEHICLE = (store.SEMANTIC.index(name) for name in ("sky", "body", "sp
 RADIUS_M = 1000.0
 WIDTH, HEIGHT = 96, 80
 CAMERAS: dict[str, dict[str, Any]] = {
-    "thin": {"fov_deg": 40.0},
+    "thin": {"fov_deg": 50.0},
     "lens": {"lens": "nikkor_28_f2p8", "detector": "cmv4000", "fov_deg": 65.0},
     "opencv": {"calibration": TABLES["opencv"]},
     "fisheye": {"calibration": TABLES["fisheye"]},
@@ -90,7 +90,9 @@ def built(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
     import pyarrow.parquet
 
     folder = tmp_path_factory.mktemp(request.param)
-    pyarrow.parquet.write_table(pyarrow.table(poses(2200.0, 7.0)), folder / "poses.parquet")
+    pyarrow.parquet.write_table(
+        pyarrow.table(poses(1700.0 if request.param == "fisheye" else 2800.0, 14.0)), folder / "poses.parquet"
+    )
     scene = scene_of(
         camera=CAMERAS[request.param],
         trajectory={"file": str(folder / "poses.parquet")},
@@ -108,7 +110,7 @@ def test_flow_is_the_reprojection_of_stored_points(built: tuple[Path, config.Sce
     Depth is compared with the nearest and the farthest of 3 × 3 pixels; what lies between may be either.
     """
     data = vbnfault.open_dataset(built[0])
-    shown = hidden = sky = 0
+    shown = sky = 0
     for k in range(sum(FRAMES)):
         flow, semantic = data["flow"][k].values, data["semantic"][k].values
         assert flow.dtype == np.float32
@@ -135,26 +137,30 @@ def test_flow_is_the_reprojection_of_stored_points(built: tuple[Path, config.Sce
         x, y = np.clip(np.floor(at), 0, (WIDTH - 1, HEIGHT - 1)).astype(int)[inside].T
         depth_there, z = (low[y, x], high[y, x]), in_C[inside][:, 2]
         before = (z <= depth_there[1]) & (depth_there[1] < 1.03 * depth_there[0])
-        assert seen[inside][before].mean() > 0.999, (k, seen[inside][before].mean())
-        behind = z > 1.05 * depth_there[1]
+        assert seen[inside][before].mean() > 0.999
+        behind = z > 1.02 * depth_there[1]
         assert not seen[inside][behind].any()
-        shown, hidden = shown + int(before.sum()), hidden + int(behind.sum())
+        shown += int(before.sum())
         # the sky turns with J, which the store has of each frame
         J = data["T_from_J"].values
         later = C_from_T(data, k + 1) @ J[k + 1] @ J[k].T @ C_from_T(data, k).T
-        stars = np.random.default_rng(k).normal(size=(20_000, 3)) + [0, 0, 1]
-        stars = stars[(stars[:, 2] > 0.05) & ((stars @ later.T)[:, 2] > 0.05)]
+        stars = np.random.default_rng(k).normal([0, 0, 1], size=(20_000, 3))
+        stars /= np.linalg.norm(stars, axis=1, keepdims=True)
+        # farther off the boresight, the models of OpenCV fold back
+        least_z = np.cos(np.radians(min(data["distortion"].attrs["valid_to_deg"], 85)))
+        stars = stars[(stars[:, 2] > least_z) & ((stars @ later.T)[:, 2] > least_z)]
         stars = stars[np.abs(projected(data, k, stars) - [WIDTH / 2, HEIGHT / 2]).max(axis=1) < WIDTH / 2]
         at = projected(data, k, stars)
         of_sky = np.where((semantic == SKY)[..., None], flow, np.nan)
         # between pixels, the flow bends by some px / f², 80² or more: 1e-3 px of the mean of neighbours
-        moved = cv2.remap(of_sky, *(at - 0.5).astype(np.float32).T, cv2.INTER_LINEAR, borderValue=(np.nan,) * 2)
+        x, y = ((at[:, k : k + 1] - 0.5).astype(np.float32) for k in (0, 1))
+        moved = cv2.remap(of_sky, x, y, cv2.INTER_LINEAR, borderValue=(np.nan,) * 2)
         off = np.hypot(*(projected(data, k + 1, stars @ later.T) - at - moved[:, 0]).T)
-        assert np.nanmax(off) <= 0.05
-        sky += int(np.isfinite(off).sum())
-    assert shown > 3000
-    assert hidden > 20
-    assert sky > 1000
+        off = off[np.isfinite(off)]
+        assert (off <= 0.05).all()
+        sky += len(off)
+    assert shown > 500
+    assert sky > 50
 
 
 def test_a_sample_alone_has_the_same_flow(built: tuple[Path, config.Scene]) -> None:
@@ -163,19 +169,21 @@ def test_a_sample_alone_has_the_same_flow(built: tuple[Path, config.Scene]) -> N
         np.testing.assert_array_equal(session.simulate(k).layers["flow"], data["flow"][k].values)
 
 
-def test_the_next_image_warped_back_is_the_present_one(built: tuple[Path, config.Scene]) -> None:
-    """Shaded relief correlates when it is carried along, and hardly where it is left in place."""
-    data = vbnfault.open_dataset(built[0])
-    now, after = (data["clean"][k].values[..., 3].astype(np.float32) for k in (0, 1))
-    flow, body = data["flow"][0].values, data["semantic"][0].values == BODY
-    at = (centres() + flow - 0.5).astype(np.float32)  # remap counts from the first centre
+def test_the_next_image_warped_back_is_the_present_one() -> None:
+    """Shaded relief correlates when the flow carries it along, and not when it is left in place."""
+    scene = scene_of(camera={"fov_deg": 20.0}, patch={"relief": 2.0, "facet_m": 3.0, "max_triangles": 300_000})
+    session = vbnfault.Session(scene, poses=poses(2500.0, 3.0))
+    first, second = (session.simulate(k).layers for k in range(2))
+    # without what is smooth, which is alike in both images
+    now, after = (cv2.Laplacian(np.float32(one["clean"][..., 3]), -1, ksize=5) for one in (first, second))
+    at = (centres() + first["flow"] - 0.5).astype(np.float32)  # remap counts from the first centre
     warped = cv2.remap(after, at[..., 0], at[..., 1], cv2.INTER_LINEAR)
-    kept = body & np.isfinite(flow[..., 0]) & (now > 5) & (now < 250)
-    detail = [image - cv2.GaussianBlur(image, (0, 0), 4) for image in (now, warped, after)]
-    carried, left = (np.corrcoef(detail[0][kept], other[kept])[0, 1] for other in detail[1:])
-    assert kept.sum() > 300
-    assert carried > 0.8
-    assert left < 0.5
+    kept = np.isfinite(warped)
+    kept[[0, 1, 2, -3, -2, -1]] = kept[:, [0, 1, 2, -3, -2, -1]] = False
+    carried, left = (np.corrcoef(now[kept], image[kept])[0, 1] for image in (warped, after))
+    assert kept.sum() > 2000
+    assert carried > 0.9
+    assert abs(left) < 0.1
 
 
 def test_tracks_follow_the_flow(built: tuple[Path, config.Scene]) -> None:
@@ -189,7 +197,7 @@ def test_tracks_follow_the_flow(built: tuple[Path, config.Scene]) -> None:
     np.testing.assert_allclose(found.xy_px[0], xy, atol=0.02)
     seen = np.isfinite(flow[body][:, 0])
     np.testing.assert_allclose(found.xy_px[1][seen], (xy + flow[body])[seen], atol=0.05)
-    assert (found.visible[1] == seen).mean() > 0.98  # but for a pixel along the limb and at the spacecraft
+    assert (found.visible[1] == seen).mean() > 0.95  # but for a pixel along the limb
     assert found.visible[0].mean() > 0.98
     again = vbnfault.navigation.tracks(data.drop_vars("depth_m"), "a", xy)  # the depth of point_T_m
     np.testing.assert_allclose(again.xy_px[1][seen], found.xy_px[1][seen], atol=1e-3)
