@@ -108,7 +108,7 @@ def _view_of(data: Mapping[str, Any], row: int) -> CameraView:
 
 def _is_ground(data: Mapping[str, Any], row: int, view: CameraView, xy: F64) -> NDArray[np.bool_]:
     """Return which pixels of a sample show the ground, bool[point]."""
-    ground = np.isfinite(np.asarray(view.depth_m))
+    ground: NDArray[np.bool_] = np.asarray(np.isfinite(np.asarray(view.depth_m)))
     if "semantic" in data:
         ground &= data["semantic"][row].values != _SPACECRAFT
     column, line = np.floor(np.clip(xy, 0, np.subtract(ground.shape[::-1], 1))).astype(int).T
