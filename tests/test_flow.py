@@ -236,6 +236,25 @@ def test_the_ground_is_hidden_behind_the_limb_of_a_ball() -> None:
     assert not found.visible[1][cosine < -0.25].any()
 
 
+def test_retaken_frames_have_the_same_flow(tmp_path: Path) -> None:
+    """A loop knows no next frame, and has none."""
+    given = poses(2500.0, 3.0)
+    lines = [",".join(given), *(",".join(map(str, values)) for values in zip(*given.values(), strict=True))]
+    (tmp_path / "poses.csv").write_text("\n".join(lines))
+    scene = scene_of(
+        trajectory={"file": str(tmp_path / "poses.csv")},
+        dataset={"samples": 2, "layers": ["clean", "depth_m", "normal", "semantic", "scene_radiance", "flow"]},
+    )
+    vbnfault.build(scene, tmp_path / "s.zarr", progress=False)  # frame 2 is in the table only
+    other = config.parse_scene({**scene.resolved(), "faults": {"vignetting": {}}}, source="test")
+    vbnfault.retake(tmp_path / "s.zarr", other, tmp_path / "again.zarr", progress=False)
+    flows = [vbnfault.open_dataset(tmp_path / name)["flow"].values for name in ("s.zarr", "again.zarr")]
+    np.testing.assert_array_equal(*flows)
+    assert np.isfinite(flows[0][1]).mean() > 0.5
+    taken = vbnfault.Session(scene).take({name: values[0] for name, values in given.items()})
+    assert np.isnan(taken.layers["flow"]).all()
+
+
 def as_dataset(samples: dict[int, Any]) -> Any:
     """Return samples of one sequence as a store would give them."""
     import xarray

@@ -108,7 +108,7 @@ def _view_of(data: Mapping[str, Any], row: int) -> CameraView:
 
 def _is_ground(data: Mapping[str, Any], row: int, view: CameraView, xy: F64) -> NDArray[np.bool_]:
     """Return which pixels of a sample show the ground, bool[point]."""
-    ground: NDArray[np.bool_] = np.asarray(np.isfinite(np.asarray(view.depth_m)))
+    ground = np.isfinite(np.asarray(view.depth_m))
     if "semantic" in data:
         ground &= data["semantic"][row].values != _SPACECRAFT
     column, line = np.floor(np.clip(xy, 0, np.subtract(ground.shape[::-1], 1))).astype(int).T
@@ -119,7 +119,7 @@ def _farthest_m(view: CameraView, xy: F64) -> F64:
     """Return the greatest depth at the four pixel centres around positions, float64[point]; NaN outside."""
     depth_m = np.abs(np.asarray(view.depth_m, np.float64))
     size = np.array(depth_m.shape[::-1])
-    inside = ((xy >= 0) & (xy < size)).all(axis=1)
+    inside = np.asarray(((xy >= 0) & (xy < size)).all(axis=1))
     first = np.floor(np.where(inside[:, None], xy, 0) - 0.5).astype(int)
     out = np.full(len(xy), -np.inf)
     for step in ((0, 0), (0, 1), (1, 0), (1, 1)):

@@ -181,13 +181,12 @@ LAYERS: dict[str, Array] = {
         ratio=0.9,
     ),
     "flow": Array(
-        "motion to the next frame of the sequence, NaN where it is hidden or outside there",
+        "motion in px to the next frame of the sequence, NaN where it is hidden or outside there",
         "Where what the pixel's centre shows appears in the next frame, minus where it is: columns and rows.",
         axes="sample y x xy",
         dtype="float32",
-        units="px",
         codec=_SINGLE,
-        ratio=0.8,
+        ratio=0.7,
     ),
     "incidence_deg": Array(
         "normal to Sun, NaN on the sky",
