@@ -36,7 +36,8 @@ SOFT = ["dust_opacity", "vignetting_factor", "straylight_added"]
 
 
 def layers_of(faults: dict[str, Any], mosaic: bool) -> list[str]:
-    named = [name for name in NAMED if mosaic or name not in ("raw", "defects")]
+    left_out = {"flow"} if mosaic else {"flow", "raw", "defects"}  # flow is that of sequences
+    named = [name for name in NAMED if name not in left_out]
     return [*named, *(f"without_{name}" for name in faults), *SOFT]
 
 

@@ -18,6 +18,8 @@ from .features import right_matches as right_matches
 from .geometry import CameraView as CameraView
 from .geometry import relative_motion as relative_motion
 from .geometry import reprojected as reprojected
+from .tracks import Tracks as Tracks
+from .tracks import tracks as tracks
 from .two_views import RelativePose as RelativePose
 from .two_views import RelativePoseError as RelativePoseError
 from .two_views import relative_pose as relative_pose

@@ -43,6 +43,9 @@ class CameraView:
     valid_to_deg
         Angle from the boresight up to which `distortion` holds, the attribute `valid_to_deg` of the array
         `distortion`. None: up to where the model first folds, which is computed. Farther directions have no pixel.
+    skew_px
+        By how much a step of one focal length down moves to the right, the attribute `skew_px` of the array
+        `intrinsics`.
     depth_m
         float[y, x]: true depth along the boresight at the pixel centres in m, inf on the sky; None where it is not
         needed.
@@ -59,6 +62,7 @@ class CameraView:
     distortion: F64 = field(default_factory=lambda: np.zeros(8))
     model: str = "opencv"
     valid_to_deg: float | None = None
+    skew_px: float = 0.0
     depth_m: NDArray[Any] | None = None
 
     def __post_init__(self) -> None:
@@ -101,7 +105,15 @@ class CameraView:
         fx, fy, cx, cy = self.intrinsics.tolist()
         coefficients = tuple(self.distortion.tolist())
         return Calibration(
-            model=self.model, width_px=1, height_px=1, fx=fx, fy=fy, cx=cx, cy=cy, coefficients=coefficients
+            model=self.model,
+            width_px=1,
+            height_px=1,
+            fx=fx,
+            fy=fy,
+            cx=cx,
+            cy=cy,
+            coefficients=coefficients,
+            skew=self.skew_px,
         )
 
     def _is_valid(self, directions: F64) -> NDArray[np.bool_]:

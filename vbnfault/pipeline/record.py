@@ -15,6 +15,7 @@ from ..scene.config import Scene
 from ..scene.trajectory import FlownPose
 from ..world import assemble, ephemeris
 from . import masks
+from .flow import flow_px
 from .spec import Frame, SampleSpec, stored_layers
 
 F64 = NDArray[np.float64]
@@ -55,6 +56,8 @@ def _layers(frame: Frame) -> dict[str, NDArray[Any]]:
             layers[name] = assemble.normal_albedo(spec.scene, frame.rendering.truth, spec.terrain.vehicle)
         elif name == "point_T_m":
             layers[name] = points_T_m(frame)
+        elif name == "flow":
+            layers[name] = flow_px(frame, points_T_m(frame))
         elif name in _TRUTH_LAYERS:
             layers[name] = getattr(frame.rendering.truth, name)
     return layers

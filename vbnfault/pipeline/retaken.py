@@ -198,7 +198,13 @@ class RetakeSession:
         first = world.plan.first_of_view(earlier)
         return (
             SampleSpec(
-                index=first, scene=scene, plan=world.plan, faults=world.faults, terrain=terrain, flown=flown
+                index=first,
+                scene=scene,
+                plan=world.plan,
+                faults=world.faults,
+                terrain=terrain,
+                flown=flown,
+                after=None if world.trajectory is None else world.trajectory.after(earlier),
             ),
             pose,
         )

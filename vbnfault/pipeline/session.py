@@ -378,6 +378,7 @@ class Session:
             flown=flown,
             terrain_of=self.aimed_terrain if aims else None,
             before=partial(self._spec, index - 1) if flown is not None and flown.frame > 0 else None,
+            after=None if self.trajectory is None else self.trajectory.after(index),
         )
 
     def dated_scene(self, index: int) -> Scene:

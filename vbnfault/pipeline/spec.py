@@ -111,7 +111,7 @@ class SampleSpec:
     `flown` is the pose of the sample if a table of poses gives it. If the camera aims, `terrain` is the shape model
     as it is, and `terrain_of` makes the terrain of a pose. `taken_with` is a camera in place of the scene's.
     `before` returns the frame before in a sequence. With `is_before`, the sample is taken as the frame before
-    another one, and without the faults that use one.
+    another one, and without the faults that use one. `after` is the pose of the frame after, if there is one.
     """
 
     index: int
@@ -124,6 +124,7 @@ class SampleSpec:
     taken_with: Camera | None = None
     before: Callable[[], SampleSpec] | None = None
     is_before: bool = False
+    after: FlownPose | None = None
 
     def at(self, pose: Pose) -> SampleSpec:
         """Return the specification with the terrain of a pose."""

@@ -411,6 +411,16 @@ def _check_layers(scene: Scene, faults: Mapping[str, Fault]) -> None:
             raise InputError(f"dataset.layers: {layer!r}: no fault of the scene has it; the faults have: {known}")
         if layer in ("raw", "defects") and not scene.camera.detector:
             raise InputError(f"dataset.layers: {layer!r} needs a mosaic: name a camera.detector")
+        if layer == "flow" and not (scene.trajectory and scene.trajectory.frames):
+            raise InputError(
+                "dataset.layers: 'flow' needs the next frame: name a table of poses with a column sequence or "
+                "time_s in trajectory.file, or leave it out"
+            )
+        if layer == "flow" and scene.motion is not None and scene.motion.shutter == "rolling":
+            raise InputError(
+                "dataset.layers: 'flow' is between two poses, and the lines of motion.shutter = 'rolling' have "
+                "different ones; leave it out, or choose 'global'"
+            )
     for name in scene.dataset.mask_any or ():
         if name not in faults:
             known = ", ".join(faults) or "none"

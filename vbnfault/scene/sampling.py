@@ -11,7 +11,7 @@ from ..core.tables import Table, each_once, ordered, pair_within
 
 _LAYERS = (
     "clean|depth_m|normal|semantic|raw|defects|radiance|scene_radiance|mask_effect|"
-    "point_T_m|incidence_deg|emission_deg|phase_deg|albedo|without_[a-z0-9_]+|"
+    "point_T_m|flow|incidence_deg|emission_deg|phase_deg|albedo|without_[a-z0-9_]+|"
     + "|".join(f"[a-z0-9_]+_{kind}" for kind in SOFT_KINDS)
 )
 Layer = Annotated[str, Field(pattern=f"^({_LAYERS})$")]

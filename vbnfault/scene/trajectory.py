@@ -217,6 +217,11 @@ class Trajectory:
             rate_C_rad_s=self.motion[1][index],
         )
 
+    def after(self, index: int) -> FlownPose | None:
+        """Return the row after a row, counted from 0, of its sequence; None if there is none."""
+        sequence, frame = place_in_sequence(self.frames, index)
+        return self.pose(index + 1) if sequence >= 0 and frame + 1 < self.frames[sequence] else None
+
 
 def place_in_sequence(frames: Sequence[int], index: int) -> tuple[int, int]:
     """Return the sequence of a row and its frame there, from 0; -1 and 0 without sequences.

@@ -180,6 +180,14 @@ LAYERS: dict[str, Array] = {
         codec=_DOUBLE,
         ratio=0.9,
     ),
+    "flow": Array(
+        "motion in px to the next frame of the sequence, NaN where it is hidden or outside there",
+        "Where what the pixel's centre shows appears in the next frame, minus where it is: columns and rows.",
+        axes="sample y x xy",
+        dtype="float32",
+        codec=_SINGLE,
+        ratio=0.7,
+    ),
     "incidence_deg": Array(
         "normal to Sun, NaN on the sky",
         "Angle between the surface normal and the direction to the Sun; above 90 the ground faces away from it.",

@@ -35,7 +35,7 @@ TARGETS: dict[str, Target] = {
         "", ("camera_position_T_m", "camera_from_T"), "float64[7]: position in T in m, unit quaternion, w first"
     ),
 }
-_LAST_AXIS = ("channel", "xyz")  # dimensions that a layer has last and a trainer first
+_LAST_AXIS = ("channel", "xyz", "xy")  # dimensions that a layer has last and a trainer first
 
 
 class Targets:

@@ -31,6 +31,7 @@ class Exr(Format):
       store has the layer `radiance`.
     - `depth.Z`: depth along the boresight in m, infinite on the sky. `normal.X`, `normal.Y`, `normal.Z`: in the
       camera's frame (x right, y down, z boresight), 0 on the sky. `semantic`: 0 sky, 1 body, 2 Sun, 3 spacecraft.
+    - `flow.X`, `flow.Y`: motion in px to the next frame.
     - `mask.<fault>`: 1 where the mask is set. Any other layer of one number a pixel has its name in the store.
     """
 
@@ -44,7 +45,9 @@ class Exr(Format):
         return [
             name
             for name, row in spec.pixel_layers.items()
-            if name not in _SKIPPED and not name.startswith("without_") and row.dims[-1] in ("x", "xyz", "channel")
+            if name not in _SKIPPED
+            and not name.startswith("without_")
+            and row.dims[-1] in ("x", "xyz", "xy", "channel")
         ]
 
     def write_part(self, store: Store, part: ExportPart, samples: Iterable[Sample], folder: Folder) -> list[Entry]:
@@ -76,7 +79,10 @@ def _channels(spec: StoreSpec, name: str, layer: NDArray[Any]) -> dict[str, NDAr
         return {f"{name}.{f}": mask.astype(np.float16) for f, mask in zip(spec.faults, layer, strict=True)}
     if layer.ndim == 3:
         kind = np.float16 if layer.dtype == np.float16 else np.float32
-        return {f"{name}.{axis}": np.ascontiguousarray(layer[..., k], kind) for k, axis in enumerate("XYZ")}
+        return {
+            f"{name}.{axis}": np.ascontiguousarray(layer[..., k], kind)
+            for k, axis in enumerate("XYZ"[: layer.shape[2]])
+        }
     if layer.dtype.kind == "u":
         return {name: layer.astype(np.uint32)}
     number = layer.astype(np.float32) if layer.dtype.itemsize > 4 else layer
