@@ -132,9 +132,10 @@ def draw(found: dict[str, dict[str, dict[str, list[float]]]], path: Path) -> Non
     left, right = drawn.subplots(1, 2)
     clean = next(iter(found.values()))["clean"]
     for axes, key, label in ((left, "median_px", "median error / px"), (right, "within", "fraction within 2 px")):
-        axes.plot(clean[key], color="black", linewidth=2, label="no fault")
+        frames = range(1, len(clean[key]))  # in the first one, corners are where they are
         for fault, curves in found.items():
-            axes.plot(curves["image"][key], label=fault.replace("_", " "))
+            axes.plot(frames, curves["image"][key][1:], label=fault.replace("_", " "))
+        axes.plot(frames, clean[key][1:], color="black", linestyle="--", label="no fault")
         axes.set_xlabel("frame")
         axes.set_ylabel(label)
     left.set_yscale("log")
