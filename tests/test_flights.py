@@ -552,6 +552,11 @@ def test_wrong_keys_are_named(scene: Path, change: dict[str, Any], sentence: str
             flight("relocation", period_s=5.0),
             r"relocation/0: a hop of \S+ m lasts 20 s; must last from \S+ to \S+ s",
         ),
+        (flight("orbit", period_s=3e6), r"lasts 1.2e\+07 s; must last at most \S+ s in this gravity, 200 orbits"),
+        (
+            flight("approach", frames=400, period_s=1e9),
+            r"approach/0 ends at Julian date \S+; must be from 1000000 to 5000000",
+        ),
         (flight("hover", max_slope_deg=0), r"hover/0 finds no site in 300 draws; widen latitude_deg"),
     ],
 )

@@ -290,8 +290,8 @@ def test_what_has_no_flow_is_refused(built: tuple[Path, config.Scene], tmp_path:
     del still["sequence"], still["time_s"]
     with pytest.raises(InputError, match=r"dataset\.layers: 'flow' needs the next frame"):
         vbnfault.Session(scene_of(), poses=still)
-    rolling = scene_of(motion={"shutter": "rolling", "line_time_s": 1e-5})
-    with pytest.raises(InputError, match=r"'flow' is between two poses, .* motion\.shutter = 'rolling'"):
+    rolling = scene_of(motion={"shutter": "rolling", "line_time_s": 1e-5}, dataset={"layers": ["flow"]})
+    with pytest.raises(InputError, match=r"'flow' is that of one pose, .* motion\.shutter = 'rolling'"):
         vbnfault.Session(rolling, poses=poses(2500.0, 1.0))
     data = vbnfault.open_dataset(built[0])
     for arguments, sentence in (

@@ -257,6 +257,86 @@ def test_a_star_leaves_a_trail_of_its_length_and_light() -> None:
     assert measured == pytest.approx(length_px * stretch * px_rad * 128 / np.tan(np.radians(20.0)), abs=0.15)
 
 
+def moved_and_brute(spec: SampleSpec, count: int) -> tuple[Any, Any, Any]:
+    """Return the radiance of a moved frame, of its sub-frames by the whole renderer, and of the still one."""
+    pose = resolve(spec)
+    rendered = render_view(spec, pose)
+    moved = motion.move(spec, rendered, meter(spec, rendered)).light.rendered.array
+    camera_motion = rendered.scene.view.motion
+    assert camera_motion is not None
+    assert spec.flown is not None
+    total = 0.0
+    for k in range(count):
+        t = ((k + 0.5) / count - 0.5) * EXPOSURE_S
+        turn = Rotation.from_rotvec(camera_motion.rate_C_rad_s * t).as_matrix()
+        still = replace(
+            spec.flown,
+            camera_position_T_m=spec.flown.camera_position_T_m + spec.flown.velocity_T_m_s * t,
+            T_from_C=spec.flown.T_from_C @ turn,
+            velocity_T_m_s=np.zeros(3),
+            rate_C_rad_s=np.zeros(3),
+        )
+        frame = replace(spec, flown=still)
+        total = total + render_view(frame, resolve(frame)).light.rendered.array
+    return moved, total / count, rendered.light.rendered.array
+
+
+def test_air_and_light_between_surfaces_move_with_the_ground() -> None:
+    """New rays at limb and border see sunlight once; what air adds there is carried, so no dark border appears."""
+    air = {"optical_depth": 0.2, "scale_height_m": 40.0}
+    scene = {**SCENE, "body": {**SCENE["body"], "atmosphere": air}, "render": {**SCENE["render"], "bounces": 1}}
+    rate = 4 * PIXEL_RAD / EXPOSURE_S * np.array([0.6, -0.8, 0.0])
+    moved, true, _ = moved_and_brute(spec_of(scene, (0, 0, 0), rate), 8)
+    assert moved.min() >= 0
+    # the sub-frames are 0.5 px apart, an eighth of the path each
+    assert np.abs(moved - true).max() < 0.15 * true.max()
+    border = np.ones((PX, PX), bool)
+    border[2:-2, 2:-2] = False
+    assert moved[:, border].sum() == pytest.approx(true[:, border].sum(), rel=0.05)
+    assert true[:, border].sum() > 0
+
+
+def test_a_body_of_few_pixels_keeps_its_light() -> None:
+    """It stays where it is at mid-exposure, once."""
+    values = dict(zip(MOTION, [2e3, 0, 0, 0, 0, 0], strict=True))
+    table = row("a", (0.0, 0.0, 2000.0), (0.8, 0.0, 0.6), **values)
+    poses = columns_of([table]) | {name: [table[name]] for name in MOTION}
+    spec = vbnfault.Session(config.parse_scene(SCENE, source="test"), poses=poses).spec(0)
+    rendered = render_view(spec, resolve(spec))
+    assert not rendered.shows_ground
+    moved = motion.move(spec, rendered, meter(spec, rendered)).light.rendered.array
+    assert moved.sum() == pytest.approx(rendered.light.rendered.array.sum(), rel=1e-4)
+
+
+def test_a_monochrome_camera_moves() -> None:
+    camera = {"detector": "rosetta_navcam", "width_px": PX, "height_px": PX, "fov_deg": FIELD_DEG}
+    camera |= {"exposure_s": EXPOSURE_S}
+    rate = 4 * PIXEL_RAD / EXPOSURE_S * np.array([0.6, -0.8, 0.0])
+    moved, true, still = moved_and_brute(spec_of({**SCENE, "camera": camera}, (0, 0, 0), rate), 8)
+    assert np.abs(moved - true).mean() < 0.2 * np.abs(still - true).mean()
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"spacecraft": {"model": "default"}}, "spacecraft.model = 'default': does not apply beside"),
+        ({"dataset": {"layers": ["point_T_m"]}}, "dataset.layers: 'point_T_m' is that of one pose"),
+    ],
+)
+def test_what_does_not_go_with_motion_is_one_sentence(change: dict[str, Any], sentence: str) -> None:
+    flight = {"kind": "approach", "frames": 2, "period_s": 60.0, "range_m": [3e3, 2e3]}
+    rolling = {"shutter": "rolling", "line_time_s": 1e-5}
+    table = {**SCENE, "motion": rolling, "trajectory": {"flight": [flight]}, **change}
+    with pytest.raises(InputError, match=re.escape(sentence)):
+        vbnfault.Session(config.parse_scene(table, source="test"))
+
+
+def test_motion_needs_poses() -> None:
+    session = vbnfault.Session(config.parse_scene(SCENE, source="test"))
+    with pytest.raises(InputError, match=r"motion: needs velocities and rates, which poses of"):
+        session.simulate(0)
+
+
 # --- through the store --------------------------------------------------------------------------------------------
 
 
@@ -270,7 +350,10 @@ def test_a_store_holds_frames_in_motion(tmp_path: Path, call: Callable[..., Call
     lines += [",".join([*(str(values[k]) for values in poses.values()), f"{k}"]) for k in range(3)]
     (tmp_path / "poses.csv").write_text("\n".join(lines))
     tables = {**{name: SCENE[name] for name in names}, "trajectory": {"file": str(tmp_path / "poses.csv")}}
-    scene = config.parse_scene({**SCENE, **tables, "faults": {"dust_on_optics": {}}}, source="test")
+    scene = config.parse_scene(
+        {**SCENE, **tables, "faults": {"dust_on_optics": {}}, "dataset": {"layers": ["clean", "scene_radiance"]}},
+        source="test",
+    )
     vbnfault.build(scene, tmp_path / "moving.zarr")
     assert call("verify", tmp_path / "moving.zarr").code == 0
     data = xarray.open_zarr(tmp_path / "moving.zarr")
@@ -278,5 +361,8 @@ def test_a_store_holds_frames_in_motion(tmp_path: Path, call: Callable[..., Call
     assert data["rate_C_rad_s"].attrs["units"] == "rad s-1"
     sample = vbnfault.simulate(scene, 1)
     np.testing.assert_array_equal(sample.layers["clean"], data["clean"].values[1])
+    changed = scene.model_copy(update={"camera": scene.camera.model_copy(update={"exposure_s": 0.5})})
+    with pytest.raises(InputError, match=r"camera.exposure_s .*a retake keeps"):
+        vbnfault.retake(tmp_path / "moving.zarr", changed, tmp_path / "again.zarr")
     still = scene.model_copy(update={"motion": None})
     assert (vbnfault.simulate(still, 1).layers["clean"] != sample.layers["clean"]).any()

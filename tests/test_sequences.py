@@ -663,7 +663,7 @@ def test_events_are_listed_by_the_command(scene: Path, tmp_path: Path, call: Cal
         ({"cause": "c", "faults": ["dust_on_optics"], "onset_s": 1.0, "rise_s": 1.0}, r"rise_s must not be set"),
         (
             {"cause": "c", "faults": ["dust_on_optics"], "onset_s": 1.0, "profile": "thermal"},
-            r'profile = "thermal": period_s must be set; it is for the profile intermittent and thermal',
+            r'profile = "thermal": period_s must be set; it is for the profile intermittent or thermal',
         ),
         (
             {"cause": "c", "faults": ["dust_on_optics"], "onset_s": 1.0, "profile": "until_reset"},

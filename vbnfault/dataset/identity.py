@@ -251,7 +251,7 @@ def store_spec(session: pipeline.Session, blocks: Sequence[int]) -> StoreSpec:
         The scene asks for a layer that its world does not provide, or worker processes cannot load a fault.
     """
     scene = session.scene
-    plan.check_events(scene)
+    plan.check_time(scene)
     dataset, camera = scene.dataset, session.base_camera  # base_camera first: it reports an unusable lens
     layers = tuple(name for name in stored_layers(scene, session.faults) if name != "clean")
     individuals = scene.camera.individuals

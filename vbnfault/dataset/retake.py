@@ -66,6 +66,11 @@ _FREE: dict[str, frozenset[str] | None] = {
 }
 # Of the camera, these keys may not differ; all others may.
 _FIXED_OF_CAMERA = frozenset({"calibration", "fov_deg", "width_px", "height_px", "focus_distance_m"})
+# Nor these, where the camera of the store moved during its exposures.
+_FIXED_IN_MOTION = frozenset(
+    {"exposure_s", "exposure_min_s", "exposure_max_s", "exposure_max_towards_sun_s", "exposure_stops"}
+    | {"metering_level", "metering_percentile", "readout_directions"}
+)
 # Keys of the camera on which the renderer's aperture depends.
 _OPTICS = ("lens", "focus", "f_number", "pixel_pitch_um", "detector")
 _SAME_FOCAL_LENGTH = 1e-6  # as a fraction: 1e-3 px at the border of 2048 px
@@ -281,6 +286,7 @@ def _check_same_view(opened: Store, session: pipeline.Session, source: str) -> N
 
 def _differing(stored: Mapping[str, Any], wanted: Mapping[str, Any]) -> Iterator[Difference]:
     """Yield the values in which a scene may not differ from that of the store, but does."""
+    fixed = _FIXED_OF_CAMERA | (_FIXED_IN_MOTION if stored.get("motion") else frozenset())
     for table in sorted({*stored, *wanted}):
         free = _FREE.get(table, frozenset())
         if free is None or (table.endswith("_sha256") and table != "shape_sha256"):
@@ -288,7 +294,7 @@ def _differing(stored: Mapping[str, Any], wanted: Mapping[str, Any]) -> Iterator
         pair = [tables.get(table, {}) for tables in (stored, wanted)]
         if isinstance(pair[0], Mapping) and isinstance(pair[1], Mapping):
             keep = [
-                {k: v for k, v in values.items() if (k in _FIXED_OF_CAMERA if table == "camera" else k not in free)}
+                {k: v for k, v in values.items() if (k in fixed if table == "camera" else k not in free)}
                 for values in pair
             ]
             yield from differences(keep[0], keep[1], table)

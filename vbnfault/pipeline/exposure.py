@@ -188,7 +188,7 @@ def _sky_turns(spec: SampleSpec, view: View, exposure_s: float) -> list[F64]:
         return [np.eye(3)]
     spin_T = np.array([0, 0, 2 * np.pi / spec.terrain.body.rotation_period_s])
     rate_C = view.motion.rate_C_rad_s + spec.flown.T_from_C.T @ spin_T
-    px = float(np.linalg.norm(rate_C)) * exposure_s * max(*view.intrinsics[:2], *view.intrinsics[2:])
+    px = float(np.linalg.norm(rate_C)) * exposure_s * max(view.intrinsics[:2])
     count = min(int(np.ceil(_STAR_STEPS_PER_PX * px)) + 1, _MOST_STAR_STEPS)
     times_s = ((np.arange(count) + 0.5) / count - 0.5) * exposure_s
     return list(Rotation.from_rotvec(times_s[:, None] * rate_C).as_matrix())

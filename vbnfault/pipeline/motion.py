@@ -12,13 +12,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ..core.quantities import SPACECRAFT, Radiance, Truth
+from ..core.quantities import BODY, SPACECRAFT, Radiance, Truth
 from ..render.description import CameraMotion, RenderInput, View
 from .noise_budget import green_per_second
 from .spec import Rendering, SampleSpec, SceneExposure, SceneLight
@@ -55,11 +56,11 @@ def motion_of(spec: SampleSpec) -> CameraMotion | None:
 def move(spec: SampleSpec, rendering: Rendering, exposure: SceneExposure) -> SceneExposure:
     """Return the exposure with the light of a camera that moves; without motion it is returned as it is."""
     view, light = rendering.scene.view, exposure.light.rendered
-    if view.motion is None or rendering.cells is None:
+    if view.motion is None or rendering.cells is None or rendering.direct is None:
         return exposure
     seconds = exposure.camera.exposure_s
     truth = rendering.truth
-    if truth.depth_m.shape != light.array.shape[1:]:
+    if exposure.light.lens.resamples:
         from .. import render
 
         truth = render.truth(spec.terrain.surface, view, rendering.scene.sun)
@@ -69,8 +70,11 @@ def move(spec: SampleSpec, rendering: Rendering, exposure: SceneExposure) -> Sce
     weights = green_per_second(spec)
     moved = _carried(light, rendering.cells, weights, paths)
     appearing = paths.appearing(truth)
-    if appearing.any():
-        _traced(spec, rendering.scene, appearing, moved, weights, seconds)
+    if appearing.any() and rendering.shows_ground:
+        # light between surfaces, of a coma and of air is smooth: it is carried everywhere
+        rest = _without_fine(light) - (rendering.direct if light.sun is None else rendering.direct - light.sun)
+        moved[:, appearing] = _coloured(rest, paths)[:, appearing]
+        _trace(spec, rendering.scene, appearing, moved, weights, seconds)
     if light.fine is not None:
         moved = light.fine.added_to(moved)
     if light.sun is not None:
@@ -92,12 +96,15 @@ class Paths:
         Time over which pixels are exposed, from half of it before to half of it after.
     line_s
         By how much later a pixel is exposed than its left and its upper neighbour.
+    is_ground
+        bool[y, x]: pixels that see ground.
     """
 
     speed_px_s: F32
     bend_px_s2: F32
     exposure_s: float
     line_s: F64
+    is_ground: Mask
 
     @classmethod
     def of(cls, view: View, truth: Truth, exposure_s: float) -> Paths:
@@ -125,12 +132,16 @@ class Paths:
             bend_px_s2=np.where(stays, 0, bend).astype(np.float32),
             exposure_s=exposure_s,
             line_s=view.motion.line_s,
+            is_ground=truth.semantic == BODY,
         )
 
-    @property
+    @cached_property
     def length_px(self) -> float:
-        """Return the length of nearly the longest path over the exposure."""
-        return float(np.percentile(np.hypot(*np.moveaxis(self.speed_px_s, -1, 0)), 99.9)) * self.exposure_s
+        """Return the length of nearly the longest path over the exposure, of the frame or of the ground in it."""
+        speed = np.hypot(*np.moveaxis(self.speed_px_s, -1, 0))
+        ground = speed[self.is_ground]
+        longest = np.percentile(speed, 99.9), np.percentile(ground, 90) if len(ground) else 0.0
+        return float(max(longest)) * self.exposure_s
 
     def sources(self, time_s: float) -> tuple[F32, F32]:
         """Return column and row, float32[y, x] from the middle of the first pixel, of the light at a time.
@@ -184,8 +195,7 @@ def _carried(light: Radiance, cells: F32, weights: F64, paths: Paths) -> F32:
     `cells` float32[y·n, x·n] is the signal of n × n cells of each pixel, of light with `weights` of the bands. They
     say how light varies, and the bands of whole pixels which colour it has.
     """
-    array = light.array if light.sun is None else light.array - light.sun
-    array = array if light.fine is None else light.fine.removed_from(array)
+    array = _without_fine(light)
     height, width = array.shape[1:]
     side = cells.shape[0] // height
     signal = np.einsum("b,byx->yx", weights, array).astype(np.float32)
@@ -202,21 +212,30 @@ def _carried(light: Radiance, cells: F32, weights: F64, paths: Paths) -> F32:
         column, row = paths.sources(time_s)
         moved += _looked_up(fine, column * side, row * side)
     moved /= len(times)
-    planes = np.concatenate([array, signal[None]])
-    coloured = np.zeros_like(planes)
-    times = paths.times_s(1.0)
-    for time_s in times:
-        place = paths.sources(time_s)
-        for plane, out in zip(planes, coloured, strict=True):
-            out += _looked_up(plane, *place)
-    coloured /= len(times)
-    *bands, total = coloured
+    *bands, total = _coloured(np.concatenate([array, signal[None]]), paths)
     factor = np.where(total > 0, moved / np.maximum(total, 1e-30), 1)
     return np.stack(bands) * factor
 
 
-def _traced(spec: SampleSpec, scene: RenderInput, where: Mask, moved: F32, weights: F64, exposure_s: float) -> None:
-    """Give some pixels, bool[y, x], the light of rays that are spread over the exposure, in place."""
+def _without_fine(light: Radiance) -> F32:
+    """Return radiance float32[band, y, x] without the Sun and without fine light."""
+    array = light.array if light.sun is None else light.array - light.sun
+    return array if light.fine is None else light.fine.removed_from(array)
+
+
+def _coloured(planes: F32, paths: Paths) -> F32:
+    """Return planes of whole pixels carried along their paths, float32[plane, y, x]."""
+    out = np.zeros_like(planes)
+    times = paths.times_s(1.0)
+    for time_s in times:
+        place = paths.sources(time_s)
+        for plane, moved in zip(planes, out, strict=True):
+            moved += _looked_up(plane, *place)
+    return np.asarray(out / np.float32(len(times)))
+
+
+def _trace(spec: SampleSpec, scene: RenderInput, where: Mask, moved: F32, weights: F64, exposure_s: float) -> None:
+    """Add to some pixels, bool[y, x], the sunlight on rays that are spread over the exposure, in place."""
     from .. import render
 
     pixels = np.flatnonzero(where).astype(np.uint32)
@@ -230,4 +249,5 @@ def _traced(spec: SampleSpec, scene: RenderInput, where: Mask, moved: F32, weigh
         samples,
         exposure_s,
     )
-    moved.reshape(len(moved), -1)[:, pixels] = light
+    row, column = np.nonzero(where)
+    moved[:, row, column] = np.maximum(moved[:, row, column] + light, 0)

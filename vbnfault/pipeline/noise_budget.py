@@ -54,12 +54,13 @@ _THREADS = 2
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SampledRadiance:
-    """Hold a rendered radiance with its number of samples, its noise and its cells, as in `Rendering`."""
+    """Hold a rendered radiance with its number of samples, its noise, cells and direct light, as in `Rendering`."""
 
     radiance: Radiance
     samples_per_pixel: float
     noise_fraction_p99: float = float("nan")
     cells: F32 | None = None
+    direct: F32 | None = None
 
 
 def sample_to_noise(
@@ -133,6 +134,7 @@ def sample_to_noise(
         samples_per_pixel=float(refined.used.mean()),
         noise_fraction_p99=float(np.percentile(np.where(shows, now, 0)[lit], 99)) if lit.any() else 0.0,
         cells=None if scene.view.motion is None else refined.cells() / np.float32(exposure),
+        direct=None if scene.view.motion is None else light if indirect is None else light - indirect,
     )
 
 
@@ -363,7 +365,8 @@ def _allocated(squares: F32, goal: F32, most: int) -> NDArray[np.int32]:
 
 
 def green_per_second(spec: SampleSpec) -> F64:
-    """Return electrons per second of the green pixels for unit radiance in each band, float64[band]."""
+    """Return electrons per second of green or of grey pixels for unit radiance in each band, float64[band]."""
     nodes = ephemeris.wavelengths_nm(spec.scene)
     unit = Radiance(array=np.eye(len(nodes), dtype=np.float32)[:, :, None], wavelength_nm=nodes)
-    return np.asarray(rate_on_axis(spec.camera, unit).array[:, 0, 1], dtype=np.float64)
+    rates = rate_on_axis(spec.camera, unit).array[:, 0]
+    return np.asarray(rates[:, min(1, rates.shape[1] - 1)], dtype=np.float64)

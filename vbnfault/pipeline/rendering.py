@@ -98,8 +98,10 @@ def render_view(spec: SampleSpec, pose: Pose) -> Rendering:
         truth=truth if body is None else with_body(truth, body, camera.projection),
         open_sky=guide.semantic == SKY if stars and guide is not None else None,
         samples_per_pixel=sampled.samples_per_pixel,
-        noise_fraction_p99=sampled.noise_fraction_p99,
+        noise_fraction_p99=math.nan if fraction == math.inf else sampled.noise_fraction_p99,
         cells=sampled.cells,
+        direct=sampled.direct,
+        shows_ground=body is None,
         surroundings=surroundings(spec, scene),
         far_sources=far_sources(spec, pose),
     )

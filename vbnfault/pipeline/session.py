@@ -362,7 +362,7 @@ class Session:
 
     def _spec(self, index: int) -> SampleSpec:
         """Return what `spec` does; the messages of its errors do not name the scene."""
-        plan.check_events(self.scene)
+        plan.check_time(self.scene)
         site, aims = int(self.plan.site[index]), self.scene.is_aimed
         if self.trajectory is not None:
             terrain = self.terrain(self.ground_detail(index))

@@ -230,6 +230,11 @@ class Rendering:
     cells
         float32[y·n, x·n]: signal of n × n cells of each pixel of the render, in electrons per s of direct light;
         None unless the camera moves.
+    direct
+        float32[band, y, x]: sunlight reflected once and the Sun's disc, without a body of few pixels; None unless
+        the camera moves.
+    shows_ground
+        False if the body has few pixels, whose light `Radiance.fine` holds.
     surroundings
         Radiance around the render, for the faults that need it; empty if the scene has none.
     far_sources
@@ -245,6 +250,8 @@ class Rendering:
     samples_per_pixel: float
     noise_fraction_p99: float = float("nan")
     cells: NDArray[np.float32] | None = None
+    direct: NDArray[np.float32] | None = None
+    shows_ground: bool = True
     surroundings: tuple[Radiance, ...] = ()
     far_sources: tuple[FarSource, ...] = ()
     shared: SharedResults = field(default_factory=SharedResults)

@@ -107,6 +107,15 @@ class Scene(Table):
             )
         return self
 
+    @model_validator(mode="after")
+    def _rolls_alone(self) -> Scene:
+        if self.motion is not None and self.motion.shutter == "rolling" and self.spacecraft.model != "none":
+            raise ValueError(
+                f"motion.shutter = 'rolling': spacecraft.model = {self.spacecraft.model!r}: does not apply beside "
+                "a spacecraft, which moves with the camera; must be 'global'"
+            )
+        return self
+
     @property
     def frames(self) -> tuple[int, ...]:
         """Return the number of samples of each sequence; () if the samples are not frames of such."""
@@ -416,9 +425,9 @@ def _check_layers(scene: Scene, faults: Mapping[str, Fault]) -> None:
                 "dataset.layers: 'flow' needs the next frame: name a table of poses with a column sequence or "
                 "time_s in trajectory.file, or leave it out"
             )
-        if layer == "flow" and scene.motion is not None and scene.motion.shutter == "rolling":
+        if layer in ("flow", "point_T_m") and scene.motion is not None and scene.motion.shutter == "rolling":
             raise InputError(
-                "dataset.layers: 'flow' is between two poses, and the lines of motion.shutter = 'rolling' have "
+                f"dataset.layers: {layer!r} is that of one pose, and the lines of motion.shutter = 'rolling' have "
                 "different ones; leave it out, or choose 'global'"
             )
     for name in scene.dataset.mask_any or ():

@@ -65,7 +65,7 @@ class EventTable(Table):
             if (getattr(self, name) is None) == needed:
                 verb = "must be set" if needed else "must not be set"
                 raise ValueError(
-                    f'profile = "{self.profile}": {name} {verb}; it is for the profile {" and ".join(profiles)}'
+                    f'profile = "{self.profile}": {name} {verb}; it is for the profile {" or ".join(profiles)}'
                 )
         if self.reset_s is not None and np.min(self.reset_s) <= np.max(self.onset_s):
             reset_s, onset_s = float(np.min(self.reset_s)), float(np.max(self.onset_s))

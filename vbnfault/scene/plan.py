@@ -258,8 +258,10 @@ def _sequences(scene: Scene, samples: NDArray[np.int64]) -> tuple[NDArray[np.int
     return sequence.astype(np.int32), starts[sequence]
 
 
-def check_events(scene: Scene) -> None:
-    """Raise InputError if a scene has events, but no sequence in whose time they could happen."""
+def check_time(scene: Scene) -> None:
+    """Raise InputError if a scene has events without a sequence, or motion without poses."""
+    if scene.motion is not None and scene.trajectory is None:
+        raise InputError("motion: needs velocities and rates, which poses of [trajectory] have; leave it out")
     if scene.event and not scene.frames:
         raise InputError(
             f"event: {shown(scene.event[0].cause)} happens at a time of a sequence, and the scene has none; "

@@ -35,8 +35,9 @@ F64 = NDArray[np.float64]
 TYPES = (".csv", ".parquet")
 # Numeric column → its allowed range. Quaternion and Sun may exceed 1 by rounding; their norms are checked below.
 _UNIT = (-1.001, 1.001)
+JULIAN_DATES = (1_000_000, 5_000_000)
 _NUMBERS: dict[str, tuple[float, float]] = {
-    "julian_date": (1_000_000, 5_000_000),
+    "julian_date": JULIAN_DATES,
     **dict.fromkeys(("camera_x_T_m", "camera_y_T_m", "camera_z_T_m"), (-1e12, 1e12)),
     **dict.fromkeys((f"camera_from_T_{axis}" for axis in "wxyz"), _UNIT),
     **dict.fromkeys(("sun_x_T", "sun_y_T", "sun_z_T"), _UNIT),
@@ -90,10 +91,9 @@ class TrajectoryTable(Table):
             raise ValueError(f"file = {shown(self.file)}: flight makes poses, too; leave one out")
         if self.file is None and not self.flight:
             raise ValueError("file: is missing; a trajectory needs a file, or flights")
-        if sum(frames_of(self.flight)) > _MOST_ROWS:
-            raise ValueError(
-                f"flight: has {sum(frames_of(self.flight))} frames; must have at most {_MOST_ROWS} all together"
-            )
+        frames = sum(flight.frames * flight.sequences for flight in self.flight)
+        if frames > _MOST_ROWS:
+            raise ValueError(f"flight: has {frames} frames; must have at most {_MOST_ROWS} all together")
         return self
 
 

@@ -37,7 +37,7 @@ from ..scene.flights import (
     numbered,
     uniform,
 )
-from ..scene.trajectory import FLIGHTS, Trajectory
+from ..scene.trajectory import FLIGHTS, JULIAN_DATES, Trajectory
 from . import ephemeris
 from .ground import below_ground, body_radius_m, first_hit, first_inside, nearest_ground
 
@@ -58,6 +58,7 @@ _MISS_M = 0.01  # largest miss of the target of a free flight
 _HOP_DEG = (10.0, 80.0)
 # Distances of the second site that are tried until it lies at the wanted distance, to this fraction.
 _STEPS, _DISTANCE_FRACTION = 6, 0.01
+_MOST_ORBITS = 200  # of a free fall; each takes some hundred evaluations of gravity
 # Harmonics of an angle of the attitude's noise, and the highest of them in 1 / attitude_time_s.
 _HARMONICS, _BAND = 64, 10.0
 # Least angle between the boresight and what is up in the image; nearer to it, the other axis is.
@@ -141,23 +142,34 @@ def _sequence(scene: Scene, body: Body, flight: AnyFlight, number: int) -> Traje
     """Return one sequence of a flight. Raises InputError."""
     finer = -(-_PATH_POINTS // max(flight.frames - 1, 1))
     time_s = np.arange((flight.frames - 1) * finer + 1) / finer * flight.period_s
-    inside: tuple[int, float] | None = None
+    failed: InputError | None = None
     tries = _TRIES if isinstance(flight, DescentFlight | HoverFlight | RelocationFlight) else 1
     for attempt in range(tries):
         case = _Case(scene=scene, body=body, flight=flight, number=number, time_s=time_s, attempt=attempt)
-        path = _PATHS[type(flight)](case)
+        try:
+            path = _PATHS[type(flight)](case)
+        except InputError as error:  # another site may do
+            failed = error
+            continue
         inside = first_inside(body, path.position_T_m)
         if inside is None:
             return _row_by_row(case, path, slice(None, None, finer))
-    assert inside is not None
-    index, depth_m = inside
-    row = _row_by_row(case, path, slice(index, index + 1), first=-(-index // finer)).pose(0)
-    raise InputError(f"{FLIGHTS}: {below_ground(row, depth_m)}")
+        index, depth_m = inside
+        row = _row_by_row(case, path, slice(index, index + 1), first=-(-index // finer)).pose(0)
+        failed = InputError(f"{FLIGHTS}: {below_ground(row, depth_m)}")
+    assert failed is not None
+    raise failed
 
 
 def _row_by_row(case: _Case, path: _Path, rows: slice, first: int = 0) -> Trajectory:
     """Return some positions of a path as the rows of a trajectory, whose names begin with the number `first`."""
     time_s = case.time_s[rows]
+    last_jd = case.dated(float(time_s[-1])).sun.julian_date
+    if not JULIAN_DATES[0] <= last_jd <= JULIAN_DATES[1]:
+        raise InputError(
+            f"{FLIGHTS}: {case.name} ends at Julian date {last_jd:.10g}; must be from {JULIAN_DATES[0]:.10g} to "
+            f"{JULIAN_DATES[1]:.10g}, so choose a shorter period_s or fewer frames"
+        )
     scenes = [case.dated(float(t)) for t in time_s]
     position, velocity = path.position_T_m[rows], path.velocity_T_m_s[rows]
     T_from_C, rate = _attitude(case, replace(path, position_T_m=position, velocity_T_m_s=velocity), time_s)
@@ -205,6 +217,12 @@ def _fall(
 
     spin, centre = body.omega_rad_s, body.centre_of_mass_T_m
     offset = position_T_m - centre
+    orbit_s = 2 * np.pi * np.sqrt(np.linalg.norm(offset) ** 3 / _gm_m3_s2(body))
+    if np.ptp(time_s) > _MOST_ORBITS * orbit_s:
+        raise InputError(
+            f"{FLIGHTS}: lasts {np.ptp(time_s):.4g} s; must last at most {_MOST_ORBITS * orbit_s:.4g} s in this "
+            f"gravity, {_MOST_ORBITS} orbits, so choose a shorter period_s or fewer frames"
+        )
     start = np.concatenate([offset, velocity_T_m_s + spin * _cross_pole(offset)])
 
     def derivative(t: float, state: F64) -> F64:
@@ -225,7 +243,7 @@ def _fall(
                 atol=loose * _ATOL,
             )
             if not solved.success:
-                raise InputError(f"the motion cannot be integrated: {solved.message}")
+                raise InputError(f"{FLIGHTS}: the motion cannot be integrated: {solved.message}")
             states[rows] = solved.y.T
     offset = _turned(states[:, :3], -spin * time_s)
     return centre + offset, _turned(states[:, 3:], -spin * time_s) - spin * _cross_pole(offset)
@@ -253,7 +271,8 @@ def _fall_to(body: Body, start_T_m: F64, end_T_m: F64, time_s: F64) -> tuple[F64
     solution = root(miss_m_s, guess, jac=lambda _: turn, method="hybr", options={"xtol": 1e-7})
     if not np.linalg.norm(solution.fun) * last[0] < _MISS_M:
         raise InputError(
-            f"no free fall from one end to the other takes {last[0]:g} s; choose a shorter period_s or fewer frames"
+            f"{FLIGHTS}: no free fall from one end to the other takes {last[0]:g} s; choose a shorter period_s or "
+            "fewer frames"
         )
     return _fall(body, start_T_m, solution.x - spin * _cross_pole(offsets[0]), time_s)
 
