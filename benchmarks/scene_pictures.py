@@ -51,7 +51,7 @@ SHEET_TRIANGLES = 800_000
 SHEET_WIDTH_PX = 1080
 NARROW_PX = {"approach": 700, "earth_observation": 700}  # sheets that pages of the documentation show
 # Sequences of which film strips are shown, and frames of each.
-STRIPS = {"descent67p": (0, 5), "flyby_bennu": (6, 7), "hover_ceres": (4, 19), "relocation67p": (6, 9)}
+STRIPS = {"descent67p": (0, 5), "flyby_bennu": (3, 6), "hover_ceres": (4, 19), "relocation67p": (6, 9)}
 STRIP_FRAMES, STRIP_PX = 6, 144
 # Samples with many fault classes; several share a site, whose terrain is then built once.
 # Those of NAVCAM have all nine classes of the scene between them, most of them visible in a small figure.

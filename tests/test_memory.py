@@ -15,6 +15,7 @@ import pytest
 from conftest import small_scene
 
 import vbnfault
+from vbnfault.core.errors import InputError
 from vbnfault.pipeline import Session
 from vbnfault.pipeline import session as pipeline_session
 from vbnfault.pipeline.development import acting_at, without
@@ -132,6 +133,12 @@ def test_a_session_shares_arenas_before_anything_else(monkeypatch: pytest.Monkey
     """Later, the threads of its terrain would each have one."""
     done: list[str] = []
     monkeypatch.setattr(pipeline_session, "share_arenas", lambda: done.append("arenas"))
-    monkeypatch.setattr(pipeline_session, "as_trajectory", lambda _: done.append("trajectory"))
-    Session(config.parse_scene(small_scene(), source="test"), poses=())
+
+    def as_trajectory(_: object) -> None:
+        done.append("trajectory")
+        raise InputError("no poses")
+
+    monkeypatch.setattr(pipeline_session, "as_trajectory", as_trajectory)
+    with pytest.raises(InputError, match="no poses"):
+        Session(config.parse_scene(small_scene(), source="test"), poses=())
     assert done == ["arenas", "trajectory"]
