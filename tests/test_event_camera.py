@@ -340,6 +340,12 @@ def test_renders_are_as_far_apart_as_the_ground_moves(scene: Path) -> None:
         assert {10.0, 11.0, 12.0} <= set(flight.times_s.tolist())
 
 
+def test_a_grey_camera_sends_events(scene: Path) -> None:
+    changes = {"camera.detector": "rosetta_navcam", "event_camera.step_px": 8.0}
+    flight = EventFlight(vbnfault.Session(vbnfault.load_scene(scene, changes)), 1)
+    assert sum(map(len, flight.events())) > 100
+
+
 def test_events_have_neither_faults_nor_blur_nor_samples_where_noise_asks_for_them(scene: Path) -> None:
     changes = {
         "render.noise_fraction": 0.5,

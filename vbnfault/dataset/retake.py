@@ -66,7 +66,7 @@ _FREE: dict[str, frozenset[str] | None] = {
 }
 # Of the camera, these keys may not differ; all others may.
 _FIXED_OF_CAMERA = frozenset({"calibration", "fov_deg", "width_px", "height_px", "focus_distance_m"})
-# Nor these, where the camera of the store moved during its exposures.
+# These may not differ either, where the camera of the store moved during its exposures.
 _FIXED_IN_MOTION = frozenset(
     {"exposure_s", "exposure_min_s", "exposure_max_s", "exposure_max_towards_sun_s", "exposure_stops"}
     | {"metering_level", "metering_percentile", "readout_directions"}

@@ -28,7 +28,7 @@ from .spec import SampleSpec
 
 F64 = NDArray[np.float64]
 
-_GREEN = 1  # channel of the electrons
+_GREEN = 1  # channel of the electrons; a grey camera has one
 _EVERY_PX = 8  # pixels whose motion is computed
 _STEP = 1e-3  # of the interval between two frames, over which motion is computed
 _STEPS_AT = (0.0, 0.5, 1.0 - _STEP)  # where in the interval
@@ -135,7 +135,7 @@ class EventFlight:
         render = scene.render.model_copy(update={"noise_fraction": None})
         scene = scene.model_copy(update={"render": render, "motion": None})
         plan = replace(spec.plan, faults=(), injected=spec.plan.injected[:, :0])
-        self._spec = replace(spec, scene=scene, faults={}, plan=plan, taken_with=spec.camera, before=None)
+        self._spec = replace(spec, scene=scene, faults={}, plan=plan, taken_with=spec.camera)
         self._number, self._device = number, int(spec.plan.individual[first])
         self.times_s = self._planned_times_s()
 
@@ -167,7 +167,8 @@ class EventFlight:
         """Return expected electrons per second at a time, float32[y, x]."""
         spec = self._at(time_s)
         rendering = render_view(spec, resolve(spec))
-        return spec.camera.expose(rendering.light.rendered, 1.0).merged.array[..., _GREEN]
+        electrons = spec.camera.expose(rendering.light.rendered, 1.0).merged.array
+        return electrons[..., min(_GREEN, electrons.shape[-1] - 1)]
 
     def _planned_times_s(self) -> F64:
         """Return the times of the frames, and between them so many that the ground moves at most `step_px`."""
