@@ -22,6 +22,13 @@ patch = {facet_m = 10.0, radius_m = 40.0, boulders = false, max_triangles = 60_0
 dataset = {shard_samples = 2, seed = 3}
 trajectory.file = "poses.csv"
 """
+EVENTS = """
+[[event]]
+cause = "dust event"
+faults = ["dust_on_optics", "cosmic_rays"]
+onset_s = [0.5, 1.5]
+duration_s = 2.0
+"""
 
 
 def columns() -> dict[str, list[Any]]:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_sequences import EVENTS, FRAMES, SCENE, columns, write
+from frames_kit import EVENTS, FRAMES, SCENE, columns, write
 
 import vbnfault
 from vbnfault.detect.prediction import Prediction

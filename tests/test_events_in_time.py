@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import Called
-from frames_kit import FRAMES, NAMES, columns, write, write_scene
+from frames_kit import EVENTS, FRAMES, NAMES, columns, write, write_scene
 
 import vbnfault
 from vbnfault.core.errors import InputError
@@ -21,14 +21,6 @@ from vbnfault.dataset import scene_identity
 from vbnfault.faults import registry
 from vbnfault.scene import config, plan
 from vbnfault.scene.events import commanded_now, events_of_sequence, striking
-
-EVENTS = """
-[[event]]
-cause = "dust event"
-faults = ["dust_on_optics", "cosmic_rays"]
-onset_s = [0.5, 1.5]
-duration_s = 2.0
-"""
 
 
 @pytest.fixture
