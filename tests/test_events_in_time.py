@@ -189,7 +189,9 @@ def test_an_event_strikes_only_the_sequences_that_carry_its_first_fault(scene: P
 
 
 def test_calls_with_a_sequence_and_without_one_do_not_mix(scene: Path) -> None:
-    session = vbnfault.Session(config.load_scene(scene))
+    table = config.load_scene(scene).resolved()
+    table |= {"trajectory": None, "dataset": table["dataset"] | {"samples": 2, "sites": 1}}
+    session = vbnfault.Session(config.parse_scene(table, source="test"))
     row_of = {name: values[0] for name, values in columns().items() if name not in ("sequence", "time_s")}
     alone = session.take(row_of, sample=1).scalars["parameters"]["dust_on_optics"]
     framed = session.take({**row_of, "sequence": "s", "time_s": 0.0}, sample=1).scalars["parameters"][

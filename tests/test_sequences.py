@@ -287,18 +287,26 @@ def test_readers_give_the_columns_of_sequences(scene: Path, tmp_path: Path) -> N
     assert {"sequence", "frame", "time_s"} <= set(table)
 
 
-def test_frames_of_a_loop_are_those_of_a_table(scene: Path) -> None:
-    """A pose with the name of a sequence is a frame of one that has all samples of the scene."""
-    table = columns()
-    table["camera_y_T_m"] = [10 * y for y in table["camera_y_T_m"]]  # from afar, all rows share the terrain
-    write(scene.parent / "poses.csv", table)
-    session = vbnfault.Session(config.load_scene(scene))
+def test_frames_of_a_loop_are_those_of_a_table(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a scene with sequences, a call is one of its frames from another pose, and keeps its terrain."""
+    table = columns()  # near the ground, where another pose alone would have a terrain of its own
+    session = vbnfault.Session(config.load_scene(scene, {"faults.persistence": {}, "plan.classes_per_sample": [3, 3]}))
+    expected = [session.simulate(k) for k in range(3)]
+    monkeypatch.setattr(session, "aimed_terrain", None)  # none is built for a call
     for k in (0, 2):
-        frame = session.take({name: values[k] for name, values in table.items()}, sample=k)
-        expected = session.simulate(k)
-        assert frame.scalars["parameters"] == expected.scalars["parameters"]
-        np.testing.assert_array_equal(frame.layers["image"], expected.layers["image"])
-        assert frame.scalars["time_s"] == k
+        camera = {name: values[k] for name, values in table.items() if "camera" in name or "velocity" in name}
+        for pose in (camera, {name: values[k] for name, values in table.items()}):
+            frame = session.take(pose, sample=k)
+            assert frame.scalars["parameters"] == expected[k].scalars["parameters"]
+            np.testing.assert_array_equal(frame.layers["image"], expected[k].layers["image"])
+            assert frame.scalars["time_s"] == k
+    moved = session.take(camera | {"camera_x_T_m": camera["camera_x_T_m"] + 1.0}, sample=2)
+    np.testing.assert_array_equal(moved.scalars["site_T_m"], expected[2].scalars["site_T_m"])
+    np.testing.assert_array_equal(moved.scalars["injected"], expected[2].scalars["injected"])
+    assert (moved.layers["image"] != expected[2].layers["image"]).any()
+    bright = session.take(camera, sample=2, faults={"dust_on_optics": True}, exposure=0.03)
+    assert bright.scalars["exposure_s"] == 0.03
+    assert bright.scalars["injected"].sum() == 1
 
 
 def test_windows_are_frames_that_follow_each_other(scene: Path, tmp_path: Path) -> None:

@@ -53,6 +53,8 @@ if TYPE_CHECKING:
     from ..faults import Fault
     from ..render import TerrainMesh
 
+    _Switched = tuple[Scene, dict[str, Fault], plan.Plan]
+
 # Limit of the slope of an octave of the finest relief: steeper relief would look like needles.
 _STEEPEST_DETAIL = 0.12
 # Leaving out the smallest boulders is usual: the packaged scenes keep at least a quarter of those that are drawn. A
@@ -152,7 +154,7 @@ class Session:
         self._terrain_key: int | GroundDetail | None = None
         self._model: Terrain | None = None
         self._shared_views = SharedViews()
-        self._taken: dict[str, tuple[Scene, dict[str, Fault], plan.Plan]] = {}  # by faults and exposure
+        self._taken: dict[str, _Switched] = {}  # by faults and exposure
         self._compiled = False  # the first sample compiles the kernels
 
     @cached_property
@@ -355,43 +357,54 @@ class Session:
             The scene plans no such sample.
         """
         with in_file(self.source):
-            number = tables.whole(index)
-            if number is None or not 0 <= number < len(self.plan):
-                raise InputError(f"sample {shown(index)}: must be a whole number from 0 to {len(self.plan) - 1}")
-            return self._spec(number)
+            return self._spec(self._checked(index, "sample "))
 
-    def _spec(self, index: int) -> SampleSpec:
-        """Return what `spec` does; the messages of its errors do not name the scene."""
-        plan.check_time(self.scene)
-        site, aims = int(self.plan.site[index]), self.scene.is_aimed
-        if self.trajectory is not None:
+    def _checked(self, index: Any, named: str) -> int:
+        """Return the number of a sample of the plan. Raises InputError."""
+        number = tables.whole(index)
+        if number is None or not 0 <= number < len(self.plan):
+            raise InputError(f"{named}{shown(index)}: must be a whole number from 0 to {len(self.plan) - 1}")
+        return number
+
+    def _spec(self, index: int, switched: _Switched | None = None, taken: FlownPose | None = None) -> SampleSpec:
+        """Return what `spec` does; the messages of its errors do not name the scene.
+
+        `switched` replaces scene, faults and plan of the session, and `taken` the pose of the table.
+        """
+        scene, faults, planned = switched or (self.scene, self.faults, self.plan)
+        plan.check_time(scene)
+        table, site = self.trajectory, int(planned.site[index])
+        flown = table.pose(index) if table is not None and taken is None else taken
+        if table is not None and (taken is None or table.frames):
             terrain = self.terrain(self.ground_detail(index))
+        elif flown is not None:
+            terrain = self.aimed_terrain(flown)
         else:
-            terrain = self.model_terrain(site) if aims else self.terrain(site)
-        flown = None if self.trajectory is None else self.trajectory.pose(index)
+            terrain = self.model_terrain(site) if scene.is_aimed else self.terrain(site)
         return SampleSpec(
             index=index,
-            scene=self.dated_scene(index),
-            plan=self.plan,
-            faults=self.faults,
+            scene=_dated(scene, flown) if flown is not None else self.dated_scene(index),
+            plan=planned,
+            faults=faults,
             terrain=terrain,
             flown=flown,
-            terrain_of=self.aimed_terrain if aims else None,
-            before=partial(self._spec, index - 1) if flown is not None and flown.frame > 0 else None,
-            after=None if self.trajectory is None else self.trajectory.after(index),
+            terrain_of=self.aimed_terrain if scene.is_aimed else None,
+            before=partial(self._spec, index - 1, switched) if flown is not None and flown.frame > 0 else None,
+            after=table.after(index) if table is not None and taken is None else None,
         )
 
     def dated_scene(self, index: int) -> Scene:
         """Return the scene with the date of a sample's view, and with its distance of the Sun on a trajectory."""
-        scene, values = self.scene, {}
+        scene = self.scene
+        if self.trajectory is not None:
+            return _dated(scene, self.trajectory.pose(index))
         if scene.spice.spacecraft:
             first = np.array([self.plan.first_of_view(index)])
             fraction = float(keyed_uniform(scene.dataset.seed, first, "plan", "epoch")[0])
-            values = {"julian_date": ephemeris.epoch_jd(scene, int(self.plan.site[index]), fraction)}
-        if self.trajectory is not None:
-            flown = self.trajectory.pose(index)
-            values = {"julian_date": flown.julian_date, "distance_au": flown.sun_distance_au}
-        return ephemeris.dated(scene, **values) if values else scene
+            return ephemeris.dated(
+                scene, julian_date=ephemeris.epoch_jd(scene, int(self.plan.site[index]), fraction)
+            )
+        return scene
 
     def simulate(self, index: int) -> Sample:
         """Return one finished sample."""
@@ -415,7 +428,9 @@ class Session:
         """Return the sample of a pose that was not known before, as for a camera in a loop.
 
         It equals, bit for bit, row `sample` of a table of poses with as many rows as the scene has samples, all of
-        them this pose. Body, kernels, faults and, where it serves, terrain stay from call to call.
+        them this pose. Body, kernels, faults and, where it serves, terrain stay from call to call. In a scene with
+        sequences, it is frame `sample` from another pose than planned: terrain, device, time and the frame before
+        are those of this frame, so near the ground, too, no terrain is built for a call.
 
         Parameters
         ----------
@@ -424,9 +439,9 @@ class Session:
             mapping with the columns of a table of poses. With a `sequence`, all samples of the session are frames
             of it: dust, defects and wear stay from call to call, and events come at its `time_s`.
         sun
-            Direction from the body to the Sun in T, float[3]; by default the mapping's.
+            Direction from the body to the Sun in T, float[3]; by default the mapping's, or the planned frame's.
         time
-            Julian date, TDB; by default the mapping's, or the scene's.
+            Julian date, TDB; by default the mapping's, the planned frame's, or the scene's.
         faults
             Which faults the sample has: a class is on with True or with values of keys, such as
             `{"dust_on_optics": True, "straylight": {"veil_fraction": 0.01}}`, and all others are off. By default
@@ -441,38 +456,35 @@ class Session:
         InputError
             If the pose, a fault or a value cannot be used.
         """
+        number, planned = self._checked(sample, "sample = "), None
+        if self.trajectory is not None and self.trajectory.frames:
+            planned = self.trajectory.pose(number)
         row = one_pose(
             pose,
             sun,
             time,
-            self.scene.sun.julian_date,
+            planned or self.scene.sun.julian_date,
             lambda date: ephemeris.sun_distance_au(ephemeris.dated(self.scene, julian_date=date)),
         )
-        scene, of_faults, planned = self._switched(row, faults, exposure)
-        number = tables.whole(sample)
-        if number is None or not 0 <= number < len(planned):
-            raise InputError(f"sample = {shown(sample)}: must be a whole number from 0 to {len(planned) - 1}")
         flown = row.pose(0)
-        spec = SampleSpec(
-            index=number,
-            scene=ephemeris.dated(scene, julian_date=flown.julian_date, distance_au=flown.sun_distance_au),
-            plan=planned,
-            faults=of_faults,
-            terrain=self.aimed_terrain(flown),
-            flown=flown,
-            terrain_of=self.aimed_terrain if scene.is_aimed else None,
-        )
+        if planned is not None:
+            time_s = planned.time_s if np.isnan(flown.time_s) else flown.time_s
+            flown = replace(flown, sequence=planned.sequence, frame=planned.frame, time_s=time_s)
+        spec = self._spec(number, self._switched(None if planned else row, faults, exposure), flown)
         return to_sample(simulate_frame(spec))
 
     def _switched(
-        self, row: Trajectory, faults: Mapping[str, bool | Mapping[str, Any]] | None, exposure: float | None
-    ) -> tuple[Scene, dict[str, Fault], plan.Plan]:
-        """Return the scene with a table of poses and a call's faults and exposure, its faults, and its plan."""
+        self, row: Trajectory | None, faults: Mapping[str, bool | Mapping[str, Any]] | None, exposure: float | None
+    ) -> _Switched:
+        """Return the scene with a call's faults and exposure, its faults, and its plan.
+
+        `row` is the call's pose, of which the plan is; without one, it is that of the session.
+        """
         if not isinstance(faults, Mapping | None):
             raise InputError(
                 f"faults = {shown(faults)}: must map names of classes to True, False or values of keys"
             )
-        key = json.dumps([faults, exposure, bool(row.frames)], sort_keys=True, default=repr)
+        key = json.dumps([faults, exposure, row is not None and bool(row.frames)], sort_keys=True, default=repr)
         if key not in self._taken:
             scene = self.scene
             if faults is not None or exposure is not None:
@@ -484,10 +496,12 @@ class Session:
                         raise InputError(f"faults: {shown(name)} is no fault of {self.source}; it has {known}")
                     table["faults"][name] |= dict(values) if isinstance(values, Mapping) else {}
                 scene = config.parse_scene(table, source=self.source)
-            scene = with_rows(scene, row.repeated(len(self.plan)))
-            parsed = configure_faults(scene, self.source)
-            need_sun = [name for name, fault in parsed.items() if fault.needs_sun]
-            planned = plan.make_plan(scene, list(parsed), need_sun=need_sun)
+            kept = {"trajectory": self.scene.trajectory, "dataset": self.scene.dataset}
+            scene = scene.model_copy(update=kept) if row is None else with_rows(scene, row.repeated(len(self.plan)))
+            parsed, planned = configure_faults(scene, self.source), self.plan
+            if row is not None:
+                need_sun = [name for name, fault in parsed.items() if fault.needs_sun]
+                planned = plan.make_plan(scene, list(parsed), need_sun=need_sun)
             if faults is not None:
                 on = [faults.get(name, False) is not False for name in planned.faults]
                 planned = replace(planned, injected=np.tile(on, (len(planned), 1)))
@@ -499,3 +513,8 @@ class Session:
     def frame(self, index: int) -> Frame:
         """Return one sample with the outcome of every stage, from its pose to its labels."""
         return simulate_frame(self.spec(index), shared=self._shared_views)
+
+
+def _dated(scene: Scene, flown: FlownPose) -> Scene:
+    """Return a scene at the date of a pose, and at its distance of the Sun."""
+    return ephemeris.dated(scene, julian_date=flown.julian_date, distance_au=flown.sun_distance_au)

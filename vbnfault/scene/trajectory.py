@@ -34,13 +34,13 @@ F64 = NDArray[np.float64]
 
 TYPES = (".csv", ".parquet")
 # Numeric column → its allowed range. Quaternion and Sun may exceed 1 by rounding; their norms are checked below.
-_UNIT = (-1.001, 1.001)
+_UNIT, _SUN = (-1.001, 1.001), ("sun_x_T", "sun_y_T", "sun_z_T")
 JULIAN_DATES = (1_000_000, 5_000_000)
 _NUMBERS: dict[str, tuple[float, float]] = {
     "julian_date": JULIAN_DATES,
     **dict.fromkeys(("camera_x_T_m", "camera_y_T_m", "camera_z_T_m"), (-1e12, 1e12)),
     **dict.fromkeys((f"camera_from_T_{axis}" for axis in "wxyz"), _UNIT),
-    **dict.fromkeys(("sun_x_T", "sun_y_T", "sun_z_T"), _UNIT),
+    **dict.fromkeys(_SUN, _UNIT),
     "sun_distance_au": (0.01, 1000),
 }
 COLUMNS = ("name", *_NUMBERS)
@@ -325,7 +325,7 @@ def one_pose(
     pose: Mapping[str, Any] | Sequence[Any],
     sun: Any,
     time: float | None,
-    default_date: float,
+    default: float | FlownPose,
     distance_au: Callable[[float], float],
 ) -> Trajectory:
     """Return a table of one pose.
@@ -338,7 +338,9 @@ def one_pose(
     sun
         Direction from the body to the Sun in T, float[3], of any length; None: the mapping's.
     time
-        Julian date, TDB; None: the mapping's, or else `default_date`.
+        Julian date, TDB; None: the mapping's.
+    default
+        Julian date, or the pose with the date and the Sun, of what neither these nor the mapping have.
     distance_au
         Gives the distance from the Sun at a date, where the mapping has none.
 
@@ -347,7 +349,12 @@ def one_pose(
     InputError
         Something is missing, or no pose.
     """
-    row: dict[str, Any] = {"name": "pose", "julian_date": default_date}
+    row: dict[str, Any] = {"name": "pose", "julian_date": default}
+    if isinstance(default, FlownPose):
+        row |= {"julian_date": default.julian_date} | (
+            {"sun_distance_au": default.sun_distance_au} if time is None else {}
+        )
+        row |= dict(zip(_SUN, default.sun_direction_T.tolist(), strict=True))
     camera = [f"camera_{axis}_T_m" for axis in "xyz"] + [f"camera_from_T_{axis}" for axis in "wxyz"]
     if isinstance(pose, Mapping) or hasattr(pose, "keys"):
         row |= dict(pose)
@@ -370,7 +377,7 @@ def one_pose(
             raise InputError(
                 f"sun = {shown(sun)}: must be three numbers, the direction from the body to the Sun in T"
             )
-        row |= dict(zip((f"sun_{axis}_T" for axis in "xyz"), (towards / length).tolist(), strict=True))
+        row |= dict(zip(_SUN, (towards / length).tolist(), strict=True))
     if time is not None:
         row["julian_date"] = time
     if "sun_distance_au" not in row:
