@@ -1,11 +1,12 @@
 """Compare images of a camera in motion with the mean of brute-force sub-frames, and give the time of each.
 
-    python benchmarks/motion_blur.py [--size 512] [--sub-frames 256]
+    python benchmarks/motion_blur.py [--size 512] [--sub-frames 256] [--repeats 1]
 
 A camera 150 m above ground of 67P turns, flies sideways, or flies down. For each kind and length of motion, a line
 gives the error of the signal over the noise of the sensor (median with its sign, root mean square, median, 99th
 percentile and fraction below 0.3 of the lit pixels), the pixels that get new rays, and the time of the moved frame,
-from the render to its electrons, over that of a still one.
+from the render to its electrons, over that of a still one. With repeats, the mean of so many frames with samples of
+their own is compared, which leaves the error that more samples would not reduce.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from vbnfault.pipeline.rendering import render_view
 from vbnfault.pipeline.resolve import resolve
 from vbnfault.pipeline.spec import Pose, Rendering, SampleSpec, SceneExposure
 from vbnfault.scene.config import parse_scene
+from vbnfault.scene.trajectory import FlownPose
 
 F64 = NDArray[np.float64]
 
@@ -35,8 +37,8 @@ HEIGHT_M, FIELD_DEG, EXPOSURE_S = 150.0, 30.0, 0.02
 UP_T = np.array([0.2, -0.1, 1.0]) / np.linalg.norm([0.2, -0.1, 1.0])
 
 
-def spec_above_ground(size: int, noise_fraction: float) -> SampleSpec:
-    """Return the sample of a thin-lens camera that looks down, with the Sun 50° from the zenith."""
+def specs_above_ground(size: int, noise_fraction: float, count: int) -> list[SampleSpec]:
+    """Return samples of one view of a thin-lens camera that looks down, with the Sun 50° from the zenith."""
     camera = {"width_px": size, "height_px": size, "fov_deg": FIELD_DEG, "exposure_s": EXPOSURE_S}
     table = {
         "title": "motion",
@@ -44,7 +46,7 @@ def spec_above_ground(size: int, noise_fraction: float) -> SampleSpec:
         "sun": {"limb_darkening": True},
         "render": {"noise_fraction": noise_fraction, "bounces": 0},
         "motion": {},
-        "dataset": {"samples": 1},
+        "dataset": {"samples": count, "shard_samples": count},
     }
     scene = parse_scene(table, source="motion")
     vertices_m = vbnfault.Session(scene).body.vertices_m
@@ -56,30 +58,31 @@ def spec_above_ground(size: int, noise_fraction: float) -> SampleSpec:
     names = (
         [f"camera_{a}_T_m" for a in "xyz"] + [f"camera_from_T_{a}" for a in "wxyz"] + [f"sun_{a}_T" for a in "xyz"]
     )
-    row = {"name": "0", "julian_date": 2457000.0, "sun_distance_au": 2.0, **dict(zip(names, values, strict=True))}
-    return vbnfault.Session(scene, poses={name: [value] for name, value in row.items()}).spec(0)
+    row = {"julian_date": 2457000.0, "sun_distance_au": 2.0, **dict(zip(names, values, strict=True))}
+    poses = {"name": [str(k) for k in range(count)], **{name: [value] * count for name, value in row.items()}}
+    session = vbnfault.Session(scene, poses=poses)
+    return [session.spec(k) for k in range(count)]
 
 
-def motions(spec: SampleSpec, lengths_px: list[float]) -> Iterator[tuple[str, SampleSpec]]:
+def motions(flown: FlownPose, width_px: int, lengths_px: list[float]) -> Iterator[tuple[str, FlownPose]]:
     """Yield the kinds of motion that move the ground by these lengths during the exposure."""
-    assert spec.flown is not None
-    pixel_rad = np.radians(FIELD_DEG) / spec.scene.camera.width_px
+    pixel_rad = np.radians(FIELD_DEG) / width_px
     quarter = np.radians(FIELD_DEG) / 4
     for px in lengths_px:
         rad_s = px * pixel_rad / EXPOSURE_S
-        sideways = spec.flown.T_from_C @ np.array([0.8, 0.6, 0.0]) * rad_s * HEIGHT_M
+        sideways = flown.T_from_C @ np.array([0.8, 0.6, 0.0]) * rad_s * HEIGHT_M
         kinds = {
             "turn": {"rate_C_rad_s": rad_s * np.array([0.36, -0.92, 0.15])},
             "sideways": {"velocity_T_m_s": sideways},
             "down": {"velocity_T_m_s": -UP_T * rad_s * HEIGHT_M / quarter},
         }
         for kind, values in kinds.items():
-            yield f"{kind:8} {px:4g} px", replace(spec, flown=replace(spec.flown, **values))
+            yield f"{kind:8} {px:4g} px", replace(flown, **values)
 
 
 def exposed(spec: SampleSpec, pose: Pose) -> tuple[Rendering, SceneExposure, float]:
     """Return the render of a sample, its exposure, and the seconds that both take once kernels are compiled."""
-    for _ in range(2):
+    for _ in range(2):  # the first compiles
         started = time.perf_counter()
         rendered = render_view(spec, pose)
         exposure = motion.move(spec, rendered, meter(spec, rendered))
@@ -111,17 +114,21 @@ def main() -> None:
     parser.add_argument("--sub-frames", type=int, default=256)
     parser.add_argument("--noise-fraction", type=float, default=0.3)
     parser.add_argument("--lengths", type=float, nargs="+", default=[1, 5, 20])
+    parser.add_argument("--repeats", type=int, default=1)
     options = parser.parse_args()
-    spec = spec_above_ground(options.size, options.noise_fraction)
-    pose = resolve(spec)
-    still, _, still_s = exposed(spec, pose)
+    specs = specs_above_ground(options.size, options.noise_fraction, options.repeats)
+    pose = resolve(specs[0])
+    assert specs[0].flown is not None
+    still, _, still_s = exposed(specs[0], pose)
     print(f"still frame: {still_s:.2f} s, noise of sampling {still.noise_fraction_p99:.2f} of the sensor's")
-    weights, detector = green_per_second(spec) * EXPOSURE_S, spec.camera.detector
-    for name, moving in motions(spec, options.lengths):
-        rendered, exposure, seconds = exposed(moving, pose)
+    weights, detector = green_per_second(specs[0]) * EXPOSURE_S, specs[0].camera.detector
+    for name, flown in motions(specs[0].flown, options.size, options.lengths):
+        frames = [exposed(replace(spec, flown=flown), pose) for spec in specs]
+        rendered, seconds = frames[0][0], float(np.median([frame[2] for frame in frames]))
         paths = motion.Paths.of(rendered.scene.view, rendered.truth, EXPOSURE_S)
-        got = np.einsum("b,byx->yx", weights, exposure.light.rendered.array)
-        true = np.einsum("b,byx->yx", weights, brute_force(rendered, moving, options.sub_frames))
+        mean = sum(exposure.light.rendered.array for _, exposure, _ in frames) / len(frames)
+        got = np.einsum("b,byx->yx", weights, mean)
+        true = np.einsum("b,byx->yx", weights, brute_force(rendered, specs[0], options.sub_frames))
         lit = (true > 0.01 * detector.full_well_e) & (true < detector.full_well_e)
         error = ((got - true) / np.sqrt(np.maximum(true, 0) + detector.read_noise_e_rms**2))[lit]
         size = np.abs(error)
