@@ -19,6 +19,7 @@ from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
+import frames_kit
 import synthetic
 from conftest import small_scene
 from tools import victim
@@ -254,6 +255,32 @@ class Retake(Way):
         vbnfault.retake(place.shared / "views.zarr", self._scene(2), place.out, progress=False)
 
 
+class Frames(Way):
+    """A build of rendered frames of sequences, with events and faults that need the frame before."""
+
+    variants = ("alone", "workers", "cluster")
+    makes_dataset = False
+    needs = ("scheduler",)
+
+    def prepare(self, place: Place) -> None:
+        """Write the scene, and build it in one process."""
+        path = frames_kit.write_scene(place.shared)
+        path.write_text("faults.persistence = {}\n" + path.read_text() + frames_kit.EVENTS)
+        vbnfault.build(path, place.shared / "frames.zarr", progress=False)
+
+    def run(self, place: Place) -> None:
+        """Build."""
+        how = {"alone": {}, "workers": {"workers": 2}, "cluster": {"scheduler": place.scheduler}}[place.variant]
+        vbnfault.build(place.shared / "scene.toml", place.out, progress=False, **how)
+
+    def report(self, place: Place) -> dict[str, Any]:
+        """Return the digest, and whether it is another than that of one process."""
+        found = super().report(place)
+        if found["digest"] != store.digest(place.shared / "frames.zarr"):
+            found["problems"].append("frames differ from those of one process")
+        return found
+
+
 class Export(Way):
     """An export."""
 
@@ -293,6 +320,7 @@ WAYS: dict[str, Way] = {
     "bucket": InBucket("S3, command killed"),
     "failing": BucketFails("S3, server fails"),
     "retake": Retake("retake"),
+    "frames": Frames("frames of sequences"),
     "export": Export("export"),
 }
 

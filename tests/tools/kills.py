@@ -3,11 +3,12 @@
     python -m tests.tools.kills --count 200 --samples 64
 
 The ways are in `kill_ways.py`: builds in one process, in two, on Dask, in ranges of shards and in a bucket of S3,
-merges, retakes and exports. First each way runs undisturbed; all that make the dataset must have one digest. Then
-each round ends one command early, `--steps` times or until it ends well, and completes it undisturbed. An event is
-drawn with `--seed`: an operation on files of the command or of one of its workers, or a request that writes to
-the bucket. The signal is SIGKILL; in one of five cases it is SIGTERM where the command itself follows the plan, and
-half of the SIGKILLs leave a half-written file. Requests may be answered with 503 from one on, instead of a signal.
+of frames of sequences, merges, retakes and exports. First each way runs undisturbed; all that make the dataset must
+have one digest. Then each round ends one command early, `--steps` times or until it ends well, and completes it
+undisturbed. An event is drawn with `--seed`: an operation on files of the command or of one of its workers, or a
+request that writes to the bucket. The signal is SIGKILL; in one of five cases it is SIGTERM where the command
+itself follows the plan, and half of the SIGKILLs leave a half-written file. Requests may be answered with 503 from
+one on, instead of a signal.
 
 A round passes if the output is that of the undisturbed command, if `verify` reports no problem and no temporary
 file is left, and if no kill lost what was finished. The exit code is 1 if a round fails. `--count` counts SIGKILLs,
