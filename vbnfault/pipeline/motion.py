@@ -31,12 +31,13 @@ Mask = NDArray[np.bool_]
 _LEAST_PX = 0.02  # of motion that is seen
 _STEPS_PER_PX = 4.0  # of the light of cells; that of whole pixels, whose colours are taken, has one
 _MOST_STEPS = 1024
+_STRIP_PX = 64  # rows of pixels whose cells are carried at a time
 _ROUNDS = 2  # in which the place is found from which light comes
 # Pixels whose paths depart by more than this from those around, up to either end, may hide one another.
 _APART_PX, _APART_OF_LENGTH = 0.12, 0.02
 _FARTHEST_PX = 64  # from such a step, within which pixels get new rays
 # New rays over all pixels, and range of the samples of a pixel that gets some.
-_RAYS_PER_PX, _SAMPLES = 32, (16, 1024)
+_RAYS_PER_PX, _SAMPLES = 128, (16, 1024)
 # Where the first and the last line are: direction in which pixels are exposed one after the other, x and y.
 _LATER = {"up": (0, 1), "down": (0, -1), "left": (1, 0), "right": (-1, 0)}
 
@@ -68,7 +69,8 @@ def move(spec: SampleSpec, rendering: Rendering, exposure: SceneExposure) -> Sce
     if paths.length_px < _LEAST_PX:
         return exposure
     weights = green_per_second(spec)
-    moved = _carried(light, rendering.cells, weights, paths)
+    white = float(rendering.scene.sun.irradiance_W_m2_nm @ weights) / np.pi
+    moved = _carried(light, rendering.cells, white, weights, paths)
     appearing = paths.appearing(truth)
     if appearing.any() and rendering.shows_ground:
         # light between surfaces, of a coma and of air is smooth: it is carried everywhere
@@ -143,21 +145,33 @@ class Paths:
         longest = np.percentile(speed, 99.9), np.percentile(ground, 90) if len(ground) else 0.0
         return float(max(longest)) * self.exposure_s
 
-    def sources(self, time_s: float) -> tuple[F32, F32]:
+    @cached_property
+    def _motion(self) -> F32:
+        """Return speed and bend of each pixel, float32[y, x, 4]."""
+        return np.concatenate([self.speed_px_s, self.bend_px_s2], axis=-1)
+
+    def sources(self, time_s: float, rows: slice = slice(None)) -> tuple[F32, F32]:
         """Return column and row, float32[y, x] from the middle of the first pixel, of the light at a time.
 
-        It is the light that each pixel gets `time_s` after the middle of its exposure.
+        It is the light that each pixel of some rows gets `time_s` after the middle of its exposure.
         """
         height, width = self.speed_px_s.shape[:2]
-        row, column = np.mgrid[0:height, 0:width].astype(np.float32)
-        shift = self.speed_px_s * np.float32(time_s) + self.bend_px_s2 * np.float32(time_s**2)
-        at = shift
-        for _ in range(_ROUNDS):
-            if self.line_s.any():  # the source was seen at the time of its own line
-                since_s = (time_s + at @ self.line_s).astype(np.float32)[..., None]
-                shift = self.speed_px_s * since_s + self.bend_px_s2 * since_s**2
-            at = _looked_up(shift, column - at[..., 0], row - at[..., 1])
+        row, column = np.mgrid[slice(*rows.indices(height)), 0:width].astype(np.float32)
+        since_s, motion = np.float32(time_s), self._motion[rows]
+        for again in range(_ROUNDS + 1):
+            at = motion[..., :2] * since_s + motion[..., 2:] * since_s**2
+            if again < _ROUNDS:
+                if self.line_s.any():  # the source was seen at the time of its own line
+                    since_s = (time_s + at @ self.line_s).astype(np.float32)[..., None]
+                motion = _looked_up(self._motion, column - at[..., 0], row - at[..., 1])
         return column - at[..., 0], row - at[..., 1]
+
+    def reach(self, rows: slice) -> slice:
+        """Return the rows that the light of some rows comes from, with two more on either side."""
+        height, half_s = len(self.speed_px_s), self.exposure_s / 2
+        found = np.concatenate([self.sources(time_s, rows)[1] for time_s in (-half_s, 0.0, half_s)])
+        first, last = (int(np.clip(v, 0, height - 1)) for v in (found.min() - 2, found.max() + 2))
+        return slice(min(first, rows.start), max(last + 1, min(rows.stop, height)))
 
     def times_s(self, per_px: float) -> Sequence[float]:
         """Return times at the middles of equal parts of the exposure, so many for a pixel of motion."""
@@ -189,32 +203,44 @@ def _looked_up(array: F32, column: F32, row: F32) -> F32:
     return np.asarray(cv2.remap(array, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
 
-def _carried(light: Radiance, cells: F32, weights: F64, paths: Paths) -> F32:
+def _carried(light: Radiance, cells: NDArray[np.float16], white: float, weights: F64, paths: Paths) -> F32:
     """Return the light of a view carried along its paths, float32[band, y, x], without Sun and fine light.
 
-    `cells` float32[y·n, x·n] is the signal of n × n cells of each pixel, of light with `weights` of the bands. They
-    say how light varies, and the bands of whole pixels which colour it has.
+    `cells` float16[y·n, x·n] is the signal over `white` of n × n cells of each pixel, where `weights` are those of
+    the bands. They say how light varies, and the bands of whole pixels which colour it has.
     """
     array = _without_fine(light)
     height, width = array.shape[1:]
     side = cells.shape[0] // height
     signal = np.einsum("b,byx->yx", weights, array).astype(np.float32)
-    of_cells = cv2.resize(cells, (width, height), interpolation=cv2.INTER_AREA)
-    between_surfaces = np.repeat(np.repeat(signal - of_cells, side, axis=0), side, axis=1)
-    # The mean over a pixel whose upper left corner is at each cell. That samples count for all of their cell is a
-    # blur by a box of width h, which adds h²/24 times the second derivative.
-    fine = cv2.boxFilter(cells + between_surfaces, -1, (side, side), anchor=(0, 0), borderType=cv2.BORDER_REPLICATE)
-    if side > 1:
-        fine = np.maximum(fine - cv2.Laplacian(fine, -1, borderType=cv2.BORDER_REPLICATE) / 24, 0)
     times = paths.times_s(_STEPS_PER_PX)
     moved = np.zeros((height, width), np.float32)
-    for time_s in times:
-        column, row = paths.sources(time_s)
-        moved += _looked_up(fine, column * side, row * side)
+    for start in range(0, height, _STRIP_PX):
+        rows = slice(start, start + _STRIP_PX)
+        seen = paths.reach(rows)
+        fine = _of_pixels_at(cells[seen.start * side : seen.stop * side], white, signal[seen], side)
+        for time_s in times:
+            column, row = paths.sources(time_s, rows)
+            moved[rows] += _looked_up(fine, column * side, (row - np.float32(seen.start)) * side)
     moved /= len(times)
     *bands, total = _coloured(np.concatenate([array, signal[None]]), paths)
     factor = np.where(total > 0, moved / np.maximum(total, 1e-30), 1)
     return np.stack(bands) * factor
+
+
+def _of_pixels_at(cells: NDArray[np.float16], white: float, signal: F32, side: int) -> F32:
+    """Return the mean signal over a pixel whose upper left corner is at each cell, float32[y·n, x·n].
+
+    `signal` float32[y, x] is that of the pixels themselves. That samples count for all of their cell is a blur by a
+    box of width h, which adds h²/24 times the second derivative.
+    """
+    direct = cells.astype(np.float32) * np.float32(white)
+    between_surfaces = signal - cv2.resize(direct, signal.shape[::-1], interpolation=cv2.INTER_AREA)
+    direct += np.repeat(np.repeat(between_surfaces, side, axis=0), side, axis=1)
+    fine = cv2.boxFilter(direct, -1, (side, side), anchor=(0, 0), borderType=cv2.BORDER_REPLICATE)
+    if side > 1:
+        fine = np.maximum(fine - cv2.Laplacian(fine, -1, borderType=cv2.BORDER_REPLICATE) / 24, 0)
+    return np.asarray(fine)
 
 
 def _without_fine(light: Radiance) -> F32:

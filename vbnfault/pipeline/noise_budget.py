@@ -46,6 +46,8 @@ _WORTH = 1.2
 _DOWN = 0.25
 # Cells whose light is held at once; all of a frame would take 200 MB.
 _CELLS_AT_ONCE = 1 << 20
+# Least number of cells across a frame that OpenCV takes no more.
+_MOST_CELLS = 1 << 15
 # Rows of pixels whose samples are compared with their neighbours at a time, to bound memory.
 _STRIP = 64
 _ROWS = 1 << 15  # pixels whose squared ranges are summed at a time
@@ -59,7 +61,7 @@ class SampledRadiance:
     radiance: Radiance
     samples_per_pixel: float
     noise_fraction_p99: float = float("nan")
-    cells: F32 | None = None
+    cells: NDArray[np.float16] | None = None
     direct: F32 | None = None
 
 
@@ -133,7 +135,7 @@ def sample_to_noise(
         radiance=whole,  # its array is that which `refine` has changed
         samples_per_pixel=float(refined.used.mean()),
         noise_fraction_p99=float(np.percentile(np.where(shows, now, 0)[lit], 99)) if lit.any() else 0.0,
-        cells=None if scene.view.motion is None else refined.cells() / np.float32(exposure),
+        cells=None if scene.view.motion is None else refined.cells(),
         direct=None if scene.view.motion is None else light if indirect is None else light - indirect,
     )
 
@@ -167,7 +169,7 @@ class _Refined:
         self._sensor_e, self._sun = sensor_e, sampled.radiance.sun
         self._most = spec.scene.render.max_samples_per_pixel
         self._samples = samples = sampled.samples
-        self._of_cells = None if scene.view.motion is None else samples.astype(np.float32)
+        self._of_cells = None if scene.view.motion is None else samples[..., None]
         self._white_e = float(scene.sun.irradiance_W_m2_nm @ signal) / np.pi
         self._array, self._indirect = array, indirect
         self.variance = (sampled.error * (exposure_s / sensor_e)) ** 2
@@ -184,13 +186,16 @@ class _Refined:
         # what the later samples of a pixel leave of it
         self._left = np.ones_like(self._single)
 
-    def cells(self) -> F32:
-        """Return the signal of each cell of the pixels in electrons, float32[y·n, x·n], of direct light."""
+    def cells(self) -> NDArray[np.float16]:
+        """Return the signal of each cell of the pixels, as in `Rendering`, with quarters of the first cells."""
         assert self._of_cells is not None
         height, width = self.used.shape
-        side = round(self._of_cells.shape[1] ** 0.5)
-        of_pixels = (self._of_cells * np.float32(self._white_e)).reshape(height, width, side, side)
-        return np.ascontiguousarray(of_pixels.transpose(0, 2, 1, 3)).reshape(height * side, width * side)
+        side, parts = (round(n**0.5) for n in self._of_cells.shape[1:])
+        of_pixels = self._of_cells.reshape(height, width, side, side, parts, parts)
+        cells = of_pixels.transpose(0, 2, 4, 1, 3, 5).reshape(height * side * parts, width * side * parts)
+        while cells.shape[1] >= _MOST_CELLS:
+            cells = cells.reshape(len(cells) // 2, 2, -1, 2).mean(axis=(1, 3), dtype=np.float32).astype(np.float16)
+        return cells
 
     def _next(self, samples: int, use: int = 0) -> RenderInput:
         """Return the scene with a number of samples, and with random numbers that no earlier render had."""
@@ -247,6 +252,8 @@ class _Refined:
 
         count, cells = numbers.shape
         side = round(cells**0.5)
+        if self._of_cells is not None and self._rounds == 1:  # now with the quarters of each cell
+            self._of_cells = np.repeat(self._of_cells, 4, axis=2)
         total = np.zeros((len(self._array), count), dtype=np.float32)
         variance = np.zeros(count)
         for samples in np.unique(numbers).tolist():
@@ -254,11 +261,14 @@ class _Refined:
             for span in _spans(numbers == samples):
                 owner, cell = np.nonzero(numbers[span] == samples)
                 listed = render.Cells(pixel=pixels[span][owner], cell=cell.astype(np.uint32), side=side)
-                light, signal, error = render.direct_in_cells(self._surface, scene, self._signal, listed, samples)
+                light, signal, error = render.direct_in_cells(
+                    self._surface, scene, self._signal, listed, samples, quarters=self._of_cells is not None
+                )
                 for band, values in zip(total[:, span], light, strict=True):
                     band += np.bincount(owner, values, len(band))
                 if self._of_cells is not None:
-                    self._of_cells[listed.pixel, listed.cell] = signal / self._white_e
+                    self._of_cells[listed.pixel, listed.cell] = (signal / self._white_e).astype(np.float16)
+                    signal = signal.mean(axis=1)
                 variance[span] += self._variance(owner, listed, samples, signal, error, len(variance[span]))
         return total / cells, variance / cells**2
 

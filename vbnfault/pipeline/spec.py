@@ -228,8 +228,8 @@ class Rendering:
         99th percentile over the lit pixels of the sampling noise as a fraction of the sensor's noise. NaN if
         `render.noise_fraction` is not set.
     cells
-        float32[y·n, x·n]: signal of n × n cells of each pixel of the render, in electrons per s of direct light;
-        None unless the camera moves.
+        float16[y·n, x·n]: signal of n × n cells of each pixel of the render over that of a white, perpendicular
+        facet, of direct light; None unless the camera moves.
     direct
         float32[band, y, x]: sunlight reflected once and the Sun's disc, without a body of few pixels; None unless
         the camera moves.
@@ -249,7 +249,7 @@ class Rendering:
     open_sky: Mask | None
     samples_per_pixel: float
     noise_fraction_p99: float = float("nan")
-    cells: NDArray[np.float32] | None = None
+    cells: NDArray[np.float16] | None = None
     direct: NDArray[np.float32] | None = None
     shows_ground: bool = True
     surroundings: tuple[Radiance, ...] = ()

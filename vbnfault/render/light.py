@@ -361,6 +361,7 @@ def direct_in_cells(
     cells: Cells,
     samples: int,
     exposure_s: float = 0.0,
+    quarters: bool = False,
 ) -> tuple[F32, F32, F32]:
     """Return the mean radiance of sunlight reflected once in each cell, its signal, and an estimate of its error.
 
@@ -372,13 +373,15 @@ def direct_in_cells(
         Number of samples of each cell, a power of two.
     exposure_s
         Time over which the samples are spread, while the camera moves; 0: at the middle of the exposure.
+    quarters
+        Whether the signal is that of the quarters of each cell, as far as its samples tell them apart.
 
     Returns
     -------
     radiance
         float32[band, cell], without the Sun's disc itself.
     signal
-        float32[cell].
+        float32[cell]; of quarters float32[cell, 4]: the upper left one, the upper right one, and the lower two.
     error
         float32[cell]: half the signed difference between the mean signals of two halves of the cell's samples; 0 if
         there is one sample.
@@ -389,13 +392,15 @@ def direct_in_cells(
     count = len(cells.pixel)
     out = np.zeros((per_term.shape[1], count), dtype=np.float32)
     seen, halves = np.zeros(count, dtype=np.float32), np.zeros(count, dtype=np.float32)
+    sides = np.zeros((3 if quarters else 0, count), dtype=np.float32)
     factors = per_term.astype(np.float64) @ weights
     done = 0
     for part in cells.parts(max(1, WAVEFRONT // (samples * len(per_term)))):
         strata = CellStrata(part, samples, scene.key, limb, exposure_s)
         terms = tracer.terms(strata)
         total = tracer.signal(terms, factors)
-        terms = [*terms, total, total * strata.checkered()]
+        of_sides = [total * sign for sign in strata.sides()] if quarters else []
+        terms = [*terms, *of_sides, total, total * strata.checkered()]
         dr.eval(*terms)
         if samples > 1:
             terms = [dr.block_sum(term, samples) for term in terms]
@@ -407,8 +412,13 @@ def direct_in_cells(
             for band in np.flatnonzero(row):
                 out[band, span] += values * row[band]
         seen[span] = terms[-2].numpy()
+        for side, term in zip(sides, terms[-2 - len(sides) : -2], strict=True):
+            side[span] = term.numpy()
         if samples > 1:
             halves[span] = terms[-1].numpy()
+    if quarters:
+        signs = np.array([(1, x, y, x * y) for y in (-1, 1) for x in (-1, 1)], np.float32)
+        return out, np.concatenate([seen[None], sides]).T @ signs.T, halves
     return out, seen, halves
 
 
@@ -464,6 +474,17 @@ class CellStrata(Strata):
         key = self._key ^ (0x9E3779B9 * dimension & 0xFFFFFFFF) ^ (self.index * 0x85EBCA77)
         u, v = mi.sample_tea_32(self._number, key, 4)
         return mi.Float(u) * 2.0**-32, mi.Float(v) * 2.0**-32
+
+    def sides(self) -> tuple[Any, Any, Any]:
+        """Return -1 left and +1 right in the cell, -1 above and +1 below, and their product; 0 for one stratum."""
+        x = self._sign(self.index & self._last_across, self._last_across)
+        y = self._sign(self.index >> self._across, self._last >> self._across)
+        return x, y, x * y
+
+    @staticmethod
+    def _sign(stratum: Any, last: Any) -> Any:
+        """Return -1 in the first half of strata, +1 in the second, and 0 if there is only one."""
+        return dr.select(last > 0, mi.Float(dr.select(2 * stratum > last, 1, -1)), 0)
 
     def checkered(self) -> Any:
         """Return +1 and -1 as on a chessboard: two halves of the samples that each cover the cell."""
