@@ -369,6 +369,9 @@ class Session:
         else:
             terrain = self.model_terrain(site) if aims else self.terrain(site)
         flown = None if self.trajectory is None else self.trajectory.pose(index)
+        delay = 0
+        if flown is not None and self.scene.camera.exposure_s == "auto":
+            delay = min(self.scene.camera.metering_delay_frames, flown.frame)
         return SampleSpec(
             index=index,
             scene=self.dated_scene(index),
@@ -379,6 +382,7 @@ class Session:
             terrain_of=self.aimed_terrain if aims else None,
             before=partial(self._spec, index - 1) if flown is not None and flown.frame > 0 else None,
             after=None if self.trajectory is None else self.trajectory.after(index),
+            metered_on=partial(self._spec, index - delay) if delay else None,
         )
 
     def dated_scene(self, index: int) -> Scene:
@@ -432,7 +436,7 @@ class Session:
             `{"dust_on_optics": True, "straylight": {"veil_fraction": 0.01}}`, and all others are off. By default
             the plan chooses.
         exposure
-            In s; by default as the scene says.
+            In s; by default as the scene says, metered on this frame whatever `camera.metering_delay_frames`.
         sample
             Number of the sample, from 0 to below `dataset.samples`: the key of its noise and of what is drawn.
 
