@@ -79,6 +79,10 @@ READOUT: tuple[tuple[dict[str, dict[str, Any]], str, int, tuple[int, int, int]],
     ({"dust_on_optics": {"model": "defocused", "count": 0, "cover": 0.4}}, "physical67p", 10, WHOLE),
     ({"optics_degradation": {"filter_size_px": 17}}, "physical67p", 7, (768, 0, 256)),
     ({"optics_degradation": {"filter_size_px": 17, "unclipped": True}}, "physical67p", 7, (768, 0, 256)),
+    ({"register_upset": {"bit": 5}}, "navcam67p", 24, WHOLE),
+    ({"register_upset": {"bit": 4}}, "navcam67p", 24, WHOLE),
+    ({"register_upset": {"model": "window", "lines": "columns", "bit": 8}}, "navcam67p", 24, WHOLE),
+    ({"register_upset": {"model": "flip", "lines": "both"}}, "physical67p", 10, WHOLE),
 )
 FLOWN_TILE_PX = 256
 
