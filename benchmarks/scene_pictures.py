@@ -79,8 +79,12 @@ READOUT: tuple[tuple[dict[str, dict[str, Any]], str, int, tuple[int, int, int]],
     ({"dust_on_optics": {"model": "defocused", "count": 0, "cover": 0.4}}, "physical67p", 10, WHOLE),
     ({"optics_degradation": {"filter_size_px": 17}}, "physical67p", 7, (768, 0, 256)),
     ({"optics_degradation": {"filter_size_px": 17, "unclipped": True}}, "physical67p", 7, (768, 0, 256)),
+    ({"register_upset": {"bit": 5}}, "navcam67p", 24, WHOLE),
+    ({"register_upset": {"bit": 4}}, "navcam67p", 24, WHOLE),
+    ({"register_upset": {"model": "window", "lines": "columns", "bit": 8}}, "navcam67p", 24, WHOLE),
+    ({"register_upset": {"model": "flip", "lines": "both"}}, "physical67p", 10, WHOLE),
 )
-FLOWN_TILE_PX = 256
+FLOWN_TILE_PX, READOUT_TILE_PX = 256, 232  # the latter keeps the file below 250 kB
 
 
 def frames(scene: str, samples: tuple[int, ...], overrides: dict[str, Any] | None = None) -> list[Frame]:
@@ -197,7 +201,7 @@ def flown_readout() -> U8:
     """Draw faults of the readout and light from beside the field, each alone."""
     of, attempt = {key: unharmed(*key) for key in {(scene, sample) for _, scene, sample, _ in READOUT}}, count(1)
     tiles = [harmed(of[scene, sample], faults, part, next(attempt)) for faults, scene, sample, part in READOUT]
-    return spaced([tiles[k : k + 4] for k in range(0, len(tiles), 4)], FLOWN_TILE_PX)
+    return spaced([tiles[k : k + 4] for k in range(0, len(tiles), 4)], READOUT_TILE_PX)
 
 
 def strips(scene: str) -> U8:

@@ -287,7 +287,8 @@ _DIMENSIONLESS = """
     hot_pixel_fraction hurst
     individuals
     intermittency internal_transmittance_10mm iso iso_power joints k leak limb log10_scale max_samples_per_pixel
-    max_triangles max_tries max_views metering_level min_lit_fraction missing_codes n nadir nd neutral
+    max_triangles max_tries max_views metering_delay_frames metering_level min_lit_fraction missing_codes n nadir
+    nd neutral
     node_gains noise_fraction of_sunlight optical_depth ponds porosity_factor prnu prnu_column prnu_low prnu_row
     quantum_efficiency_peak random random_jet_strength random_jets reflectance relief rts_per_interaction
     rts_fraction rubble samples samples_per_pixel scarps seed sequences shadow_hiding_amplitude shadow_hiding_width

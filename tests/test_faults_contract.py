@@ -155,6 +155,7 @@ def test_orders() -> None:
         "banding",
         "adc",
         "broken_lines",
+        "register_upset",
         "transmission",
         "pixel_overwriting",
     ]

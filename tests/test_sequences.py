@@ -290,7 +290,9 @@ def test_readers_give_the_columns_of_sequences(scene: Path, tmp_path: Path) -> N
 def test_frames_of_a_loop_are_those_of_a_table(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In a scene with sequences, a call is one of its frames from another pose, and keeps its terrain."""
     table = columns()  # near the ground, where another pose alone would have a terrain of its own
-    session = vbnfault.Session(config.load_scene(scene, {"faults.persistence": {}, "plan.classes_per_sample": [3, 3]}))
+    session = vbnfault.Session(
+        config.load_scene(scene, {"faults.persistence": {}, "plan.classes_per_sample": [3, 3]})
+    )
     expected = [session.simulate(k) for k in range(3)]
     monkeypatch.setattr(session, "aimed_terrain", None)  # none is built for a call
     for k in (0, 2):

@@ -63,6 +63,7 @@ _LEFT_OUT_AT_DEFAULT = (
     "camera.stretch",
     "camera.exposure_max_towards_sun_s",
     "camera.exposure_stops",
+    "camera.metering_delay_frames",
     "dataset.variants_per_view",
     "event",
     "dataset.radiance_dtype",

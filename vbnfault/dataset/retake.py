@@ -69,7 +69,7 @@ _FIXED_OF_CAMERA = frozenset({"calibration", "fov_deg", "width_px", "height_px",
 # These may not differ either, where the camera of the store moved during its exposures.
 _FIXED_IN_MOTION = frozenset(
     {"exposure_s", "exposure_min_s", "exposure_max_s", "exposure_max_towards_sun_s", "exposure_stops"}
-    | {"metering_level", "metering_percentile", "readout_directions"}
+    | {"metering_level", "metering_percentile", "metering_delay_frames", "readout_directions"}
 )
 # Keys of the camera on which the renderer's aperture depends.
 _OPTICS = ("lens", "focus", "f_number", "pixel_pitch_um", "detector")
@@ -155,6 +155,11 @@ def _planned(
 ) -> build.BuildPlan:
     """Return what a retake builds. Raises InputError if store and scene do not belong together."""
     _check_radiance(opened)
+    if scene.camera.metering_delay_frames:
+        raise InputError(
+            f"{source}: camera.metering_delay_frames = {scene.camera.metering_delay_frames}: a retake meters each "
+            "frame itself; must be 0"
+        )
     repeats = _repeats(opened, scene, source)
     of_source = _of_source(opened)
     attributes: dict[str, Any] = {RETAKE: {"repeats": repeats, "source": of_source}}

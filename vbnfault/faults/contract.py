@@ -238,6 +238,10 @@ class Fault:
         """Return the pixels at which the fault acts, bool[y, x]; None if the class has no footprint."""
         return None
 
+    def moved(self, layer: NDArray[Any], params: Params) -> NDArray[Any]:
+        """Return a layer of the mosaic, [y, x], whose pixels the fault moves, as it does those of the image."""
+        return layer
+
     def soft(self, params: Params, context: FaultContext) -> NDArray[np.float32]:
         """Return how strongly the fault acts on each pixel, float32[y, x], in the unit of its `soft_layer`."""
         raise NotImplementedError(f"{self.fault}/{self.model} has no soft layer")

@@ -43,7 +43,7 @@ class PacketTransmission(Fault):
     fault = "transmission"
     model = "packets"
     default = True
-    after = "broken_lines"
+    after = "register_upset"
     step = "raw"
     per_exposure = True
     severity = Severity(key="lost_count", low=1, high=1000, width_power=2)

@@ -268,7 +268,7 @@ class Development:
             more = draw.fault.defects(draw.params, self.context_of(draw.fault, draws))
             if more is not None:
                 defects |= more
-        return defects
+        return moved(defects, draws, physical_order(draws))
 
     # --- effects ---------------------------------------------------------------------------------------------
 
@@ -330,6 +330,20 @@ class Development:
 def _altering(draws: Draws) -> list[str]:
     """Return the drawn faults that may alter the camera, in physical order."""
     return [name for name in physical_order(draws) if type(draws[name].fault).alter is not Fault.alter]
+
+
+def movers(draws: Draws, name: str) -> list[str]:
+    """Return the drawn faults that move what one of them did to pixels of the mosaic, in physical order."""
+    order = physical_order(draws)
+    behind = [] if draws[name].fault.step == "rgbi" else order[order.index(name) + 1 :]
+    return [other for other in behind if type(draws[other].fault).moved is not Fault.moved]
+
+
+def moved(layer: NDArray[Any], draws: Draws, names: Iterable[str]) -> NDArray[Any]:
+    """Return a layer, [y, x], after drawn faults that move its pixels."""
+    for name in names:
+        layer = draws[name].fault.moved(layer, draws[name].params)
+    return layer
 
 
 def informs(fault: Fault) -> bool:

@@ -32,13 +32,18 @@ _AT_45_DEG = ((0.0, 0.5**0.5, 0.5**0.5), (0.5**0.5, 0.0, 0.5**0.5))  # towards t
 _AT_ZERO_PHASE = ((0.0, 0.0, 1.0), (0.0, 0.0, 1.0))
 
 
-def meter(spec: SampleSpec, rendering: Rendering) -> SceneExposure:
-    """Set the exposure: fixed, or metered on the noise-free, fault-free frame. All twins share it."""
+def meter(spec: SampleSpec, rendering: Rendering, earlier_s: float | None = None) -> SceneExposure:
+    """Set the exposure: fixed, or metered on the noise-free, fault-free frame. All twins share it.
+
+    `earlier_s` is what the metering of an earlier frame gave: this frame takes it within its own limits.
+    """
     metered_s, rate = _metered_light(spec, rendering)
-    seconds, settings = metered_s * exposure_factor(spec), limited(spec.scene, rendering.scene).camera
+    seconds = (metered_s if earlier_s is None else earlier_s) * exposure_factor(spec)
+    settings = limited(spec.scene, rendering.scene).camera
     if settings.exposure_s == "auto":
         seconds = float(np.clip(seconds, settings.exposure_min_s, settings.exposure_max_s))
-    return SceneExposure(camera=replace(spec.camera, exposure_s=seconds), light=rendering.light, rate=rate)
+    camera = replace(spec.camera, exposure_s=seconds)
+    return SceneExposure(camera=camera, light=rendering.light, rate=rate, metered_s=metered_s)
 
 
 def _metered_light(spec: SampleSpec, rendering: Rendering) -> tuple[float, Electrons]:

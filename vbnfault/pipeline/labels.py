@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from ..core.quantities import soft_kind
 from ..faults import Fault
 from . import masks
+from .development import moved, movers
 from .spec import Injection, Labels, SampleSpec, mask_any_faults, stored_layers
 
 
@@ -29,15 +31,17 @@ def labels_of(
 ) -> Labels:
     """Return the labels of an image: `members` are the classes united in mask_any, `layers` the optional layers."""
     draws, development = injection.draws, injection.development
+    behind = {name: movers(draws, name) for name in draws}
     changed = {
         name: development.effect(draws, name, draw.fault.effect_level_dn)
         for name, draw in draws.items()
-        if draw.fault.effect_mask or masks.spreads(draw.fault, development.context)
+        if draw.fault.effect_mask or masks.spreads(draw.fault, development.context) or behind[name]
     }
     together = [name for name in members if name in draws]
     params = {name: draw.params for name, draw in draws.items()}
     soft = {fault.soft_layer: fault for fault in faults.values() if fault.soft_layer}
-    its_masks = masks.mask_layers(faults, params, development.context, changed)
+    moves = {name: partial(moved, draws=draws, names=names) for name, names in behind.items() if names}
+    its_masks = masks.mask_layers(faults, params, development.context, changed, moves)
     mask_any = masks.union(its_masks, faults, together)
     if together:
         mask_any |= development.joint_effect(draws, together)
@@ -56,4 +60,5 @@ def strength(fault: Fault, injection: Injection) -> NDArray[Any]:
     if draw is None:
         return np.full(development.context.shape, kind.neutral, dtype=kind.dtype)
     strength = fault.soft(draw.params, development.context_of(fault, injection.draws))
+    strength = moved(strength, injection.draws, movers(injection.draws, fault.fault))
     return np.asarray(strength).astype(kind.dtype)

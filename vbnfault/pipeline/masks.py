@@ -10,8 +10,9 @@ mask is the union of footprint and effect.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import lru_cache
+from types import MappingProxyType
 
 import cv2
 import numpy as np
@@ -72,11 +73,13 @@ def mask_layers(
     drawn: Mapping[str, Params],
     context: FaultContext,
     effects: Mapping[str, Mask],
+    moves: Mapping[str, Callable[[Mask], Mask]] = MappingProxyType({}),
 ) -> Mask:
     """Return the masks of all classes, bool[fault, y, x], in the order of `faults`.
 
     Classes that are not in `drawn` have empty masks. `effects` holds the effect masks, bool[y, x], of the classes
-    that need them.
+    that need them. `moves` are the movements of footprints by faults behind these classes; demosaicing may change
+    other neighbours there, so the effect is added.
     """
     if not drawn:
         return no_masks((len(faults), *context.shape))
@@ -85,7 +88,9 @@ def mask_layers(
         if name not in drawn:
             continue
         mask = effects[name] if fault.effect_mask else fault.footprint(drawn[name], context)
-        if mask is not None and spreads(fault, context):
+        if mask is not None and not fault.effect_mask and name in moves:
+            mask = moves[name](mask) | effects[name]
+        elif mask is not None and spreads(fault, context):
             mask = mask | effects[name]
         if mask is not None:
             out[k] = mask

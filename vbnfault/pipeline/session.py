@@ -381,6 +381,9 @@ class Session:
             terrain = self.aimed_terrain(flown)
         else:
             terrain = self.model_terrain(site) if scene.is_aimed else self.terrain(site)
+        delay = 0
+        if flown is not None and taken is None and scene.camera.exposure_s == "auto":
+            delay = min(scene.camera.metering_delay_frames, flown.frame)
         return SampleSpec(
             index=index,
             scene=_dated(scene, flown) if flown is not None else self.dated_scene(index),
@@ -391,6 +394,7 @@ class Session:
             terrain_of=self.aimed_terrain if scene.is_aimed else None,
             before=partial(self._spec, index - 1, switched) if flown is not None and flown.frame > 0 else None,
             after=table.after(index) if table is not None and taken is None else None,
+            metered_on=partial(self._spec, index - delay, switched) if delay else None,
         )
 
     def dated_scene(self, index: int) -> Scene:
@@ -447,7 +451,7 @@ class Session:
             `{"dust_on_optics": True, "straylight": {"veil_fraction": 0.01}}`, and all others are off. By default
             the plan chooses.
         exposure
-            In s; by default as the scene says.
+            In s; by default as the scene says, metered on this frame whatever `camera.metering_delay_frames`.
         sample
             Number of the sample, from 0 to below `dataset.samples`: the key of its noise and of what is drawn.
 

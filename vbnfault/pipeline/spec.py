@@ -112,6 +112,7 @@ class SampleSpec:
     as it is, and `terrain_of` makes the terrain of a pose. `taken_with` is a camera in place of the scene's.
     `before` returns the frame before in a sequence. With `is_before`, the sample is taken as the frame before
     another one, and without the faults that use one. `after` is the pose of the frame after, if there is one.
+    `metered_on` returns the earlier frame whose metering sets the exposure; None: the sample is metered itself.
     """
 
     index: int
@@ -125,6 +126,7 @@ class SampleSpec:
     before: Callable[[], SampleSpec] | None = None
     is_before: bool = False
     after: FlownPose | None = None
+    metered_on: Callable[[], SampleSpec] | None = None
 
     def at(self, pose: Pose) -> SampleSpec:
         """Return the specification with the terrain of a pose."""
@@ -262,12 +264,14 @@ class SceneExposure:
     """Hold the outcome of `meter`, to which `add_stars` adds the stars.
 
     `camera` has its exposure. `rate` are the electrons expected after one second of `light`; `Electrons.past_rims`
-    holds those of the Sun's disc.
+    holds those of the Sun's disc. `metered_s` is what the metering of the frame gives, before the factor of
+    `camera.exposure_stops` and whatever the camera exposes; None: nothing was metered.
     """
 
     camera: Camera
     light: SceneLight
     rate: Electrons
+    metered_s: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

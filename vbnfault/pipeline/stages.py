@@ -61,9 +61,12 @@ class SharedViews:
 
     A view belongs to the first of its samples. So its pose and its render depend on no other sample, and not on the
     order in which the samples are made.
+
+    `metered_s` holds what the metering of samples gave, by their numbers, for the later frames of their sequence.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, metered_s: dict[int, float] | None = None) -> None:
+        self.metered_s = {} if metered_s is None else metered_s
         self._first_sample = -1
         self._kept: dict[int, tuple[Pose, Rendering]] = {}
 
@@ -138,7 +141,7 @@ def simulate_stored_view(
     run
         Function that calls each stage.
     """
-    return _frame(_expose(spec, run, pose, rendering, views), views, run)
+    return _frame(_expose(spec, run, SharedViews(), pose, rendering, views), views, run)
 
 
 def _frame(view: _RenderedView, views: int, run: StageRunner) -> Frame:
@@ -158,34 +161,59 @@ def _take_view(
     pose, rendering = shared.take(spec, run, first_try)
     if not any(spec.faults[name].needs_sun for name in spec.commanded):
         pose = replace(pose, resolved=True)  # only another sample of the view needs the Sun
-    return _expose(spec.at(pose), run, pose, rendering, views, redrawn=True)
+    return _expose(spec.at(pose), run, shared, pose, rendering, views, redrawn=True)
 
 
 def _expose(
-    spec: SampleSpec, run: StageRunner, pose: Pose, rendering: Rendering, views: int, *, redrawn: bool = False
+    spec: SampleSpec,
+    run: StageRunner,
+    shared: SharedViews,
+    pose: Pose,
+    rendering: Rendering,
+    views: int,
+    *,
+    redrawn: bool = False,
 ) -> _RenderedView:
     """Run the stages from the exposure of a rendered view to its faults.
 
     `redrawn` says whether another view may take the place of this one.
     """
-    exposure = run(meter, spec, rendering)
+    exposure = run(meter, spec, rendering, _earlier_metering_s(spec, shared))
+    if exposure.metered_s is not None and spec.scene.camera.metering_delay_frames:
+        shared.metered_s[spec.index] = exposure.metered_s
     if rendering.scene.view.motion is not None:
         exposure = run(move, spec, rendering, exposure)
     starless = exposure.light.rendered if "scene_radiance" in spec.scene.dataset.layers else None
     exposure = run(add_stars, spec, pose, rendering, exposure)
     # a second copy of the light without stars takes 37 MB for 1024 pixels
     rendering = replace(rendering, light=exposure.light)
-    before = cache(partial(_frame_before, spec.before)) if spec.before and not spec.is_before else None
+    before = cache(partial(_frame_before, spec.before, shared)) if spec.before and not spec.is_before else None
     injection = run(inject_faults, spec, pose, rendering, exposure, views, redrawn=redrawn, before=before)
     return _RenderedView(
         spec=spec, pose=pose, rendering=rendering, starless=starless, exposure=exposure, injection=injection
     )
 
 
-def _frame_before(spec_of: Callable[[], SampleSpec]) -> FrameBefore:
+def _earlier_metering_s(spec: SampleSpec, shared: SharedViews) -> float | None:
+    """Return what the metering of the earlier frame gave that sets the exposure; None if the sample's own does.
+
+    A frame that this process has not metered is rendered anew, so that no order of the samples matters.
+    """
+    if spec.metered_on is None:
+        return None
+    earlier = spec.metered_on()
+    if earlier.index not in shared.metered_s:
+        pose, rendering = SharedViews().take(earlier, run_stage, 0)
+        metered_s = meter(earlier.at(pose), rendering).metered_s
+        assert metered_s is not None
+        shared.metered_s[earlier.index] = metered_s
+    return shared.metered_s[earlier.index]
+
+
+def _frame_before(spec_of: Callable[[], SampleSpec], shared: SharedViews) -> FrameBefore:
     """Return what the frame before left behind; it is made anew, so that no order of the samples matters."""
     spec = replace(spec_of(), is_before=True)
-    injection = _take_view(spec, run_stage, SharedViews(), views=1, first_try=0).injection
+    injection = _take_view(spec, run_stage, SharedViews(shared.metered_s), views=1, first_try=0).injection
     return injection.development.left_behind(injection.draws)
 
 

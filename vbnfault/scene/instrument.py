@@ -202,6 +202,13 @@ class CameraTable(Table):
     metering_percentile: float = Field(
         99.0, gt=0, le=100, description="percentile of the sunlit pixels that is brought to metering_level"
     )
+    metering_delay_frames: int = Field(
+        0,
+        ge=0,
+        le=10,
+        description="by how many frames of its sequence an exposure lags behind the frame that is metered for it; "
+        "0: each frame has its own",
+    )
     architectures: tuple[Architecture, ...] = Field(
         ARCHITECTURES,
         min_length=1,

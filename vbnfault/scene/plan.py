@@ -259,13 +259,17 @@ def _sequences(scene: Scene, samples: NDArray[np.int64]) -> tuple[NDArray[np.int
 
 
 def check_time(scene: Scene) -> None:
-    """Raise InputError if a scene has events without a sequence, or motion without poses."""
+    """Raise InputError if a scene has events or late metering without a sequence, or motion without poses."""
     if scene.motion is not None and scene.trajectory is None:
         raise InputError("motion: needs velocities and rates, which poses of [trajectory] have; leave it out")
     if scene.event and not scene.frames:
         raise InputError(
             f"event: {shown(scene.event[0].cause)} happens at a time of a sequence, and the scene has none; "
             "trajectory.file must name a table of poses with sequences"
+        )
+    if (delay := scene.camera.metering_delay_frames) and not scene.frames:
+        raise InputError(
+            f"camera.metering_delay_frames = {delay}: counts frames of a sequence, and there is none; must be 0"
         )
 
 
