@@ -5,9 +5,9 @@
 A camera 150 m above ground of 67P stands still, turns, flies sideways, or flies down. For each kind and length of
 motion, a line gives the error of the signal over the noise of the sensor (median with its sign, root mean square,
 median, 99th percentile and fraction below 0.3 of the lit pixels), the 99th percentile of the noise of sub-frames,
-the pixels that get new rays, and the time of the moved frame, from the render to its electrons, over that of a still
-one. With repeats, the mean of so many frames with samples of their own is compared, which leaves the error that more
-samples would not reduce.
+the pixels that get new rays, and the time of the moved frame, from the render to its electrons, over that of a
+still one. With repeats, the mean of so many frames with samples of their own is compared, which leaves the error
+that more samples would not reduce.
 """
 
 from __future__ import annotations
