@@ -5,6 +5,7 @@ from __future__ import annotations
 import builtins
 import contextlib
 import errno
+import functools
 import gc
 import io
 import logging
@@ -120,6 +121,15 @@ def one_render_thread() -> None:
     """The processes of xdist share the cores: each renders with one thread, where a test asks for no more."""
     if "PYTEST_XDIST_WORKER" in os.environ and "drjit" in sys.modules:
         sys.modules["drjit"].set_thread_count(1)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_command_line() -> None:
+    """Make the commands of Typer once a process, not at each of some thousand calls: that takes 20 ms."""
+    import typer.testing
+
+    cached = functools.cache(typer.main.get_command)
+    typer.main.get_command = typer.testing._get_command = cached
 
 
 @pytest.fixture(autouse=True)
