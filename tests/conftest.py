@@ -89,9 +89,10 @@ if "PYTEST_VERSION" in os.environ and "TMPDIR" not in os.environ and _has_room()
 if os.environ.pop("PYTHONDONTWRITEBYTECODE", None):
     sys.dont_write_bytecode = False
 
-# Threads of OpenMP keep a core busy as they wait for each other. Where three processes share two cores, PyTorch with
-# two threads takes eight times the processor time of one. The library reads this when it is loaded.
-os.environ.setdefault("OMP_NUM_THREADS", "1")
+# A thread of OpenMP or OpenBLAS that waits for another keeps a core busy. Where three processes share two cores, a
+# training takes eight times the processor time with two threads. The libraries read this when they are loaded.
+for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    os.environ.setdefault(_variable, "1")
 
 # Patches are cached for this run alone: the tests neither read nor fill the cache of the user. The processes of
 # xdist, and those that tests start, share the folder of the first process.
