@@ -5,6 +5,7 @@ from __future__ import annotations
 import builtins
 import contextlib
 import errno
+import functools
 import gc
 import io
 import logging
@@ -88,6 +89,11 @@ if "PYTEST_VERSION" in os.environ and "TMPDIR" not in os.environ and _has_room()
 if os.environ.pop("PYTHONDONTWRITEBYTECODE", None):
     sys.dont_write_bytecode = False
 
+# A thread of OpenMP or OpenBLAS that waits for another keeps a core busy. Where three processes share two cores, a
+# training takes eight times the processor time with two threads. The libraries read this when they are loaded.
+for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    os.environ.setdefault(_variable, "1")
+
 # Patches are cached for this run alone: the tests neither read nor fill the cache of the user. The processes of
 # xdist, and those that tests start, share the folder of the first process.
 if "VBNFAULT_TESTS_CACHE" not in os.environ:
@@ -120,6 +126,15 @@ def one_render_thread() -> None:
     """The processes of xdist share the cores: each renders with one thread, where a test asks for no more."""
     if "PYTEST_XDIST_WORKER" in os.environ and "drjit" in sys.modules:
         sys.modules["drjit"].set_thread_count(1)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_command_line() -> None:
+    """Make the commands of Typer once a process, not at each of some thousand calls: that takes 20 ms."""
+    import typer.testing
+
+    cached = functools.cache(typer.main.get_command)
+    typer.main.get_command = typer.testing._get_command = cached
 
 
 @pytest.fixture(autouse=True)

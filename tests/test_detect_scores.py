@@ -21,7 +21,7 @@ from vbnfault import navigation
 from vbnfault import store as st
 from vbnfault.core.errors import InputError, VbnfaultError
 from vbnfault.core.quantities import BODY
-from vbnfault.detect import Prediction
+from vbnfault.detect import Prediction, score_page
 from vbnfault.detect.artefacts import artefact_counts, artefact_figures
 from vbnfault.detect.figures import view_numbers
 from vbnfault.detect.navigation_scores import VARIANTS, candidate_pairs, frame_errors, pair_errors
@@ -278,10 +278,21 @@ class Known:
         return found
 
 
-def scored(labelled: Path, tmp_path: Path, change: Any = lambda masks, i: masks, **options: Any) -> dict[str, Any]:
+def figures(*given: Any, **options: Any) -> dict[str, Any]:
+    """Score without the pages, which take a second to draw."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(score_page, "write_pages", lambda *_: None)
+        return score(*given, ScoreOptions(**options))
+
+
+def scored(
+    labelled: Path, tmp_path: Path, change: Any = lambda masks, i: masks, *, pages: bool = False, **options: Any
+) -> dict[str, Any]:
     heads = options.pop("heads", {})
-    classes = options.pop("classes", FAULTS)
-    return score(Known(labelled, change, classes, **heads), labelled, tmp_path / "s", ScoreOptions(**options))
+    detector = Known(labelled, change, options.pop("classes", FAULTS), **heads)
+    if pages:
+        return score(detector, labelled, tmp_path / "s", ScoreOptions(**options))
+    return figures(detector, labelled, tmp_path / "s", **options)
 
 
 def value(figure: dict[str, Any]) -> Any:
@@ -310,7 +321,7 @@ def test_a_perfect_prediction_scores_one_everywhere(labelled: Path, tmp_path: Pa
 
 
 def test_an_empty_prediction_finds_nothing(labelled: Path, tmp_path: Path) -> None:
-    found = scored(labelled, tmp_path, lambda masks, i: 0 * masks)
+    found = scored(labelled, tmp_path, lambda masks, i: 0 * masks, pages=True)
     assert {value(found["mean"][name]) for name in ("iou", "recall", "f1", "par", "pamiou")} == {0.0}
     assert value(found["mean"]["precision"]) is None
     assert value(found["navigation"]["good_pixels_kept"]) == 1
@@ -323,7 +334,7 @@ def test_an_empty_prediction_finds_nothing(labelled: Path, tmp_path: Path) -> No
 def test_a_detector_is_scored_by_what_it_learned(labelled: Path, tmp_path: Path) -> None:
     detector, store = Known(labelled), st.open_store(labelled)
     detector.masks = "effect"  # type: ignore[attr-defined]
-    found = score(detector, labelled, tmp_path / "s", ScoreOptions(navigation=False))
+    found = figures(detector, labelled, tmp_path / "s", navigation=False)
     assert found["options"]["masks"] == "effect"
     both = [store.read_sample(i, ("mask", "mask_effect")).layers for i in range(8)]
     all_px, seen_px = (np.sum([one[name][:3].any(axis=0) for one in both]) for name in ("mask", "mask_effect"))
@@ -331,7 +342,7 @@ def test_a_detector_is_scored_by_what_it_learned(labelled: Path, tmp_path: Path)
     assert value(found["classes"][FAULTS[3]]["pixels"]["recall"]) == 1
     kept = 1 - (all_px - seen_px) / (8 * 48 * 56 - seen_px)
     assert value(found["navigation"]["good_pixels_kept"]) == pytest.approx(kept)
-    again = score(detector, labelled, tmp_path / "s", ScoreOptions(navigation=False, masks="footprint"))
+    again = figures(detector, labelled, tmp_path / "s", navigation=False, masks="footprint")
     assert value(again["mean"]["iou"]) == 1
 
 
@@ -412,7 +423,7 @@ def test_a_usable_fraction_is_compared_with_mask_any(labelled: Path, tmp_path: P
 
 
 def test_a_class_that_the_model_does_not_know_is_never_predicted(labelled: Path, tmp_path: Path) -> None:
-    found = scored(labelled, tmp_path, classes=FAULTS[:3], navigation=False)
+    found = scored(labelled, tmp_path, classes=FAULTS[:3], navigation=False, pages=True)
     assert [found["classes"][name]["predicted_by_model"] for name in FAULTS] == [True] * 3 + [False]
     assert value(found["classes"][FAULTS[3]]["pixels"]["iou"]) == 0
     assert value(found["mean"]["iou"]) == 0.75
@@ -423,7 +434,7 @@ def test_a_class_that_the_store_does_not_have_is_left_out(labelled: Path, tmp_pa
     def more(masks: np.ndarray, index: int) -> np.ndarray:
         return np.concatenate([np.ones_like(masks[:1]), masks])
 
-    found = scored(labelled, tmp_path, more, classes=("of_a_plug_in", *FAULTS), navigation=False)
+    found = scored(labelled, tmp_path, more, classes=("of_a_plug_in", *FAULTS), navigation=False, pages=True)
     assert value(found["mean"]["iou"]) == value(found["classes"][FAULTS[0]]["presence"]["roc_auc"]) == 1
     assert "does not have of_a_plug_in" in (tmp_path / "s/score.md").read_text()
 
@@ -434,11 +445,11 @@ def test_a_score_depends_neither_on_batches_nor_on_the_run(labelled: Path, tmp_p
 
     written = []
     for batch in (1, 1, 5):
-        scored(labelled, tmp_path, noisy, batch=batch)
+        scored(labelled, tmp_path, noisy, batch=batch, pages=True)
         written.append([(tmp_path / "s" / name).read_bytes() for name in ("score.json", "score.md", "score.html")])
     assert written[0] == written[1] == written[2]
     detector = Known(labelled)
-    score(detector, labelled, tmp_path / "s", ScoreOptions(batch=3, navigation=False))
+    figures(detector, labelled, tmp_path / "s", batch=3, navigation=False)
     assert max(detector.asked) == 3  # never more than a batch is held
 
 
@@ -571,17 +582,17 @@ def masks_of(labelled: Path, folder: Path, name: str = "{i}.png") -> Path:
 
 @pytest.mark.parametrize("name", ["{i}.png", "{i:06d}.png"])
 def test_a_folder_of_true_masks_scores_one(labelled: Path, tmp_path: Path, name: str) -> None:
-    found = score(masks_of(labelled, tmp_path / "masks", name), labelled, tmp_path / "s")
+    found = figures(masks_of(labelled, tmp_path / "masks", name), labelled, tmp_path / "s")
     assert value(found["mean"]["iou"]) == value(found["mean"]["pamiou"]) == 1
     assert found["name"] == "masks"
-    again = score(masks_of(labelled, tmp_path / "other", "{i:03d}.png"), labelled, tmp_path / "s")
+    again = figures(masks_of(labelled, tmp_path / "other", "{i:03d}.png"), labelled, tmp_path / "s")
     assert again["model"]["sha256"] == found["model"]["sha256"]  # of the masks, not of their names
 
 
 @pytest.mark.parametrize("masks", ["footprint", "effect"])
 def test_exported_masks_score_one(labelled: Path, tmp_path: Path, masks: str) -> None:
     export_store(labelled, tmp_path / "png", "png", progress=False)
-    found = score(tmp_path / "png", labelled, tmp_path / "s", ScoreOptions(split="all", masks=masks))
+    found = figures(tmp_path / "png", labelled, tmp_path / "s", split="all", masks=masks)
     assert value(found["mean"]["iou"]) == value(found["mean"]["pap"]) == 1
 
 
@@ -589,8 +600,8 @@ def test_a_grey_value_is_a_probability(labelled: Path, tmp_path: Path) -> None:
     folder = masks_of(labelled, tmp_path / "masks")
     for file in folder.glob("*/*.png"):
         assert cv2.imwrite(str(file), (cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) > 0).astype(np.uint8) * 127)
-    assert value(score(folder, labelled, tmp_path / "s")["mean"]["iou"]) == 0
-    assert value(score(folder, labelled, tmp_path / "s", ScoreOptions(calibrate=True))["mean"]["iou"]) == 1
+    assert value(figures(folder, labelled, tmp_path / "s")["mean"]["iou"]) == 0
+    assert value(figures(folder, labelled, tmp_path / "s", calibrate=True)["mean"]["iou"]) == 1
 
 
 def test_a_bad_folder_is_refused_in_one_sentence(labelled: Path, tmp_path: Path) -> None:
@@ -644,7 +655,7 @@ def test_the_command_writes_a_score(labelled: Path, tmp_path: Path, call: Any) -
 def test_a_trained_detector_is_scored(tmp_path: Path, call: Any) -> None:
     pytest.importorskip("torch", reason="PyTorch is not installed: pip install '.[torch]'")
     model, store = tmp_path / "detector", filled(tmp_path / "made.zarr", size=40).path
-    done = call("train", store, "--out", model, "--epochs", 1, "--crop-px", 32, "--batch-size", 2)
+    done = call("train", store, "--out", model, "--epochs", 1, "--crop-px", 32, "--batch-size", 2, "--no-onnx")
     assert done.code == 0, done.err
     done = call("score", model, store, "--no-navigation")
     assert done.code == 0, done.err

@@ -193,10 +193,10 @@ def test_a_finished_training_returns_at_once_and_another_one_is_refused(
 def test_a_network_learns_three_images_by_heart(tmp_path: Path) -> None:
     """One of them has a disc of 12 px in radius: whoever marks the whole of all has an IoU of 0.03.
 
-    Who is off by 2 px everywhere at the rim has (10 / 12)² = 0.69; nothing makes 40 steps exact to a pixel.
+    Who is off by 2 px everywhere at the rim has (10 / 12)² = 0.69; nothing makes 60 steps exact to a pixel.
     """
     store = st.open_store(made(tmp_path / "few.zarr", samples=3))  # all of the training split
-    options = TrainOptions(classes=("straylight",), epochs=40, batch_size=3, learning_rate=1e-2)
+    options = TrainOptions(classes=("straylight",), epochs=60, batch_size=3, learning_rate=1e-2)
     train([str(store.path)], tmp_path / "model", options)
     said = load_detector(tmp_path / "model").predict(store.read("image"))
     truth = store.read("mask_effect")[:, FAULTS.index("straylight")]

@@ -37,7 +37,12 @@ import reference  # noqa: E402
 
 NOTEBOOK = DOCS / "quickstart.ipynb"
 PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md")), NOTEBOOK]
-TERRAIN = {"patch.facet_m": 12.0, "patch.radius_m": 60.0, "patch.min_boulder_m": 6.0}
+TERRAIN = {
+    "patch.facet_m": 12.0,
+    "patch.radius_m": 60.0,
+    "patch.min_boulder_m": 6.0,
+    "patch.max_triangles": 100_000,
+}
 LONGEST_PX = 64
 SAMPLES_OF_PAGES = {
     "README.md": 4,

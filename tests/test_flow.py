@@ -99,7 +99,7 @@ def built(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
         spacecraft={"model": "default"},
         patch={"relief": 2.0},
     )
-    assert vbnfault.build(scene, folder / "s.zarr", progress=False, workers=2).built == sum(FRAMES)
+    assert vbnfault.build(scene, folder / "s.zarr", progress=False, workers=1).built == sum(FRAMES)
     assert vbnfault.verify(folder / "s.zarr").problems == []
     return folder / "s.zarr", scene
 

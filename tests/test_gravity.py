@@ -126,3 +126,18 @@ def test_centrifugal_term(bodies: dict[str, Body]) -> None:
     # omega² times the distance from the axis, outwards: (3, -4, 0)e-4; rounding of 1e-4 is 1e-20.
     np.testing.assert_allclose(effective - field.acceleration_m_s2, [[3e-4, -4e-4, 0.0]], rtol=0, atol=1e-18)
     assert field.potential_m2_s2[0] > 0
+
+
+def test_gravity_that_is_kept_of_a_shape_is_that_of_density_and_rotation() -> None:
+    """Twice the density attracts twice as much; without a rotation nothing else acts."""
+    sphere = trimesh.creation.icosphere(subdivisions=2, radius=100.0)
+    shape = {"name": "ball", "vertices_m": sphere.vertices, "faces": sphere.faces}
+    still, dense, turning = (
+        Body(**shape, density_kg_m3=density, rotation_period_s=period)
+        for density, period in ((1000.0, 1e12), (2000.0, 1e12), (1000.0, 3e4))
+    )
+    np.testing.assert_allclose(dense.places[1], 2 * still.places[1], rtol=1e-12)
+    outward = turning.places[1] - still.places[1]
+    wanted = (2 * np.pi / 3e4) ** 2 * still.places[0] * [1, 1, 0]
+    np.testing.assert_allclose(outward, wanted, atol=1e-12)  # of 3e-5 m/s² of gravity, to 1e-7 of it
+    assert Body(**shape, density_kg_m3=1000.0, rotation_period_s=1e12).places is still.places

@@ -331,6 +331,9 @@ def pixel_mm(lens: Prescription) -> float:
     return float(2 * paraxial_properties(lens).efl_mm * np.tan(np.radians(32.5)) / 1024)
 
 
+# The rim cuts some 4 n cells of a grid of n² rays. If each counts wholly or not at all, at random, they leave
+# √(4 n) / (√12 · n²) = 1.4e-4 of the light, far below the 0.01 that is asked for.
+ACROSS = 256
 WHOLE = "VBNFAULT_WHOLE_ORACLE"
 ALL_ANGLES = ("nikkor_28_f2p8", "tessar_50_f2p8")
 
@@ -344,7 +347,10 @@ def test_traced_ghosts_against_the_sequential_trace(name: str, sun_deg: float) -
     from vbnfault.lens.straylight.irradiance import traced_ghosts
 
     lens, wavelength = load_lens(name), WAVELENGTH_NM.get(name, D_NM)
-    traced = traced_ghosts(lens, sun_deg, azimuth_deg=AZIMUTH_DEG, bands=Bands.lines(wavelength))
+    # the wide ghost (10, 11) of this lens is off by 0.7 px with fewer rays than a flare has
+    across = None if name == "nikkor_28_f2p8" else ACROSS
+    bands = Bands.lines(wavelength)
+    traced = traced_ghosts(lens, sun_deg, azimuth_deg=AZIMUTH_DEG, bands=bands, across=across)
     ghosts = {g.pair: g for g in traced}
     far = {}
     for pair in PAIRS[name]:
@@ -412,7 +418,7 @@ def test_traced_ghosts_off_the_sensor() -> None:
     lens = load_lens("nikkor_28_f2p8_camera").coated("none")
     rows = len(lens.surfaces)
     pairs = ((rows - 5, rows - 4), (rows - 2, rows))
-    found = {g.pair: g for g in traced_ghosts(lens, 8.0, azimuth_deg=AZIMUTH_DEG)}
+    found = {g.pair: g for g in traced_ghosts(lens, 8.0, azimuth_deg=AZIMUTH_DEG, across=ACROSS)}
     assert {g.pair for g in paraxial_ghosts(lens, 8.0)} >= set(pairs)
     for pair in pairs:
         system = with_plane_at_sensor(lens) if pair[1] == rows else lens

@@ -33,7 +33,11 @@ _GRADIENT_NOISE_STD = 0.22  # `noise.gradient_noise`
 
 _PLACES = 400  # at which a body's gravity is sampled; one takes 5 ms on 20,000 facets
 
-_laws: dict[str, Roughness] = {}  # of the shapes that this process has measured, by their content
+Places = tuple[Float64, Float64, Float64]
+
+# what this process has measured of shapes, by their content, and by density and period
+_laws: dict[str, Roughness] = {}
+_places: dict[tuple[str, float, float], Places] = {}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -112,11 +116,18 @@ class Body:
         return 4 / 3 * np.pi * GRAVITATIONAL_CONSTANT * self.density_kg_m3 * radius
 
     @cached_property
-    def places(self) -> tuple[Float64, Float64, Float64]:
+    def places(self) -> Places:
         """Return some vertices spread over the body: positions float64[k, 3] in m, effective gravity float64[k, 3].
 
         The third array is their elevation, float64[k] in m: minus the effective potential over the mean gravity.
         """
+        key = self.content_hash, self.density_kg_m3, self.rotation_period_s
+        if key not in _places:
+            _places[key] = self._sampled()
+        return _places[key]
+
+    def _sampled(self) -> Places:
+        """Return `places`, which takes a second or two."""
         chosen = np.unique(np.linspace(0, len(self.vertices_m) - 1, _PLACES).astype(int))
         position = self.vertices_m[chosen]
         field = self.gravity.evaluate(position)

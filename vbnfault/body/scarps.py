@@ -39,6 +39,8 @@ _WANDER = ((1.2, 0.5), (0.6, 0.4), (0.3, 0.3))
 _STREAM = 800
 _NEAREST, _WIDTH = 8, 0.5  # model vertices that give a value, and width of their weights in mean edges
 
+_measured: dict[str, Float64] = {}  # `_at_vertices` of the last body of this process, by its content
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Form:
@@ -61,25 +63,13 @@ class Form:
 
 def form(body: Body, points_T_m: Float64) -> Form:
     """Return the form of the model around points of its surface, float64[n, 3] in T."""
-    vertices, faces = body.vertices_m, body.faces
-    edge = mean_edge_m(vertices, faces)
-    ground = vertices
-    for _ in range(2):
-        ground = smoothed(vertices, faces, ground, _GROUND_EDGES * edge)
-    up = vertex_normals(ground, faces)
-    off = vertices - smoothed(vertices, faces, vertices, _CREST_EDGES * edge)
-    crest = np.einsum("ni,ni->n", off, body.vertex_normals)
-    crest -= smoothed(vertices, faces, crest[:, None], _GROUND_EDGES * edge)[:, 0]  # the body itself is round
-    square = smoothed(vertices, faces, (crest**2)[:, None], _AROUND_EDGES * edge)[:, 0]
-    rough = np.sqrt(np.maximum(square, 0))
-    values = np.column_stack(
-        [
-            up,
-            crest / max(float(np.median(np.abs(crest))), 1e-9),
-            rough / max(float(np.sqrt(np.mean(rough**2))), 1e-9),
-        ]
-    )
-    distance, near = cKDTree(vertices).query(points_T_m, k=_NEAREST)
+    edge = mean_edge_m(body.vertices_m, body.faces)
+    values = _measured.get(body.content_hash)
+    if values is None:
+        values = _at_vertices(body, edge)
+        _measured.clear()
+        _measured[body.content_hash] = values
+    distance, near = cKDTree(body.vertices_m).query(points_T_m, k=_NEAREST)
     # measured from the nearest vertex, so that the weights never all vanish
     weight = np.exp(-0.5 * (distance**2 - distance[:, :1] ** 2) / (_WIDTH * edge) ** 2)
     weight /= weight.sum(axis=1)[:, None]
@@ -88,6 +78,27 @@ def form(body: Body, points_T_m: Float64) -> Form:
         mean += weight[:, k, None] * values[near[:, k]]
     length = np.sqrt(np.einsum("ni,ni->n", mean[:, :3], mean[:, :3]))
     return Form(up=mean[:, :3] / np.maximum(length, 1e-9)[:, None], crest=mean[:, 3], rough=mean[:, 4])
+
+
+def _at_vertices(body: Body, edge_m: float) -> Float64:
+    """Return `up`, `crest` and `rough` at the vertices of the model, float64[n, 5]."""
+    vertices, faces = body.vertices_m, body.faces
+    ground = vertices
+    for _ in range(2):
+        ground = smoothed(vertices, faces, ground, _GROUND_EDGES * edge_m)
+    up = vertex_normals(ground, faces)
+    off = vertices - smoothed(vertices, faces, vertices, _CREST_EDGES * edge_m)
+    crest = np.einsum("ni,ni->n", off, body.vertex_normals)
+    crest -= smoothed(vertices, faces, crest[:, None], _GROUND_EDGES * edge_m)[:, 0]  # the body itself is round
+    square = smoothed(vertices, faces, (crest**2)[:, None], _AROUND_EDGES * edge_m)[:, 0]
+    rough = np.sqrt(np.maximum(square, 0))
+    return np.column_stack(
+        [
+            up,
+            crest / max(float(np.median(np.abs(crest))), 1e-9),
+            rough / max(float(np.sqrt(np.mean(rough**2))), 1e-9),
+        ]
+    )
 
 
 def gathered(points: Float64, faces: Int32, where: Form, wander: Float64, edge_m: float) -> Float64:
