@@ -78,6 +78,34 @@ def test_cells_do_not_depend_on_other_cells() -> None:
         np.testing.assert_array_equal(got, of_all[..., some])
 
 
+@pytest.mark.parametrize(("samples", "columns", "rows"), [(1, 1, 1), (2, 2, 1), (8, 2, 2), (64, 2, 2)])
+def test_quarters_of_cells_are_cells_of_half_the_size(samples: int, columns: int, rows: int) -> None:
+    """Their mean is the signal, and where samples tell them apart, each is the light of a smaller cell."""
+    surface, a_scene = boxed()
+    pixels, keys, total = 16 * 16, 24, np.zeros((2, 16, 256, 4))
+    for key in range(keys):
+        keyed = dataclasses.replace(a_scene, key=0x51ED270B * (key + 1) & 0xFFFFFFFF)
+        _, whole, _ = render.direct_in_cells(surface, keyed, WEIGHTS, all_cells(pixels), samples)
+        _, quarters, _ = render.direct_in_cells(surface, keyed, WEIGHTS, all_cells(pixels), samples, quarters=True)
+        np.testing.assert_allclose(quarters.mean(axis=1), whole, rtol=1e-5, atol=1e-6)
+        _, small, _ = render.direct_in_cells(surface, keyed, WEIGHTS, all_cells(pixels, 8), 16)
+        quarters = quarters.reshape(pixels, 4, 4, 2, 2).transpose(0, 1, 3, 2, 4)  # pixel, row, half, column, half
+        small = small.reshape(pixels, 4, 2, 4, 2)
+        if rows == 1:
+            small = np.broadcast_to(small.mean(axis=2, keepdims=True), small.shape)
+        if columns == 1:
+            small = np.broadcast_to(small.mean(axis=4, keepdims=True), small.shape)
+        for k, of in enumerate((quarters, small)):
+            total[k] += of.reshape(pixels, 16, 4).transpose(1, 0, 2) / keys
+    # One sample of a cell that a shadow's edge crosses is off by half the light (1 σ), so the mean of all keys and of
+    # the samples in a quarter by this over √(24 · samples / 4). A hundred cells of 4,096 have edges: at most 3 σ.
+    light = total[1].max()
+    assert np.abs(total[0] - total[1]).max() < 3 * 0.5 * light / np.sqrt(keys * max(samples / 4, 1))
+    if rows > 1:
+        apart = total[1][..., 0] - total[1][..., 3]
+        assert np.corrcoef(apart.ravel(), (total[0][..., 0] - total[0][..., 3]).ravel())[0, 1] > 0.95
+
+
 def test_points_of_the_sun_are_as_dense_as_it_is_bright() -> None:
     """Radii against the closed form ∫ Σ A_k μ^k d(μ²), and one point in each ring of equal light."""
     coefficients = tuple(limb(2.99).limb_darkening[4].tolist())  # type: ignore[index]
