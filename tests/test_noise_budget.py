@@ -97,7 +97,7 @@ def test_quarters_of_cells_are_cells_of_half_the_size(samples: int, columns: int
             small = np.broadcast_to(small.mean(axis=4, keepdims=True), small.shape)
         for k, of in enumerate((quarters, small)):
             total[k] += of.reshape(pixels, 16, 4).transpose(1, 0, 2) / keys
-    # One sample of a cell that a shadow's edge crosses is off by half the light (1 σ), so the mean of all keys and of
+    # A sample of a cell that a shadow's edge crosses is off by half the light (1 σ), so the mean of all keys and of
     # the samples in a quarter by this over √(24 · samples / 4). A hundred cells of 4,096 have edges: at most 3 σ.
     light = total[1].max()
     assert np.abs(total[0] - total[1]).max() < 3 * 0.5 * light / np.sqrt(keys * max(samples / 4, 1))
