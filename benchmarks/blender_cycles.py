@@ -20,6 +20,7 @@ import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -65,6 +66,8 @@ class Cycles:
         As in `vbnfault.render.description`.
     bounces
         Number of diffuse bounces; 0 is direct light only.
+    poses
+        Position and L_from_C at the beginning and at the end of the exposure, for an image with motion blur.
     """
 
     def __init__(
@@ -83,6 +86,7 @@ class Cycles:
         sun_angular_radius_rad: float,
         threads: int,
         bounces: int = 0,
+        poses: Sequence[tuple[np.ndarray, np.ndarray]] = (),
     ) -> None:
         self._folder = tempfile.TemporaryDirectory()
         folder = Path(self._folder.name)
@@ -98,6 +102,7 @@ class Cycles:
             "sun_angle_rad": 2 * sun_angular_radius_rad,
             "threads": threads,
             "bounces": bounces,
+            "poses": [(position.tolist(), axes.tolist()) for position, axes in poses],
         }
         (folder / "scene.json").write_text(json.dumps(numbers))
         with (folder / "stderr.txt").open("w") as stderr:
@@ -185,13 +190,26 @@ def _set_up(folder: Path) -> Any:
     lens.sensor_fit, lens.angle = "HORIZONTAL", np.radians(numbers["fov_deg"])
     lens.clip_start, lens.clip_end = 0.1, 1e5
     camera = bpy.data.objects.new("camera", lens)
-    L_from_C = np.array(numbers["L_from_C"])
-    pose = np.eye(4)
-    pose[:3, :3] = L_from_C * [1, -1, -1]  # Blender's camera has y up and looks along -z
-    pose[:3, 3] = numbers["position"]
-    camera.matrix_world = Matrix(pose.tolist())
+    camera.rotation_mode = "QUATERNION"
     scene.collection.objects.link(camera)
     scene.camera = camera
+    given = numbers["poses"] or [(numbers["position"], numbers["L_from_C"])]
+    for position, axes in given:
+        pose = np.eye(4)
+        pose[:3, :3] = np.array(axes) * [1, -1, -1]  # Blender's camera has y up and looks along -z
+        pose[:3, 3] = position
+        camera.matrix_world = Matrix(pose.tolist())
+        if numbers["poses"]:  # the shutter is open from half a frame before to half a frame after the frame 1
+            for name in ("location", "rotation_quaternion"):
+                camera.keyframe_insert(name, frame=0.5 if position is given[0][0] else 1.5)
+    if numbers["poses"]:
+        for layer in camera.animation_data.action.layers:
+            for curve in layer.strips[0].channelbag(camera.animation_data.action_slot).fcurves:
+                for key in curve.keyframe_points:
+                    key.interpolation = "LINEAR"
+        scene.render.use_motion_blur, scene.render.motion_blur_shutter = True, 1.0
+        scene.render.motion_blur_position = "CENTER"
+        scene.frame_set(1)
 
     lamp = bpy.data.lights.new("sun", "SUN")
     lamp.angle, lamp.energy = numbers["sun_angle_rad"], 1.0

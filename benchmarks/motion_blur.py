@@ -1,6 +1,6 @@
 """Compare images of a camera in motion with the mean of brute-force sub-frames, and give the time of each.
 
-    python benchmarks/motion_blur.py [--size 128] [--sub-frames 256] [--repeats 1]
+    python benchmarks/motion_blur.py [--size 128] [--sub-frames 256] [--repeats 1] [--cycles]
 
 A camera 150 m above ground of 67P stands still, turns, flies sideways, or flies down. For each kind and length of
 motion, a line gives the error of the signal over the noise of the sensor (median with its sign, root mean square,
@@ -8,16 +8,22 @@ median, 99th percentile and fraction below 0.3 of the lit pixels), the 99th perc
 the pixels that get new rays, and the time of the moved frame, from the render to its electrons, over that of a
 still one. With repeats, the mean of so many frames with samples of their own is compared, which leaves the error
 that more samples would not reduce.
+
+With --cycles, Blender renders the same frames of smooth, Lambertian ground with as many samples per pixel (see
+`blender_cycles.py`), and a second line gives its time, and how far the two images differ.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+from blender_cycles import Cycles, interpreter
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -29,17 +35,19 @@ from vbnfault.pipeline.noise_budget import green_per_second
 from vbnfault.pipeline.rendering import render_view
 from vbnfault.pipeline.resolve import resolve
 from vbnfault.pipeline.spec import Pose, Rendering, SampleSpec, SceneExposure
+from vbnfault.render.description import View
 from vbnfault.scene.config import parse_scene
 from vbnfault.scene.trajectory import FlownPose
 
 F64 = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 HEIGHT_M, FIELD_DEG, EXPOSURE_S = 150.0, 30.0, 0.003
 SAMPLES = 256  # of a pixel in each sub-frame
 UP_T = np.array([0.2, -0.1, 1.0]) / np.linalg.norm([0.2, -0.1, 1.0])
 
 
-def specs_above_ground(size: int, noise_fraction: float, count: int) -> list[SampleSpec]:
+def session_above_ground(size: int, noise_fraction: float, count: int, **more: Any) -> vbnfault.Session:
     """Return samples of one view of a thin-lens camera that looks down, with the Sun 50° from the zenith."""
     camera = {"width_px": size, "height_px": size, "fov_deg": FIELD_DEG, "exposure_s": EXPOSURE_S}
     table = {
@@ -49,6 +57,7 @@ def specs_above_ground(size: int, noise_fraction: float, count: int) -> list[Sam
         "render": {"noise_fraction": noise_fraction, "bounces": 0},
         "motion": {},
         "dataset": {"samples": count, "shard_samples": count},
+        **more,
     }
     scene = parse_scene(table, source="motion")
     vertices_m = vbnfault.Session(scene).body.vertices_m
@@ -62,8 +71,7 @@ def specs_above_ground(size: int, noise_fraction: float, count: int) -> list[Sam
     )
     row = {"julian_date": 2457000.0, "sun_distance_au": 2.0, **dict(zip(names, values, strict=True))}
     poses = {"name": [str(k) for k in range(count)], **{name: [value] * count for name, value in row.items()}}
-    session = vbnfault.Session(scene, poses=poses)
-    return [session.spec(k) for k in range(count)]
+    return vbnfault.Session(scene, poses=poses)
 
 
 def motions(flown: FlownPose, width_px: int, lengths_px: list[float]) -> Iterator[tuple[str, FlownPose]]:
@@ -92,20 +100,50 @@ def exposed(spec: SampleSpec, pose: Pose) -> tuple[Rendering, SceneExposure, flo
     return rendered, exposure, seconds
 
 
+def pose_at(view: View, time_s: float) -> tuple[F64, F64]:
+    """Return position and axes of the camera at a time after the middle of the exposure."""
+    if view.motion is None:
+        return view.position_L_m, view.L_from_C
+    turn = Rotation.from_rotvec(view.motion.rate_C_rad_s * time_s).as_matrix()
+    return view.position_L_m + view.motion.velocity_L_m_s * time_s, view.L_from_C @ turn
+
+
+def beside_cycles(session: vbnfault.Session, rendered: Rendering, got: F64, noise: F64, lit: Mask) -> str:
+    """Return how long Blender takes for the same frame, and how far its image, scaled to ours, is from ours."""
+    patch, view = session.patch(session.spec(0).terrain.site, session.ground_detail(0)), rendered.scene.view
+    with Cycles(
+        interpreter(),
+        vertices_m=patch.vertices_L_m,
+        faces=patch.faces,
+        flat=patch.face_is_flat,
+        position_L_m=view.position_L_m,
+        L_from_C=view.L_from_C,
+        fov_deg=FIELD_DEG,
+        size_px=view.width_px,
+        samples_per_pixel=round(rendered.samples_per_pixel),
+        sun_direction_L=rendered.scene.sun.direction_L,
+        sun_angular_radius_rad=rendered.scene.sun.angular_radius_rad,
+        threads=os.cpu_count() or 1,
+        poses=[pose_at(view, t) for t in (-EXPOSURE_S / 2, EXPOSURE_S / 2)] if view.motion is not None else (),
+    ) as blender:
+        blender.render()
+        seconds, theirs = blender.render(), blender.picture()
+    theirs = theirs * (got[lit].sum() / theirs[lit].sum())
+    size = np.abs((theirs - got) / noise)[lit]
+    return (
+        f"Cycles: {seconds:.2f} s; images correlate by {np.corrcoef(theirs[lit], got[lit])[0, 1]:.5f}, differ by "
+        f"{np.median(size):.3f} (median) and {np.percentile(size, 99):.3f} (p99) of the sensor's noise"
+    )
+
+
 def brute_force(rendered: Rendering, spec: SampleSpec, count: int) -> tuple[F64, F64]:
     """Return the mean radiance of sub-frames with samples of their own, and of every second one."""
     middle = rendered.scene.view
     halves = np.zeros((2, *rendered.light.rendered.array.shape))
     for k in range(count):
         t = ((k + 0.5) / count - 0.5) * EXPOSURE_S
-        view = middle
-        if middle.motion is not None:
-            view = replace(
-                middle,
-                position_L_m=middle.position_L_m + middle.motion.velocity_L_m_s * t,
-                L_from_C=middle.L_from_C @ Rotation.from_rotvec(middle.motion.rate_C_rad_s * t).as_matrix(),
-                motion=None,
-            )
+        position_L_m, L_from_C = pose_at(middle, t)
+        view = replace(middle, position_L_m=position_L_m, L_from_C=L_from_C, motion=None)
         key = (rendered.scene.key + 7919 * (k + 1)) & 0xFFFFFFFF
         scene = replace(rendered.scene, view=view, key=key, samples_per_pixel=SAMPLES)
         halves[k % 2] += render.direct(spec.terrain.surface, scene).array
@@ -120,8 +158,17 @@ def main() -> None:
     parser.add_argument("--noise-fraction", type=float, default=0.3)
     parser.add_argument("--lengths", type=float, nargs="+", default=[1, 5, 20])
     parser.add_argument("--repeats", type=int, default=1)
+    parser.add_argument("--cycles", action="store_true")
     options = parser.parse_args()
-    specs = specs_above_ground(options.size, options.noise_fraction, options.repeats)
+    plain: dict[str, Any] = {
+        "body": {"reflectance": 0.06},
+        "patch": {"relief": 0.0},
+        "sun": {"limb_darkening": False},
+    }
+    session = session_above_ground(
+        options.size, options.noise_fraction, options.repeats, **plain if options.cycles else {}
+    )
+    specs = [session.spec(k) for k in range(options.repeats)]
     pose = resolve(specs[0])
     assert specs[0].flown is not None
     still, _, still_s = exposed(specs[0], pose)
@@ -150,6 +197,8 @@ def main() -> None:
             "still frame",
             flush=True,
         )
+        if options.cycles:
+            print(f"    ours: {seconds:.2f} s; " + beside_cycles(session, rendered, got, noise, lit), flush=True)
 
 
 if __name__ == "__main__":
