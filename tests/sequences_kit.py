@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from synthetic import fake_sample, make_spec
@@ -15,8 +17,13 @@ NAMES = ("approach", "still", "leave: night/day")
 STEP_S = 0.2
 
 
-def sequences(path: Path, *, size: int = 33, step_s: float = STEP_S, **changes: object) -> st.Store:
-    """A finished store of three sequences in the splits train, val and test; `size` + 8 columns."""
+def sequences(
+    path: Path, *, size: int = 33, step_s: float = STEP_S, drawn: Mapping[str, Any] | None = None, **changes: object
+) -> st.Store:
+    """A finished store of three sequences in the splits train, val and test; `size` + 8 columns.
+
+    `drawn` are the parameters of the faults that a frame has.
+    """
     spec = make_spec(size, **{"layers": ("clean", "mask_effect"), "sequence_names": NAMES, **changes})
     store = st.create(path, spec, sum(FRAMES))
     made = []
@@ -34,12 +41,14 @@ def sequences(path: Path, *, size: int = 33, step_s: float = STEP_S, **changes: 
             effect[0, 23] = False
             layers = {"image": image, "clean": image, "mask": mask, "mask_effect": effect}
             times = {"sequence": sequence, "frame": frame, "time_s": 5.0 + frame * step_s, "injected": injected}
+            has = dict(zip(spec.faults, injected.tolist(), strict=True))
             times |= {"velocity_T_m_s": np.zeros(3), "rate_C_rad_s": np.zeros(3)}
+            parameters = {name: one for name, one in (drawn or {}).items() if has[name]}
             made.append(
                 dataclasses.replace(
                     sample,
                     layers={name: layer for name, layer in layers.items() if name in (*spec.pixel_layers, "mask")},
-                    scalars={**sample.scalars, **times, "parameters": {}},
+                    scalars={**sample.scalars, **times, "parameters": parameters},
                 )
             )
     st.write_samples(store, made)

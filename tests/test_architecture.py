@@ -68,7 +68,7 @@ ONLY = {  # distribution → the packages or modules that import it
     "torchvision": {"detect.networks"},
     "onnxruntime": {"detect.model_files"},
     "typer": {"cli"},
-    "pyarrow": {"output.event_files", "output.export.formats.huggingface", "scene.trajectory", "study"},
+    "pyarrow": {"core.files.column_files", "output.event_files", "output.export.formats.huggingface", "study"},
     "SALib": {"study"},
     "sklearn": {"fit.two_samples"},
     "spiceypy": {"core.files.spice"},

@@ -10,15 +10,17 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from conftest import Called
-from frames_kit import EVENTS, FRAMES, NAMES, columns, write, write_scene
+from frames_kit import EVENTS, FRAMES, NAMES, SCENE, columns, write, write_scene
+from poses_kit import columns_of, row
 
 import vbnfault
 from vbnfault.core.errors import InputError
 from vbnfault.dataset import scene_identity
-from vbnfault.faults import registry
+from vbnfault.faults import dataset_order, registry
 from vbnfault.scene import config, plan
 from vbnfault.scene.events import commanded_now, events_of_sequence, striking
 
@@ -117,6 +119,66 @@ def test_an_event_brings_all_of_its_faults_and_takes_them_away(scene: Path, tmp_
             assert counts.planned(fault) == counts.realised(fault) == expected[:, c].sum()
     np.testing.assert_array_equal(changed, expected.any(axis=1))
     assert {one["dust_on_optics"]["event"]["cause"] for one in parameters if one} == {"dust event"}
+
+
+MODELS = {fault: list(models) for fault, models in registry().items()}
+SUN_BEHIND, SUN_AHEAD = (0.0, 1.0, 0.0), (0.0, -0.98, 0.199)  # and 17 degrees from the axis, beside the body
+
+
+@pytest.mark.parametrize("number", range(max(map(len, MODELS.values()))))
+def test_every_fault_changes_the_frames_of_its_event_and_no_other(tmp_path: Path, number: int) -> None:
+    """Four frames at 0, 1, 2 and 3 s, an event from 1 s to before 3 s: frames 1 and 2 differ from the clean ones.
+
+    Each class has a sequence of its own, and the model with this number. The Sun is behind the camera, and for
+    straylight in the frame, beside the body. What is left of the frame before, by `persistence` and `frozen_frame`, acts in frame 1
+    already: frame 0 is there, although it has no fault.
+    """
+    chosen = {fault: {"model": models[number]} for fault, models in MODELS.items() if len(models) > number}
+    if "pixel_overwriting" in chosen:
+        chosen["pixel_overwriting"]["texture_file"] = str(tmp_path / "texture.png")
+        assert cv2.imwrite(str(tmp_path / "texture.png"), np.full((8, 8, 4), 200, np.uint8))
+    if chosen.get("broken_pixels", {}).get("model") == "hot_pixels":
+        chosen["broken_pixels"]["dose_TeV_g"] = 10.0  # 1024 pixels of a young sensor may have no defect
+    keys = {
+        "faults": chosen,
+        "plan.classes_per_sample": [1, 1],
+        "camera.width_px": 40,
+        "camera.height_px": 40,
+        "patch.max_triangles": 20_000,
+        "dataset.shard_samples": 4,
+        "event": [
+            {"cause": f"cause of {fault}", "faults": [fault], "onset_s": 1.0, "duration_s": 2.0} for fault in chosen
+        ],
+    }
+    (tmp_path / "scene.toml").write_text(SCENE)
+    order, fault_of = dataset_order(chosen), [""] * len(chosen)
+    for _ in range(2):  # which sequence has which class does not depend on the Suns, but these on the classes
+        suns = [SUN_AHEAD if fault == "straylight" else SUN_BEHIND for fault in fault_of]
+        poses = [row(f"{k}/{t}", (0.0, 9e3 - t, 0.9e3), sun) for k, sun in enumerate(suns) for t in range(4)]
+        names, time_s = [f"s{k}" for k in range(len(suns))], [0.0, 1.0, 2.0, 3.0] * len(suns)
+        table = {**columns_of(poses), "sequence": np.repeat(names, 4).tolist(), "time_s": time_s}
+        write(tmp_path / "poses.csv", table)
+        scene = config.load_scene(tmp_path / "scene.toml", keys)
+        planned = vbnfault.Session(scene).plan.injected
+        fault_of = [order[k] for k in planned[::4].argmax(axis=1)]
+    out = tmp_path / "s.zarr"
+    vbnfault.build(scene, out, progress=False)
+    with vbnfault.open_dataset(out) as data:
+        changed = (data["image"].values != data["clean"].values).any(axis=(1, 2, 3)).reshape(-1, 4)
+        injected = data["injected"].values.reshape(-1, 4, len(chosen))
+    assert sorted(fault_of) == sorted(chosen)
+    during = [False, True, True, False]
+    for k, fault in enumerate(fault_of):
+        model = f"{fault}/{chosen[fault]['model']}"
+        assert changed[k].tolist() == during, model
+        assert injected[k].any(axis=1).tolist() == injected[k, :, order.index(fault)].tolist() == during, model
+    listed = [
+        (e.sequence, e.fault, e.cause, e.onset_s, e.end_s, e.first_frame, e.last_frame, e.frames)
+        for e in vbnfault.events(out)
+    ]
+    assert listed == [
+        (name, fault, f"cause of {fault}", 1.0, 3.0, 1, 2, 2) for name, fault in zip(names, fault_of, strict=True)
+    ]
 
 
 def test_a_store_tells_profiles_of_temperature_and_resets(scene: Path, tmp_path: Path) -> None:

@@ -94,7 +94,11 @@ def train(
 @app.command(rich_help_panel=_PANEL)
 def score(
     model: Annotated[
-        Path, typer.Argument(help="Folder of a detector, or of masks CLASS/SAMPLE.png of any other program.")
+        Path,
+        typer.Argument(
+            help="Folder of a detector, or of masks CLASS/SAMPLE.png of any other program; or a fault monitor's "
+            "log, a CSV or Parquet file."
+        ),
     ],
     dataset: Annotated[
         str,
@@ -128,7 +132,8 @@ def score(
     seed: Annotated[int, whole(0, MOST_SEED, "Seed of the bootstrap.")] = 0,
 ) -> None:
     """Compare a detector, or the masks of any other program, with the labels of a dataset: by pixel, artefact and
-    frame, and by what navigation gains. Writes score.json, score.md and score.html.
+    frame, and by what navigation gains; or a fault monitor's log by what it says when. Writes score.json, score.md
+    and score.html.
     """
     from ..detect.leaderboard import is_benchmark, score_benchmark
     from ..detect.scored_samples import ALL
@@ -177,6 +182,16 @@ def _advancing() -> Iterator[Callable[[int, int], None]]:
 
 def _say_means(result: Mapping[str, Any], where: str = "") -> None:
     """Print the means of a score."""
+    if "mean" not in result:
+        of_all, right = result["time"]["all"], result["time"]["reactions"]["right_fraction"]["value"]
+        for text, value in (
+            ("events missed", of_all["missed_fraction"]["value"]),
+            ("median delay in s", of_all["delay_s_median"]["value"]),
+            ("false alarms an hour", of_all["false_alarms_per_hour"]["value"]),
+            ("right reactions", right),
+        ):
+            typer.echo(f"{text}: {'none' if value is None else f'{value:.4g}'}")
+        return
     for key, text in (("iou", "mean IoU"), ("f1", "mean F1"), ("par", "mean PaR"), ("pap", "mean PaP")):
         figure = result["mean"][key]
         if figure["value"] is not None:

@@ -12,6 +12,7 @@ from ..core.errors import InputError
 from ..core.files import user_files
 from ..core.files.whole_files import write_json, writing
 from .benchmark import MANIFEST, read_manifest
+from .monitor_log import is_log
 from .prediction import Detector
 from .scored_samples import ALL, ScoreOptions
 from .scoring import score
@@ -41,6 +42,8 @@ def score_benchmark(
     InputError
         There is no test, or model or list cannot be used.
     """
+    if is_log(model):
+        raise InputError(f"{model}: a log is scored on one dataset with sequences, not on a benchmark")
     parts = {name: part for name, part in read_manifest(benchmark)["parts"].items() if part["purpose"] == "test"}
     if not parts:
         raise InputError(f"{benchmark / MANIFEST}: lists no dataset for a test; make them with vbnfault bench")

@@ -34,6 +34,7 @@ from ..dataset.card import markdown_table
 from ..output.contact_sheet import overlay
 from .figures import class_iou
 from .navigation_scores import VARIANTS
+from .time_scores import ANY
 
 if TYPE_CHECKING:
     from .scored_samples import Batch, Samples
@@ -77,6 +78,7 @@ def write_pages(folder: Path, result: Mapping[str, Any], samples: Samples, tally
         "false_alarms": _alarm_rows(result),
         "severity": _severity_rows(result),
         "time": (TIME, _time_rows(result["time"])),
+        "reactions": [],
         "kept": with_interval(navigation["good_pixels_kept"], percent=True),
         "let": with_interval(navigation["bad_pixels_let_through"], percent=True),
         "navigation": _navigation_rows(navigation),
@@ -84,10 +86,7 @@ def write_pages(folder: Path, result: Mapping[str, Any], samples: Samples, tally
         "reasons": _reasons(navigation),
     }
 
-    def as_table(head: list[str], rows: list[list[str]]) -> str:
-        return "\n".join(markdown_table([head, *rows]))
-
-    write_whole(own(folder / TABLE), rendered("detect/score.md", as_table=as_table, **shared))
+    write_whole(own(folder / TABLE), rendered("detect/score.md", as_table=_as_table, **shared))
     write_page(
         own(folder / PAGE),
         "detect/score.html",
@@ -102,7 +101,35 @@ def write_pages(folder: Path, result: Mapping[str, Any], samples: Samples, tally
     )
 
 
+def write_log_pages(folder: Path, result: Mapping[str, Any]) -> None:
+    """Write `score.md` and `score.html` of a fault monitor's log. Raises OSError if a file cannot be written."""
+    from .scoring import PAGE, TABLE
+
+    dataset, time = result["dataset"], result["time"]
+    facts = {
+        "Log": f"{result['model']['name']} ({result['model']['sha256'][:8]})",
+        "Dataset": f"{dataset['name']} ({dataset['sha256'][:8]})",
+        "Split": f"{result['options']['split']}, {result['samples']} frames of {time['sequences']} sequences",
+        "vbnfault": result["vbnfault"],
+    }
+    shared = {
+        "result": result,
+        "facts": facts,
+        "classes": [],
+        "time": (TIME, _time_rows(time)),
+        "reactions": _reaction_rows(time["reactions"]),
+        "right": with_interval(time["reactions"]["right_fraction"], percent=True),
+    }
+    write_whole(own(folder / TABLE), rendered("detect/score.md", as_table=_as_table, **shared))
+    write_page(own(folder / PAGE), "detect/score.html", **shared)
+
+
 # --- tables -------------------------------------------------------------------------------------------------------
+
+
+def _as_table(head: list[str], rows: list[list[str]]) -> str:
+    """Return a table as Markdown."""
+    return "\n".join(markdown_table([head, *rows]))
 
 
 def with_interval(figure: Mapping[str, Any], percent: bool = False) -> str:
@@ -206,8 +233,15 @@ def _time_rows(time: Mapping[str, Any] | None) -> list[list[str]]:
             with_interval(one["false_alarms_per_hour"]),
             with_interval(one["flicker"], percent=True),
         ]
-        for name, one in [*time["classes"].items(), ("all", time["all"])]
+        for name, one in {**time["classes"], **{key: time[key] for key in (ANY, "all") if key in time}}.items()
     ]
+
+
+def _reaction_rows(reactions: Mapping[str, Any]) -> list[list[str]]:
+    """Return how often each reaction was given, the head and a row for each right one."""
+    table = reactions["given"]
+    heads = ["right reaction", *(f"{name} given" for name in next(iter(table.values())))]
+    return [heads, *([right, *map(str, given.values())] for right, given in table.items())]
 
 
 def _navigation_rows(navigation: Mapping[str, Any]) -> list[list[str]]:

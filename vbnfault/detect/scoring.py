@@ -1,4 +1,4 @@
-"""Score a detector, or a folder of masks of any other program, against the labels of a store.
+"""Score a detector, a folder of masks of any other program, or a monitor's log, against the labels of a store.
 
 One pass over the samples counts, a batch at a time (`Tally`); all figures and intervals follow from the counts. The
 pages read the few samples again that they show.
@@ -26,6 +26,7 @@ from . import navigation_scores as nav
 from .artefacts import artefact_counts, artefact_labels, flares_of
 from .figures import json_result
 from .mask_folder import MODEL_FILE, MaskFolder
+from .monitor_log import is_log, log_result
 from .prediction import Detector
 from .scored_samples import ALL, EFFECT, FOOTPRINT, OfImages, Samples, ScoreOptions
 from .scores import BINS, HALF, best_threshold, histogram
@@ -81,7 +82,7 @@ def score(
     Parameters
     ----------
     model
-        Folder of a detector or of masks (`MaskFolder`), or an object that detects.
+        Folder of a detector or of masks (`MaskFolder`), an object that detects, or a monitor's log.
     dataset
         A store or its path.
     out
@@ -101,7 +102,7 @@ def score(
     VbnfaultError
         A sample is damaged, or a file cannot be written.
     """
-    from .score_page import write_pages  # matplotlib is loaded only for the pages
+    from .score_page import write_log_pages, write_pages  # matplotlib is loaded only for the pages
 
     options, store = options or ScoreOptions(), open_store(dataset)
     check_folder(out)
@@ -110,6 +111,20 @@ def score(
         raise InputError(f"{out}: is a {kind}, in which no other file may lie; choose another --out")
     if not store.spec.faults:
         raise InputError(f"{store.path}: it has no fault class, so there is nothing to detect")
+    head = {
+        "kind": "vbnfault score",
+        "version": 1,
+        "vbnfault": __version__,
+        "name": options.name or _name(model),
+    }
+    if is_log(model):
+        of_log = log_result(str(model), store, options)  # refuses a wrong log before the store is read
+        result = {**head, "dataset": _described(store), **of_log}
+        with writing(out, within=True):
+            out.mkdir(parents=True, exist_ok=True)
+            write_json(own(out / FILE), result)
+            write_log_pages(out, result)
+        return result
     samples = _samples(store, model, options, options.split)
     thresholds = np.full(len(store.spec.faults), HALF)
     steps = len(samples.indices)
@@ -122,10 +137,7 @@ def score(
     tally = _tally(samples, thresholds, lambda done: advance(begun + done, steps))
     pairs, reason = _pairs(samples, thresholds) if options.navigation else (None, "--no-navigation")
     result = {
-        "kind": "vbnfault score",
-        "version": 1,
-        "vbnfault": __version__,
-        "name": options.name or _name(model),
+        **head,
         "model": {
             "name": _name(model),
             "sha256": samples.predictor.sha256,

@@ -21,6 +21,7 @@ I64 = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
 _HOUR_S = 3600.0
+ANY = "any"  # stands for a fault whose class is not said
 
 
 class Frames(NamedTuple):
@@ -36,6 +37,10 @@ class Frames(NamedTuple):
         bool[n, class]: the class changes the pixels; it is told present.
     onset_s
         float64[n, class]: of the event that brings the class; -inf for none.
+    unnamed
+        bool[n]: a fault is told present, but not of which class.
+    order
+        int64[n]: numbers of the frames in the order in which they were given.
     """
 
     sequence: I64
@@ -43,6 +48,8 @@ class Frames(NamedTuple):
     injected: Flags
     said: Flags
     onset_s: F64
+    unnamed: Flags
+    order: I64
 
     @classmethod
     def of(
@@ -53,6 +60,7 @@ class Frames(NamedTuple):
         said: Flags,
         drawn: Sequence[Mapping[str, Any]],
         classes: tuple[str, ...],
+        unnamed: Flags | None = None,
     ) -> Frames:
         """Return frames that are given in any order, with their drawn parameters, in their order."""
         onset_s = np.full(injected.shape, -np.inf)
@@ -60,22 +68,36 @@ class Frames(NamedTuple):
             for c, name in enumerate(classes):
                 onset = event_of(faults, name).get("onset_s")
                 onset_s[i, c] = onset if isinstance(onset, int | float) else -np.inf
+        unnamed = np.zeros(len(sequence), bool) if unnamed is None else unnamed
         order = np.lexsort((time_s, sequence))
-        return cls(sequence[order], time_s[order], injected[order], said[order], onset_s[order])
+        columns: list[Any] = [sequence, time_s, injected, said, onset_s, unnamed, np.arange(len(sequence))]
+        return cls(*(column[order] for column in columns))
+
+    def events(self, c: int) -> list[tuple[int, int]]:
+        """Return the first and the last frame of each event of a class."""
+        there = np.flatnonzero(self.injected[:, c])
+        keys = np.column_stack([self.sequence[there].astype(np.float64), self.onset_s[there, c]])
+        spans = (there[(keys == key).all(axis=1)] for key in np.unique(keys, axis=0))
+        return [(int(mine[0]), int(mine[-1])) for mine in spans]
 
 
 def time_figures(frames: Frames, classes: tuple[str, ...], seed: int) -> dict[str, Any]:
     """Return the figures by class, and of all classes together, each with an interval over sequences."""
     bootstrap = Bootstrap(frames.sequence, seed)
-    counts = [_counts(frames, c) for c in range(len(classes))]
+    counts = {name: _counts(frames, c) for c, name in enumerate(classes)}
+    if frames.unnamed.any():
+        counts[ANY] = _unnamed_counts(frames)
     together = _Counts(
-        *(np.concatenate([getattr(one, name) for one in counts], axis=1) for name in _Counts._fields)
+        *(np.concatenate([getattr(one, name) for one in counts.values()], axis=1) for name in _Counts._fields)
     )
     hours = _hours(frames)
+    figures = {name: _figures(one, hours, bootstrap) for name, one in counts.items()}
+    unnamed = {ANY: figures.pop(ANY)} if ANY in figures else {}
     return {
         "sequences": bootstrap.views,
         "hours": float(hours.sum()),
-        "classes": {name: _figures(one, hours, bootstrap) for name, one in zip(classes, counts, strict=True)},
+        "classes": figures,
+        **unnamed,
         "all": _figures(together, hours, bootstrap),
     }
 
@@ -97,27 +119,40 @@ class _Counts(NamedTuple):
 
 
 def _counts(frames: Frames, c: int) -> _Counts:
-    """Return the counts of a class."""
-    sequence, injected, said = frames.sequence, frames.injected[:, c], frames.said[:, c]
-    events, missed, during = (np.zeros(len(sequence), bool) for _ in range(3))
-    delay_s = np.full(len(sequence), np.nan)
-    there = np.flatnonzero(injected)
-    keys = np.column_stack([sequence[there].astype(np.float64), frames.onset_s[there, c]])
-    for key in np.unique(keys, axis=0):
-        mine = there[(keys == key).all(axis=1)]
-        first, last = mine[0], mine[-1]
+    """Return the counts of a class, whose events are also seen where a fault is told without its class."""
+    events, missed, during = (np.zeros(len(frames.sequence), bool) for _ in range(3))
+    delay_s = np.full(len(frames.sequence), np.nan)
+    seen = frames.said[:, c] | frames.unnamed
+    for first, last in frames.events(c):
         events[first] = True
         during[first : last + 1] = True
-        told = np.flatnonzero(said[first : last + 1])
+        told = np.flatnonzero(seen[first : last + 1])
         missed[first] = not len(told)
         if len(told):
             delay_s[first] = frames.time_s[first + told[0]] - frames.time_s[first]
+    steady = _steadiness(frames.sequence, frames.injected[:, c], frames.said[:, c], during)
+    columns: list[Any] = [events, missed, delay_s, *steady]
+    return _Counts(*(column[:, None] for column in columns))
+
+
+def _unnamed_counts(frames: Frames) -> _Counts:
+    """Return the counts of what is told without a class: false outside of all events, which count elsewhere."""
+    none, during = np.zeros(len(frames.sequence), bool), np.zeros(len(frames.sequence), bool)
+    for c in range(frames.injected.shape[1]):
+        for first, last in frames.events(c):
+            during[first : last + 1] = True
+    steady = _steadiness(frames.sequence, np.any(frames.injected, axis=1), frames.unnamed, during)
+    columns: list[Any] = [none, none, np.full(len(none), np.nan), *steady]
+    return _Counts(*(column[:, None] for column in columns))
+
+
+def _steadiness(sequence: I64, injected: Any, said: Flags, during: Flags) -> tuple[Flags, Flags, Flags]:
+    """Return where false alarms begin, frames like the one before, and those of them in which `said` changes."""
     follows = np.diff(sequence, prepend=-1) == 0
     before = np.concatenate([[False], said[:-1]]) & follows
     false = said & ~during
     pairs = follows & (injected == np.concatenate([[False], injected[:-1]]))
-    columns = (events, missed, delay_s, false & ~before, pairs, pairs & (said != before))
-    return _Counts(*(column[:, None] for column in columns))
+    return false & ~before, pairs, pairs & (said != before)
 
 
 def _hours(frames: Frames) -> F64:

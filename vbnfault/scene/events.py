@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 else:
     Times = Annotated[float, Field(ge=-_LONGEST_S, le=_LONGEST_S)] | pair_within(-_LONGEST_S, _LONGEST_S)
     Spans = Annotated[float, Field(ge=_SHORTEST_S, le=_LONGEST_S)] | pair_within(_SHORTEST_S, _LONGEST_S)
+REACTIONS = ("isolate", "reset", "wait")  # of a fault monitor
 _PROFILES_WITH = {"rise_s": ("growing",), "period_s": ("intermittent", "thermal"), "reset_s": ("until_reset",)}
 
 
@@ -71,6 +72,14 @@ class EventTable(Table):
             reset_s, onset_s = float(np.min(self.reset_s)), float(np.max(self.onset_s))
             raise ValueError(f"reset_s = {reset_s:g}: must be later than onset_s, which is up to {onset_s:g}")
         return self
+
+    @property
+    def reaction(self) -> str:
+        """Return the right reaction: reset what a reset cures, wait for what passes, isolate what stays."""
+        if self.profile == "until_reset":
+            return "reset"
+        passes = self.profile in ("intermittent", "thermal") or self.duration_s is not None
+        return "wait" if passes else "isolate"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -163,6 +172,11 @@ def commanded_in_time(
         return injected
     rows = zip(injected.tolist(), state.tolist(), time_s, strict=True)
     return np.array([commanded_now(scene, faults, row, first, time) for row, first, time in rows])
+
+
+def right_reaction(tables: Sequence[EventTable], fault: str, cause: str) -> str:
+    """Return the right reaction to a fault that events of a cause bring; a fault of no event stays."""
+    return next((one.reaction for one in tables if one.cause == cause and fault in one.faults), "isolate")
 
 
 def first_classes(tables: Sequence[EventTable]) -> Mapping[str, tuple[str, ...]]:

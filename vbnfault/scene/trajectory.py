@@ -7,9 +7,6 @@ to C, so that a point p of the body lies at R(camera_from_T) · (p - camera_T_m)
 
 from __future__ import annotations
 
-import csv
-import io
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
@@ -22,7 +19,7 @@ from pydantic import Field, model_validator
 
 from ..core import tables
 from ..core.errors import InputError, shown, under_key
-from ..core.files import file_contents, user_files
+from ..core.files import column_files, file_contents
 from ..core.tables import Table
 from .flights import AnyFlight, frames_of
 from .motion import between_frames
@@ -32,7 +29,6 @@ if TYPE_CHECKING:
 
 F64 = NDArray[np.float64]
 
-TYPES = (".csv", ".parquet")
 # Numeric column → its allowed range. Quaternion and Sun may exceed 1 by rounding; their norms are checked below.
 _UNIT, _SUN = (-1.001, 1.001), ("sun_x_T", "sun_y_T", "sun_z_T")
 JULIAN_DATES = (1_000_000, 5_000_000)
@@ -289,9 +285,8 @@ def with_rows(scene: Scene, trajectory: Trajectory | None = None) -> Scene:
 @file_contents.cached_with_contents(maxsize=4)
 def load_trajectory(path: str) -> Trajectory:
     """Return the poses in a CSV or Parquet file. Raises InputError."""
-    data = user_files.read_input(path, "trajectory", types=TYPES)
-    columns = _csv_columns(data, path) if Path(path).suffix.lower() == ".csv" else _parquet_columns(data, path)
-    return _checked(columns, path)
+    texts = ("name", SEQUENCE_COLUMNS[0])
+    return _checked(column_files.read_columns(path, "trajectory", _check_names, texts), path)
 
 
 def as_trajectory(poses: Trajectory | str | Path | Mapping[str, Sequence[Any]] | Any) -> Trajectory:
@@ -387,60 +382,11 @@ def one_pose(
     return _checked({name: [value] for name, value in row.items()}, "pose")
 
 
-def _csv_columns(data: bytes, source: str) -> dict[str, list[Any]]:
-    """Return the columns of a CSV file, as texts. Raises InputError."""
-    try:
-        rows = [row for row in csv.reader(io.StringIO(data.decode("utf-8-sig"), newline=""), strict=True) if row]
-    except UnicodeDecodeError as error:
-        raise InputError(f"{source}: byte {error.start} is no UTF-8; a CSV file must be UTF-8 text") from None
-    except csv.Error as error:
-        raise InputError(f"{source}: is no CSV file: {error}") from None
-    header = [name.strip() for name in rows[0]] if rows else []
-    _check_names(header, source)
-    for number, row in enumerate(rows[1:], 1):
-        if len(row) != len(header):
-            raise InputError(
-                f"{source}: row {number} has {len(row)} values; must have {len(header)}, as the first line has"
-            )
-    return {name: [row[k].strip() for row in rows[1:]] for k, name in enumerate(header)}
-
-
-def _parquet_columns(data: bytes, source: str) -> dict[str, list[Any]]:
-    """Return the columns of a Parquet file. Raises InputError."""
-    import pyarrow
-    import pyarrow.parquet
-
-    try:
-        file = pyarrow.parquet.ParquetFile(io.BytesIO(data))
-        _check_names(file.schema_arrow.names, source)
-        if file.metadata.num_rows > _MOST_ROWS:  # before reading: a small file can hold a huge table
-            raise InputError(f"{source}: has {file.metadata.num_rows} rows; must have at most {_MOST_ROWS}")
-        _check_types(file.schema_arrow, source)
-        table = file.read()
-        return {name: table.column(name).to_pylist() for name in file.schema_arrow.names}
-    except (pyarrow.ArrowException, OSError, ValueError) as error:
-        raise InputError(f"{source}: is no Parquet file: {' '.join(str(error).split())[:200]}") from None
-
-
-def _check_types(schema: Any, source: str) -> None:
-    """Raise InputError for a column of a Parquet file whose values are neither numbers nor texts."""
-    from pyarrow import types
-
-    for column in schema:
-        kind = column.type.value_type if types.is_dictionary(column.type) else column.type
-        checks = (types.is_floating, types.is_integer, types.is_decimal, types.is_string, types.is_large_string)
-        if not any(check(kind) for check in checks):
-            wanted = "texts" if column.name in ("name", "sequence") else "numbers"
-            raise InputError(f"{source}: column {column.name} has the type {kind}; must hold {wanted}")
-
-
 def _check_names(names: Sequence[str], source: str) -> None:
     """Raise InputError unless each column of a table of poses is there once, and no other."""
     if names and not any(name in COLUMNS for name in names) and any(tables.is_number(name) for name in names):
         raise InputError(f"{source}: its first line is one of numbers; must name the columns: {', '.join(COLUMNS)}")
-    for name, times in Counter(names).items():
-        if times > 1:
-            raise InputError(f"{source}: column {shown(name)} stands twice; must stand once")
+    column_files.check_once(names, source)
     missing = [name for name in COLUMNS if name not in names]
     unknown = [name for name in names if name not in COLUMNS + SEQUENCE_COLUMNS + MOTION_COLUMNS]
     for columns in (_VELOCITY, _RATE):
@@ -550,23 +496,7 @@ def _names(column: Sequence[Any], source: str) -> tuple[str, ...]:
 
 def _numbers(column: Sequence[Any], name: str, source: str) -> F64:
     """Return a column as float64[n]. Raises InputError for a value that is no number, or out of its range."""
-    low, high = {**_NUMBERS, **_OPTIONAL}[name]
-    out = np.empty(len(column))
-    for row, value in enumerate(column):
-        try:
-            if isinstance(value, bool) or (isinstance(value, str) and "_" in value):
-                raise ValueError
-            out[row] = float(value)
-        except (TypeError, ValueError, OverflowError):
-            out[row] = np.nan
-    wrong = np.flatnonzero(~((out >= low) & (out <= high)))
-    if len(wrong):
-        value = column[int(wrong[0])]
-        raise InputError(
-            f"{source}: row {wrong[0] + 1}: {name} = {value if isinstance(value, float) else shown(value)}: must "
-            f"be a number from {low:.10g} to {high:.10g}"
-        )
-    return out
+    return column_files.numbers(column, name, {**_NUMBERS, **_OPTIONAL}[name], source)
 
 
 def _vectors(columns: Mapping[str, Sequence[Any]], names: Sequence[str], source: str) -> F64 | None:
