@@ -281,6 +281,32 @@ def moved_and_brute(spec: SampleSpec, count: int) -> tuple[Any, Any, Any]:
     return moved, total / count, rendered.light.rendered.array
 
 
+def test_the_disc_of_the_sun_turns_with_the_sky() -> None:
+    """Its trail has the light, the middle and the length of the mean of sub-frames."""
+    fov_deg, length_px = 12.0, 8.0
+    camera = {**SCENE["camera"], "fov_deg": fov_deg}
+    rate = np.array([0.0, length_px * np.radians(fov_deg) / PX / EXPOSURE_S, 0.0])
+    spec = spec_of({**SCENE, "camera": camera}, (0, 0, 0), rate)
+    assert spec.flown is not None
+    away = spec.flown.T_from_C @ np.diag([1.0, -1.0, -1.0])
+    sun = np.array([0.01, 0.02, 1.0])
+    flown = replace(spec.flown, T_from_C=away, sun_direction_T=sun / np.linalg.norm(sun), sun_distance_au=1.0)
+    moved, true, still = moved_and_brute(replace(spec, flown=flown), 64)
+    across = np.arange(PX)
+
+    def figures(image: Any) -> tuple[float, float, float]:
+        profile = image.sum(axis=(0, 1)) / image.sum()
+        middle = float(profile @ across)
+        return float(image.sum()), middle, float(profile @ (across - middle) ** 2)
+
+    light, middle, variance = figures(moved)
+    assert light == pytest.approx(figures(true)[0], rel=0.01)
+    assert middle == pytest.approx(figures(true)[1], abs=0.05)
+    # between pixels, light is interpolated, which adds f (1 - f) px² for fractions f of a pixel: at most 1/4
+    assert -0.02 < variance - figures(true)[2] < 1 / 4
+    assert variance - figures(still)[2] > 0.9 * length_px**2 / 12
+
+
 def test_air_and_light_between_surfaces_move_with_the_ground() -> None:
     """New rays at limb and border see sunlight once; what air adds there is carried, so no dark border appears."""
     air = {"optical_depth": 0.2, "scale_height_m": 40.0}

@@ -4,8 +4,7 @@ The view is rendered once, at the middle of each pixel's exposure, and its light
 of pixels, so that no interpolation blurs it. New rays, spread over the exposure, go only where ground appears or
 hides: at steps of the motion, and at the border of the frame.
 
-The light of every piece of ground stays that of mid-exposure, and so do the Sun's disc in view and a body of few
-pixels.
+The light of every piece of ground stays that of mid-exposure, and so does a body of few pixels.
 """
 
 from __future__ import annotations
@@ -79,9 +78,11 @@ def move(spec: SampleSpec, rendering: Rendering, exposure: SceneExposure) -> Sce
         _trace(spec, rendering.scene, appearing, moved, weights, seconds)
     if light.fine is not None:
         moved = light.fine.added_to(moved)
-    if light.sun is not None:
-        moved += light.sun
     radiance = light.with_array(moved)
+    if light.sun is not None:
+        beyond = replace(truth, depth_m=np.full_like(truth.depth_m, np.inf), semantic=np.zeros_like(truth.semantic))
+        sun = _coloured(light.sun, Paths.of(view, beyond, seconds), _STEPS_PER_PX)
+        radiance = replace(light.with_array(moved + sun), sun=sun, disc=None)  # the disc is no longer round
     lit = SceneLight(lens=exposure.light.lens, rendered=radiance)
     return replace(exposure, light=lit, rate=exposure.camera.expose(radiance, 1.0))
 
@@ -249,10 +250,10 @@ def _without_fine(light: Radiance) -> F32:
     return array if light.fine is None else light.fine.removed_from(array)
 
 
-def _coloured(planes: F32, paths: Paths) -> F32:
+def _coloured(planes: F32, paths: Paths, steps_per_px: float = 1.0) -> F32:
     """Return planes of whole pixels carried along their paths, float32[plane, y, x]."""
     out = np.zeros_like(planes)
-    times = paths.times_s(1.0)
+    times = paths.times_s(steps_per_px)
     for time_s in times:
         place = paths.sources(time_s)
         for plane, moved in zip(planes, out, strict=True):
