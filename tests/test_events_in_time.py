@@ -139,11 +139,14 @@ def test_every_fault_changes_the_frames_of_its_event_and_no_other(tmp_path: Path
         assert cv2.imwrite(str(tmp_path / "texture.png"), np.full((8, 8, 4), 200, np.uint8))
     if chosen.get("broken_pixels", {}).get("model") == "hot_pixels":
         chosen["broken_pixels"]["dose_TeV_g"] = 10.0  # 1024 pixels of a young sensor may have no defect
+    if "particles" in chosen:
+        chosen["particles"]["density_per_m3"] = 20.0  # so that each frame shows some
     keys = {
         "faults": chosen,
         "plan.classes_per_sample": [1, 1],
         "camera.width_px": 40,
         "camera.height_px": 40,
+        "camera.exposure_s": 0.04,  # so long that some pixels are full, as blooming needs
         "patch.max_triangles": 20_000,
         "dataset.shard_samples": 4,
         "event": [
