@@ -31,6 +31,26 @@ def scene(tmp_path: Path) -> Path:
 # --- tables -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("given", ["table", "flight"])
+def test_an_exposure_ends_before_the_next_frame(scene: Path, given: str) -> None:
+    """Frames are 0.4 s apart, those of other sequences nearer; a metered exposure takes at most as long."""
+    keys: dict[str, Any] = {"camera.exposure_s": "auto"}
+    if given == "table":
+        table = columns()
+        table["time_s"] = [0.0, 0.5, 0.9, 0.95, 1.0, 1.4, 2.0, 3.0, 4.0]
+        write(scene.parent / "poses.csv", table)
+    else:
+        flight = {"kind": "hover", "frames": 3, "period_s": 0.4, "height_m": 900.0}
+        keys["trajectory"] = {"flight": [flight, {**flight, "period_s": 0.8}]}
+    assert config.load_scene(scene, keys).camera.exposure_max_s == pytest.approx(0.4)
+    for changes in ({"camera.exposure_s": 0.5}, {**keys, "camera.exposure_min_s": 0.5}):
+        name = "min_s" if "camera.exposure_min_s" in changes else "s"
+        with pytest.raises(
+            InputError, match=rf"camera\.exposure_{name} = 0\.5: must be at most 0\.4, the shortest time"
+        ):
+            config.load_scene(scene, {**keys, **changes})
+
+
 def test_csv_parquet_and_columns_are_the_same_sequences(tmp_path: Path) -> None:
     import pyarrow
     import pyarrow.parquet

@@ -158,7 +158,7 @@ class Paths:
         """
         height, width = self.speed_px_s.shape[:2]
         row, column = np.mgrid[slice(*rows.indices(height)), 0:width].astype(np.float32)
-        since_s, motion = np.float32(time_s), self._motion[rows]
+        since_s, motion = np.full((1, 1, 1), time_s, np.float32), self._motion[rows]
         for again in range(_ROUNDS + 1):
             at = motion[..., :2] * since_s + motion[..., 2:] * since_s**2
             if again < _ROUNDS:

@@ -26,6 +26,7 @@ from .motion import between_frames
 
 if TYPE_CHECKING:
     from .config import Scene
+    from .instrument import CameraTable
 
 F64 = NDArray[np.float64]
 
@@ -183,6 +184,13 @@ class Trajectory:
         return velocity, rate
 
     @property
+    def shortest_step_s(self) -> float:
+        """Return the shortest time between two frames of a sequence; infinity without sequences."""
+        last = np.cumsum(self.frames, dtype=int)[:-1]
+        steps_s = np.delete(np.diff(self.time_s), last - 1) if self.frames else np.zeros(0)
+        return float(steps_s.min(initial=np.inf))
+
+    @property
     def boresight_T(self) -> F64:
         """Return the camera's boresight in T of every row, float64[row, 3], unit length."""
         w, x, y, z = self.camera_from_T.T
@@ -253,15 +261,16 @@ def with_rows(scene: Scene, trajectory: Trajectory | None = None) -> Scene:
     if trajectory is not None:
         scene = scene.model_copy(update={"trajectory": TrajectoryTable(file=_IN_PYTHON)})
         rows, frames, source = len(trajectory), trajectory.frames, trajectory.source
+        step_s = trajectory.shortest_step_s
     elif scene.trajectory is None:
         return scene
     elif scene.trajectory.file is None:
         frames, source = frames_of(scene.trajectory.flight), FLIGHTS
-        rows = sum(frames)
+        rows, step_s = sum(frames), min(flight.period_s for flight in scene.trajectory.flight)
     else:
         with under_key("trajectory.file"):
             table = load_trajectory(scene.trajectory.file).repeated(scene.dataset.variants_per_view)
-        rows, frames, source = len(table), table.frames, table.source
+        rows, frames, source, step_s = len(table), table.frames, table.source, table.shortest_step_s
     samples = rows
     if trajectory is None and "samples" in scene.dataset.model_fields_set:
         samples = scene.dataset.samples
@@ -279,7 +288,21 @@ def with_rows(scene: Scene, trajectory: Trajectory | None = None) -> Scene:
     assert scene.trajectory is not None
     flown = scene.trajectory.model_copy(update={"frames": frames})
     dataset = scene.dataset.model_copy(update={"samples": samples, "sites": sites})
-    return scene.model_copy(update={"trajectory": flown, "dataset": dataset})
+    camera = _within_step(scene.camera, step_s, source)
+    return scene.model_copy(update={"trajectory": flown, "dataset": dataset, "camera": camera})
+
+
+def _within_step(camera: CameraTable, step_s: float, source: str) -> CameraTable:
+    """Return a camera that exposes no longer than the shortest time between two frames. Raises InputError."""
+    name, least_s = "exposure_s", camera.exposure_s
+    if least_s == "auto":
+        name, least_s = "exposure_min_s", camera.exposure_min_s
+    if least_s > step_s:
+        raise InputError(
+            f"camera.{name} = {least_s:g}: must be at most {step_s:g}, the shortest time in s between two frames "
+            f"of {source}"
+        )
+    return camera.model_copy(update={"exposure_max_s": min(camera.exposure_max_s, step_s)})
 
 
 @file_contents.cached_with_contents(maxsize=4)
