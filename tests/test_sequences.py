@@ -203,7 +203,8 @@ def test_telegraph_pixels_blink_from_frame_to_frame(scene: Path, tmp_path: Path,
     sources = '[sources]\n"individual.rts_time_s" = "test"\n"individual.rts_per_interaction" = "test"'
     text = text.replace("rts_fraction = 1e-4", dwell).replace("[sources]", sources)
     (tmp_path / "cmos.toml").write_text(text)
-    keys: dict[str, Any] = {"camera.detector": str(tmp_path / "cmos.toml"), "dataset.layers": ["defects"]}
+    keys: dict[str, Any] = {"camera.detector": str(tmp_path / "cmos.toml"), "camera.exposure_s": 0.003}
+    keys["dataset.layers"] = ["defects"]
     if fault:
         keys["faults.broken_pixels"] = {"model": "hot_pixels", "dose_TeV_g": 10.0}
         keys["plan.classes_per_sample"] = [3, 3]
