@@ -254,7 +254,7 @@ def test_a_star_leaves_a_trail_of_its_length_and_light() -> None:
     # the pixels of a pinhole are wider by 1 / cos² away from the boresight: at most 1 + tan²(20°) along a row
     stretch = 1 + ((x + 0.5 - 128) / 128 * np.tan(np.radians(20.0))) ** 2
     measured = np.sqrt(12 * (variance(trail) - variance(still)))
-    assert measured == pytest.approx(length_px * stretch * px_rad * 128 / np.tan(np.radians(20.0)), abs=0.15)
+    assert measured == pytest.approx(length_px * stretch * px_rad * 128 / np.tan(np.radians(20.0)), abs=0.1)
 
 
 def moved_and_brute(spec: SampleSpec, count: int) -> tuple[Any, Any, Any]:
