@@ -27,6 +27,7 @@ from vbnfault.pipeline.resolve import resolve
 from vbnfault.pipeline.spec import SampleSpec
 from vbnfault.scene import config
 from vbnfault.scene.trajectory import as_trajectory
+from vbnfault.world.sky import SkyFrame
 
 RADIUS_M, DISTANCE_M, PX, FIELD_DEG = 100.0, 260.0, 64, 56.0
 PIXEL_RAD = np.radians(FIELD_DEG) / PX
@@ -255,6 +256,25 @@ def test_a_star_leaves_a_trail_of_its_length_and_light() -> None:
     stretch = 1 + ((x + 0.5 - 128) / 128 * np.tan(np.radians(20.0))) ** 2
     measured = np.sqrt(12 * (variance(trail) - variance(still)))
     assert measured == pytest.approx(length_px * stretch * px_rad * 128 / np.tan(np.radians(20.0)), abs=0.1)
+
+
+def test_a_rolling_shutter_sees_stars_at_the_time_of_their_line() -> None:
+    """Each star is where the camera of its own line sees it."""
+    line_s, rate = np.array([0.0, 2e-4]), np.array([0.3, -0.5, 0.2])
+    turn_per_px = line_s[:, None] * rate
+    focal_px, width = 300.0, 200
+    frame = SkyFrame(
+        J_from_C=np.eye(3), intrinsics=np.array([focal_px, focal_px, 100, 100]), width_px=width, height_px=width
+    )
+    slopes = np.random.default_rng(1).uniform(-0.3, 0.3, (50, 2))
+    stars = np.column_stack([slopes, np.ones(50)])
+    found, _, _ = replace(frame, turn_per_px=turn_per_px).positions_px(stars)
+    for star, (x, y) in zip(stars, found, strict=True):
+        axes = Rotation.from_rotvec(rate * line_s[1] * (y - width / 2)).as_matrix()
+        alone, _, _ = replace(frame, J_from_C=axes).positions_px(star[None])
+        np.testing.assert_allclose(alone[0], [x, y], atol=1e-3)
+    still, _, _ = frame.positions_px(stars)
+    assert np.abs(found - still).max() > 3
 
 
 def moved_and_brute(spec: SampleSpec, count: int) -> tuple[Any, Any, Any]:

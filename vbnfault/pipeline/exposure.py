@@ -172,8 +172,13 @@ def add_stars(spec: SampleSpec, pose: Pose, rendering: Rendering, exposure: Scen
         T_from_J = ephemeris.target_attitude(spec.scene, T_from_L @ pose.sun_L)
         J_from_C = T_from_J.T @ T_from_L @ pose.L_from_C
         starless = exposure.light.rendered
-        turned = [J_from_C @ turn for turn in _sky_turns(spec, rendering.scene.view, camera.exposure_s)]
-        stars = assemble.visible_stars(spec.scene, starless, camera, turned, open_sky, rendering.scene.view)
+        view = rendering.scene.view
+        rate_C_rad_s = _sky_rate_C_rad_s(spec, view)
+        turned = [J_from_C @ turn for turn in _sky_turns(rate_C_rad_s, view, camera.exposure_s)]
+        lines = None
+        if view.motion is not None and view.motion.line_s.any():
+            lines = view.motion.line_s[:, None] * rate_C_rad_s
+        stars = assemble.visible_stars(spec.scene, starless, camera, turned, open_sky, view, lines)
         if stars is None:
             return exposure.light, exposure.rate
         light = SceneLight(lens=exposure.light.lens, rendered=stars.added_to(starless))
@@ -184,19 +189,20 @@ def add_stars(spec: SampleSpec, pose: Pose, rendering: Rendering, exposure: Scen
     return replace(exposure, light=light, rate=rate)
 
 
-def _sky_turns(spec: SampleSpec, view: View, exposure_s: float) -> list[F64]:
-    """Return the camera's axes at times of an exposure, in those of its middle, float64[3, 3], against the stars.
-
-    The body turns about +z of T, and the camera over the body.
-    """
+def _sky_rate_C_rad_s(spec: SampleSpec, view: View) -> F64:
+    """Return how the camera turns against the stars, float64[3] in C; the body itself turns about +z of T."""
     if view.motion is None or spec.flown is None:
-        return [np.eye(3)]
+        return np.zeros(3)
     spin_T = np.array([0, 0, 2 * np.pi / spec.terrain.body.rotation_period_s])
-    rate_C = view.motion.rate_C_rad_s + spec.flown.T_from_C.T @ spin_T
-    px = float(np.linalg.norm(rate_C)) * exposure_s * max(view.intrinsics[:2])
+    return view.motion.rate_C_rad_s + spec.flown.T_from_C.T @ spin_T
+
+
+def _sky_turns(rate_C_rad_s: F64, view: View, exposure_s: float) -> list[F64]:
+    """Return the camera's axes at times of an exposure against the stars, float64[3, 3], in those of its middle."""
+    px = float(np.linalg.norm(rate_C_rad_s)) * exposure_s * max(view.intrinsics[:2])
     count = min(int(np.ceil(_STAR_STEPS_PER_PX * px)) + 1, _MOST_STAR_STEPS)
     times_s = ((np.arange(count) + 0.5) / count - 0.5) * exposure_s
-    return list(Rotation.from_rotvec(times_s[:, None] * rate_C).as_matrix())
+    return list(Rotation.from_rotvec(times_s[:, None] * rate_C_rad_s).as_matrix())
 
 
 def _rate_with(stars: StarRadiance, exposure: SceneExposure, starry: Radiance) -> Electrons:

@@ -310,6 +310,7 @@ def visible_stars(
     J_from_C: Sequence[F64],
     open_sky: NDArray[np.bool_],
     view: View | None = None,
+    turn_per_px: F64 | None = None,
 ) -> sky.StarRadiance | None:
     """Return the stars that the scene asks for and the exposure can show; None if there are none.
 
@@ -327,6 +328,8 @@ def visible_stars(
         Pixels that see neither a body nor the Sun, bool[y, x].
     view
         Grid of the radiance, if it is not the camera's frame.
+    turn_per_px
+        As in `sky.SkyFrame`.
 
     A lens with a point spread blurs the stars itself. For it they are drawn with `_STAR_SIGMA_PX`, whatever
     `sky.sigma_px` is.
@@ -348,6 +351,7 @@ def visible_stars(
                 width_px=grid.width_px,
                 height_px=grid.height_px,
                 projection=camera.lens.calibration,
+                turn_per_px=turn_per_px,
             ),
             wavelength_nm=radiance.wavelength_nm,
             sigma_px=sigma_px,

@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
+from scipy.spatial.transform import Rotation
 from scipy.special import ndtr
 
 from ..core import spectra
@@ -190,6 +191,10 @@ class StarRadiance:
         return radiance.with_array(array)
 
 
+# Each round reduces the error by the speed of the stars in px a line, which is far below 1.
+_ROLLING_ROUNDS = 3
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SkyFrame:
     """Describe the frame in which stars are drawn.
@@ -204,6 +209,9 @@ class SkyFrame:
         Size of the frame.
     projection
         Map between directions and pixels; None: the pinhole of the intrinsics.
+    turn_per_px
+        Of a rolling shutter: by which rotation vector in C the camera has turned over the sky when it exposes the
+        next column, and the next row, float64[2, 3]. `J_from_C` are the axes of the middle of the frame.
     """
 
     J_from_C: F64
@@ -211,6 +219,7 @@ class SkyFrame:
     width_px: int
     height_px: int
     projection: Projection | None = None
+    turn_per_px: F64 | None = None
 
     def positions_px(self, direction_J: F64) -> tuple[F64, F64, I64]:
         """Return the image positions float64[k, 2] and the cosines to the boresight of the directions ahead.
@@ -220,7 +229,14 @@ class SkyFrame:
         direction = direction_J @ np.asarray(self.J_from_C, dtype=np.float64)
         projection = self.projection or Pinhole(self.intrinsics)
         ahead = np.flatnonzero(direction[:, 2] > (1e-6 if self.projection is None else projection.least_z))
-        return projection.pixel_of(direction[ahead]), direction[:, 2], ahead
+        position = projection.pixel_of(direction[ahead])
+        if self.turn_per_px is not None:
+            middle = np.array([self.width_px, self.height_px]) / 2
+            for _ in range(_ROLLING_ROUNDS):
+                # stars far outside of the frame have no line of their own
+                lines = np.clip(position - middle, -2 * middle, 2 * middle) @ self.turn_per_px
+                position = projection.pixel_of(Rotation.from_rotvec(-lines).apply(direction[ahead]))
+        return position, direction[:, 2], ahead
 
 
 def star_radiance(
