@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -50,8 +50,6 @@ _LARGEST_FACET_M, _RADIUS_M = 1e6, (1.0, 1e8)
 _STEP = 2**0.5
 # A body of fewer pixels is rendered in a close-up, which shows facets of a pixel of the frame.
 _FEWEST_PX = 64
-# Positions of a path near the ground that are tested for being inside; one takes 5 ms on 36,000 facets.
-_MOST_TESTED = 2000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,6 +135,7 @@ def ground_of_sequence(scene: Scene, body: Body, poses: Sequence[FlownPose]) -> 
     return _affordable(scene, body, _around(scene, [_seen(scene, body, pose, model).thinned() for pose in chosen]))
 
 
+@lru_cache(maxsize=1)
 def shape_model(body: Body) -> TerrainMesh:
     """Return the shape model of a body for the renderer, in T."""
     from .. import render
@@ -299,24 +298,17 @@ def nearest_ground(body: Body, point_T_m: F64) -> tuple[float, int]:
 def first_inside(body: Body, path_T_m: F64) -> tuple[int, float] | None:
     """Return the first position of a path, float64[n, 3] in T, inside the shape model, and its depth in m, or None.
 
-    After a position outside, the next one is tested that is farther from it than its nearest ground. At most
-    `_MOST_TESTED` positions are tested, of those that the sphere about the body encloses.
+    Where the ray away from T's origin meets no ground, a position is outside.
     """
-    from scipy.spatial import KDTree
+    from .. import render
 
-    near = np.flatnonzero(np.linalg.norm(path_T_m, axis=1) <= body_radius_m(body))
-    if not len(near):
-        return None
-    path_T_m = path_T_m[near]
-    free_m = KDTree(body.vertices_m).query(path_T_m)[0] - _longest_edge_m(body)
-    index = 0
-    for _ in range(_MOST_TESTED):
+    distance_m = np.linalg.norm(path_T_m, axis=1, keepdims=True)
+    near = np.flatnonzero(distance_m <= body_radius_m(body))
+    outward = path_T_m[near] / np.maximum(distance_m[near], 1e-9)
+    covered = near[np.isfinite(render.first_hit_m(shape_model(body), path_T_m[near], outward))]
+    for index in covered.tolist():
         if encloses(body, path_T_m[index]):
-            return int(near[index]), nearest_ground(body, path_T_m[index])[0]
-        moved_m = np.linalg.norm(path_T_m[index + 1 :] - path_T_m[index], axis=1)
-        index += 1 + int(np.argmax(np.append(moved_m >= free_m[index], True)))
-        if index == len(path_T_m):
-            return None
+            return index, nearest_ground(body, path_T_m[index])[0]
     return None
 
 
