@@ -130,8 +130,8 @@ def test_every_fault_changes_the_frames_of_its_event_and_no_other(tmp_path: Path
     """Four frames at 0, 1, 2 and 3 s, an event from 1 s to before 3 s: frames 1 and 2 differ from the clean ones.
 
     Each class has a sequence of its own, and the model with this number. The Sun is behind the camera, and for
-    straylight in the frame, beside the body. What is left of the frame before, by `persistence` and `frozen_frame`, acts in frame 1
-    already: frame 0 is there, although it has no fault.
+    straylight in the frame, beside the body. `persistence` and `frozen_frame`, which show the frame before, act in
+    frame 1 already: frame 0 is there, although it has no fault.
     """
     chosen = {fault: {"model": models[number]} for fault, models in MODELS.items() if len(models) > number}
     if "pixel_overwriting" in chosen:
