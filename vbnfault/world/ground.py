@@ -304,6 +304,8 @@ def first_inside(body: Body, path_T_m: F64) -> tuple[int, float] | None:
 
     distance_m = np.linalg.norm(path_T_m, axis=1, keepdims=True)
     near = np.flatnonzero(distance_m <= body_radius_m(body))
+    if not len(near):
+        return None
     outward = path_T_m[near] / np.maximum(distance_m[near], 1e-9)
     covered = near[np.isfinite(render.first_hit_m(shape_model(body), path_T_m[near], outward))]
     for index in covered.tolist():
