@@ -47,14 +47,14 @@ SAMPLES = 256  # of a pixel in each sub-frame
 UP_T = np.array([0.2, -0.1, 1.0]) / np.linalg.norm([0.2, -0.1, 1.0])
 
 
-def session_above_ground(size: int, noise_fraction: float, count: int, **more: Any) -> vbnfault.Session:
-    """Return samples of one view of a thin-lens camera that looks down, with the Sun 50° from the zenith."""
+def session_above_ground(size: int, render: dict[str, Any], count: int, **more: Any) -> vbnfault.Session:
+    """Return a session of one view of a thin-lens camera that looks down, with the Sun 50° from the zenith."""
     camera = {"width_px": size, "height_px": size, "fov_deg": FIELD_DEG, "exposure_s": EXPOSURE_S}
     table = {
         "title": "motion",
         "camera": {**camera, "detector": "cmv4000"},
         "sun": {"limb_darkening": True},
-        "render": {"noise_fraction": noise_fraction, "bounces": 0},
+        "render": {"bounces": 0, **render},
         "motion": {},
         "dataset": {"samples": count, "shard_samples": count},
         **more,
@@ -156,6 +156,7 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=128)
     parser.add_argument("--sub-frames", type=int, default=256)
     parser.add_argument("--noise-fraction", type=float, default=0.3)
+    parser.add_argument("--max-samples", type=int, default=256)
     parser.add_argument("--lengths", type=float, nargs="+", default=[1, 5, 20])
     parser.add_argument("--repeats", type=int, default=1)
     parser.add_argument("--cycles", action="store_true")
@@ -165,9 +166,8 @@ def main() -> None:
         "patch": {"relief": 0.0},
         "sun": {"limb_darkening": False},
     }
-    session = session_above_ground(
-        options.size, options.noise_fraction, options.repeats, **plain if options.cycles else {}
-    )
+    limits = {"noise_fraction": options.noise_fraction, "max_samples_per_pixel": options.max_samples}
+    session = session_above_ground(options.size, limits, options.repeats, **plain if options.cycles else {})
     specs = [session.spec(k) for k in range(options.repeats)]
     pose = resolve(specs[0])
     assert specs[0].flown is not None

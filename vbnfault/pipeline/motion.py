@@ -187,7 +187,8 @@ class Paths:
         outside = np.zeros((height, width), bool)
         for sign in (-1, 1):
             x, y = column + sign * half[..., 0], row + sign * half[..., 1]
-            outside |= (x < 0) | (x > width) | (y < 0) | (y > height)
+            seen = 0.5 - _LEAST_PX  # from the border: a pixel nearer gets light from beyond it
+            outside |= (x < seen) | (x > width - seen) | (y < seen) | (y > height - seen)
         # on a slope, paths change evenly; at a step, they depart from the mean of those around
         step = np.hypot(*np.moveaxis(half - cv2.blur(half, (3, 3)), -1, 0))
         reach = 2 * min(int(np.ceil(self.length_px / 2)) + 1, _FARTHEST_PX) + 1
