@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import cv2
 import numpy as np
@@ -30,13 +30,14 @@ Mask = NDArray[np.bool_]
 _LEAST_PX = 0.02  # of motion that is seen
 _STEPS_PER_PX = 4.0  # of the light of cells; that of whole pixels, whose colours are taken, has one
 _MOST_STEPS = 1024
-_STRIP_PX = 64  # rows of pixels whose cells are carried at a time
+_FINE_PX = 5.0  # a longer path needs half as many steps for each further pixel
+_STRIP_PX = 128  # rows of pixels whose cells are carried at a time
 _ROUNDS = 2  # in which the place is found from which light comes
 # Pixels whose paths depart by more than this from those around, up to either end, may hide one another.
 _APART_PX, _APART_OF_LENGTH = 0.12, 0.02
 _FARTHEST_PX = 64  # from such a step, within which pixels get new rays
-# New rays over all pixels, and range of the samples of a pixel that gets some.
-_RAYS_PER_PX, _SAMPLES = 128, (16, 1024)
+# New rays over the samples of the whole view, their least number over its pixels, and range of those of a pixel.
+_NEW_RAYS, _LEAST_RAYS_PER_PX, _SAMPLES = 0.6, 32, (16, 1024)
 # Where the first and the last line are: direction in which pixels are exposed one after the other, x and y.
 _LATER = {"up": (0, 1), "down": (0, -1), "left": (1, 0), "right": (-1, 0)}
 
@@ -75,7 +76,8 @@ def move(spec: SampleSpec, rendering: Rendering, exposure: SceneExposure) -> Sce
         # light between surfaces, of a coma and of air is smooth: it is carried everywhere
         rest = _without_fine(light) - (rendering.direct if light.sun is None else rendering.direct - light.sun)
         moved[:, appearing] = _coloured(rest, paths)[:, appearing]
-        _trace(spec, rendering.scene, appearing, moved, weights, seconds)
+        wanted = max(_NEW_RAYS * rendering.samples_per_pixel, _LEAST_RAYS_PER_PX) / appearing.mean()
+        _trace(spec, rendering.scene, appearing, moved, weights, seconds, wanted)
     if light.fine is not None:
         moved = light.fine.added_to(moved)
     radiance = light.with_array(moved)
@@ -146,37 +148,33 @@ class Paths:
         longest = np.percentile(speed, 99.9), np.percentile(ground, 90) if len(ground) else 0.0
         return float(max(longest)) * self.exposure_s
 
-    @cached_property
-    def _motion(self) -> F32:
-        """Return speed and bend of each pixel, float32[y, x, 4]."""
-        return np.concatenate([self.speed_px_s, self.bend_px_s2], axis=-1)
+    def sources(self, time_s: float, rows: slice = slice(None)) -> F32:
+        """Return column and row, float32[y, x, 2] from the middle of the first pixel of some rows, of the light.
 
-    def sources(self, time_s: float, rows: slice = slice(None)) -> tuple[F32, F32]:
-        """Return column and row, float32[y, x] from the middle of the first pixel, of the light at a time.
-
-        It is the light that each pixel of some rows gets `time_s` after the middle of its exposure.
+        It is the light that each pixel of these rows gets `time_s` after the middle of its exposure, as if ground
+        beyond the rows moved as that at their border.
         """
-        height, width = self.speed_px_s.shape[:2]
-        row, column = np.mgrid[slice(*rows.indices(height)), 0:width].astype(np.float32)
-        since_s, motion = np.full((1, 1, 1), time_s, np.float32), self._motion[rows]
-        for again in range(_ROUNDS + 1):
-            at = motion[..., :2] * since_s + motion[..., 2:] * since_s**2
-            if again < _ROUNDS:
-                if self.line_s.any():  # the source was seen at the time of its own line
-                    since_s = (time_s + at @ self.line_s).astype(np.float32)[..., None]
-                motion = _looked_up(self._motion, column - at[..., 0], row - at[..., 1])
-        return column - at[..., 0], row - at[..., 1]
+        speed, bend = self.speed_px_s[rows], self.bend_px_s2[rows]
+        here = _places(*speed.shape[:2])
+        at = shift = cv2.addWeighted(speed, time_s, bend, time_s**2, 0)
+        for _ in range(_ROUNDS):
+            if self.line_s.any():  # the source was seen at the time of its own line
+                since_s = (time_s + at @ self.line_s).astype(np.float32)[..., None]
+                shift = speed * since_s + bend * since_s**2
+            at = _looked_up(shift, here - at)
+        return here - at
 
     def reach(self, rows: slice) -> slice:
-        """Return the rows that the light of some rows comes from, with two more on either side."""
+        """Return the rows that the light of some rows comes from, and some more."""
         height, half_s = len(self.speed_px_s), self.exposure_s / 2
-        found = np.concatenate([self.sources(time_s, rows)[1] for time_s in (-half_s, 0.0, half_s)])
-        first, last = (int(np.clip(v, 0, height - 1)) for v in (found.min() - 2, found.max() + 2))
-        return slice(min(first, rows.start), max(last + 1, min(rows.stop, height)))
+        speed, bend = np.abs(self.speed_px_s[rows, :, 1]).max(), np.abs(self.bend_px_s2[rows, :, 1]).max()
+        most = int(1.2 * (speed * half_s + bend * half_s**2)) + 3
+        return slice(max(rows.start - most, 0), min(rows.stop + most, height))
 
     def times_s(self, per_px: float) -> Sequence[float]:
         """Return times at the middles of equal parts of the exposure, so many for a pixel of motion."""
-        count = min(int(np.ceil(per_px * self.length_px)) + 1, _MOST_STEPS)
+        length_px = min(self.length_px, _FINE_PX + (self.length_px - _FINE_PX) / 2)
+        count = min(int(np.ceil(per_px * length_px)) + 1, _MOST_STEPS)
         return (((np.arange(count) + 0.5) / count - 0.5) * self.exposure_s).tolist()
 
     def appearing(self, truth: Truth) -> Mask:
@@ -200,9 +198,16 @@ class Paths:
         ) & ~vehicle
 
 
-def _looked_up(array: F32, column: F32, row: F32) -> F32:
-    """Return values between pixels, float32[y, x] or [y, x, k]; those at the border go on beyond it."""
-    return np.asarray(cv2.remap(array, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+@lru_cache(maxsize=2)
+def _places(height: int, width: int) -> F32:
+    """Return column and row of each pixel, float32[y, x, 2]."""
+    row, column = np.mgrid[0:height, 0:width].astype(np.float32)
+    return np.stack([column, row], axis=-1)
+
+
+def _looked_up(array: F32, place: F32) -> F32:
+    """Return values at columns and rows, float32[y, x, 2]; those at the border go on beyond it."""
+    return np.asarray(cv2.remap(array, place, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
 
 def _carried(light: Radiance, cells: NDArray[np.float16], white: float, weights: F64, paths: Paths) -> F32:
@@ -221,9 +226,9 @@ def _carried(light: Radiance, cells: NDArray[np.float16], white: float, weights:
         rows = slice(start, start + _STRIP_PX)
         seen = paths.reach(rows)
         fine = _of_pixels_at(cells[seen.start * side : seen.stop * side], white, signal[seen], side)
+        inner = slice(start - seen.start, start - seen.start + len(moved[rows]))
         for time_s in times:
-            column, row = paths.sources(time_s, rows)
-            moved[rows] += _looked_up(fine, column * side, (row - np.float32(seen.start)) * side)
+            moved[rows] += _looked_up(fine, paths.sources(time_s, seen)[inner] * side)
     moved /= len(times)
     *bands, total = _coloured(np.concatenate([array, signal[None]]), paths)
     factor = np.where(total > 0, moved / np.maximum(total, 1e-30), 1)
@@ -258,17 +263,18 @@ def _coloured(planes: F32, paths: Paths, steps_per_px: float = 1.0) -> F32:
     for time_s in times:
         place = paths.sources(time_s)
         for plane, moved in zip(planes, out, strict=True):
-            moved += _looked_up(plane, *place)
+            moved += _looked_up(plane, place)
     return np.asarray(out / np.float32(len(times)))
 
 
-def _trace(spec: SampleSpec, scene: RenderInput, where: Mask, moved: F32, weights: F64, exposure_s: float) -> None:
+def _trace(
+    spec: SampleSpec, scene: RenderInput, where: Mask, moved: F32, weights: F64, exposure_s: float, wanted: float
+) -> None:
     """Add to some pixels, bool[y, x], the sunlight on rays that are spread over the exposure, in place."""
     from .. import render
 
     pixels = np.flatnonzero(where).astype(np.uint32)
-    wanted = np.clip(_RAYS_PER_PX * where.size / len(pixels), *_SAMPLES)
-    samples = 1 << int(np.log2(wanted))
+    samples = 1 << int(np.log2(np.clip(wanted, *_SAMPLES)))
     light, _, _ = render.direct_in_cells(
         spec.terrain.surface,
         replace(scene, key=(scene.key ^ 0x2545F491) & 0xFFFFFFFF),
