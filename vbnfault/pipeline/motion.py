@@ -29,7 +29,7 @@ Mask = NDArray[np.bool_]
 
 _LEAST_PX = 0.02  # of motion that is seen
 _STEPS_PER_PX = 4.0  # of the light of cells; that of whole pixels, whose colours are taken, has one
-_MOST_STEPS = 1024
+_STEPS = (16, 1024)
 _FINE_PX = 5.0  # a longer path needs half as many steps for each further pixel
 _STRIP_PX = 128  # rows of pixels whose cells are carried at a time
 _ROUNDS = 2  # in which the place is found from which light comes
@@ -174,7 +174,8 @@ class Paths:
     def times_s(self, per_px: float) -> Sequence[float]:
         """Return times at the middles of equal parts of the exposure, so many for a pixel of motion."""
         length_px = min(self.length_px, _FINE_PX + (self.length_px - _FINE_PX) / 2)
-        count = min(int(np.ceil(per_px * length_px)) + 1, _MOST_STEPS)
+        least, most = (int(np.ceil(n * per_px / _STEPS_PER_PX)) for n in _STEPS)
+        count = int(np.clip(np.ceil(per_px * length_px) + 1, least, most))
         return (((np.arange(count) + 0.5) / count - 0.5) * self.exposure_s).tolist()
 
     def appearing(self, truth: Truth) -> Mask:
