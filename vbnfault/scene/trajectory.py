@@ -188,7 +188,7 @@ class Trajectory:
         """Return the shortest time between two frames of a sequence; infinity without sequences."""
         last = np.cumsum(self.frames, dtype=int)[:-1]
         steps_s = np.delete(np.diff(self.time_s), last - 1) if self.frames else np.zeros(0)
-        return float(steps_s.min(initial=np.inf))
+        return float(steps_s[steps_s > 0].min(initial=np.inf))  # rows that are repeated share a time
 
     @property
     def boresight_T(self) -> F64:
