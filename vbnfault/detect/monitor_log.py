@@ -30,7 +30,7 @@ _MOST_EARLY = 0.01  # of the time between two frames, by which a time that was r
 
 
 class Log(NamedTuple):
-    """Hold what a log says of each finished sample of a store; the last column is that of no class.
+    """Hold what a log says of each finished sample of a store; the last column is for rows of the class "any".
 
     Attributes
     ----------
@@ -106,7 +106,7 @@ def read_log(path: str, store: Store, columns: Columns) -> Log:
 
 
 def _frames_of(columns: Columns, sequence: int, time: str) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the places of a sequence's finished frames among all, and their times or numbers, in their order."""
+    """Return the indices of the finished frames of a sequence, and their times or numbers, in the order of these."""
     mine = np.flatnonzero(columns["sequence"] == sequence)
     times = columns[time][mine].astype(np.float64)
     order = np.argsort(times, kind="stable")
