@@ -106,7 +106,7 @@ def read_log(path: str, store: Store, columns: Columns) -> Log:
 
 
 def _frames_of(columns: Columns, sequence: int, time: str) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the indices of the finished frames of a sequence, and their times or numbers, in the order of these."""
+    """Return the indices of the finished frames of a sequence, and their times or numbers, in order of time."""
     mine = np.flatnonzero(columns["sequence"] == sequence)
     times = columns[time][mine].astype(np.float64)
     order = np.argsort(times, kind="stable")
