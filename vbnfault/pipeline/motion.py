@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from ..core.quantities import BODY, SPACECRAFT, Radiance, Truth
 from ..render.description import CameraMotion, RenderInput, View
-from .noise_budget import green_per_second
+from .noise_budget import green_per_second, sensor_noise_e
 from .spec import Rendering, SampleSpec, SceneExposure, SceneLight
 
 F32 = NDArray[np.float32]
@@ -271,18 +271,32 @@ def _coloured(planes: F32, paths: Paths, steps_per_px: float = 1.0) -> F32:
 def _trace(
     spec: SampleSpec, scene: RenderInput, where: Mask, moved: F32, weights: F64, exposure_s: float, wanted: float
 ) -> None:
-    """Add to some pixels, bool[y, x], the sunlight on rays that are spread over the exposure, in place."""
+    """Add to some pixels, bool[y, x], the sunlight on rays that are spread over the exposure, in place.
+
+    Those with too much noise of sampling get other rays, four times as many.
+    """
     from .. import render
 
-    pixels = np.flatnonzero(where).astype(np.uint32)
+    fraction, rest = spec.scene.render.noise_fraction, moved[:, where]
     samples = 1 << int(np.log2(np.clip(wanted, *_SAMPLES)))
-    light, _, _ = render.direct_in_cells(
-        spec.terrain.surface,
-        replace(scene, key=(scene.key ^ 0x2545F491) & 0xFFFFFFFF),
-        weights,
-        render.Cells(pixel=pixels, cell=np.zeros_like(pixels), side=1),
-        samples,
-        exposure_s,
-    )
-    row, column = np.nonzero(where)
-    moved[:, row, column] = np.maximum(moved[:, row, column] + light, 0)
+    for again in (0, 1):
+        pixels = np.flatnonzero(where).astype(np.uint32)
+        light, signal, error = render.direct_in_cells(
+            spec.terrain.surface,
+            replace(scene, key=(scene.key ^ (0x2545F491 + again)) & 0xFFFFFFFF),
+            weights * exposure_s,
+            render.Cells(pixel=pixels, cell=np.zeros_like(pixels), side=1),
+            samples << 2 * again,
+            exposure_s,
+        )
+        moved[:, where] = np.maximum(rest + light, 0)
+        if fraction is None:
+            return
+        variance = np.zeros(where.shape, np.float32)
+        variance[where] = (error / sensor_noise_e(spec.camera, signal, exposure_s)) ** 2
+        mean = cv2.blur(variance, (3, 3)) / np.maximum(cv2.blur(where.astype(np.float32), (3, 3)), 1e-6)
+        noisy = mean[where] > fraction**2
+        if not noisy.any():
+            return
+        rest = rest[:, noisy]
+        where = where & (mean > fraction**2)

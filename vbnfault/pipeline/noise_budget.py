@@ -11,12 +11,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..camera import Camera
 from ..core.quantities import FineLight, Radiance, Truth
 from ..render.description import RenderInput
 from ..world import ephemeris
@@ -102,9 +103,7 @@ def sample_to_noise(
     exposure *= 2 ** max(spec.scene.camera.exposure_stops[1], 0.0)  # the longest of the samples of the view
     signal_e = np.einsum("b,byx->yx", electron_rate * exposure, whole.array)
     detector = camera.detector
-    sensor_e = np.sqrt(
-        np.maximum(signal_e, 0) + detector.dark_current_e_s * exposure + detector.read_noise_e_rms**2
-    )
+    sensor_e = sensor_noise_e(camera, signal_e, exposure)
     # dark pixels and saturated pixels do not show this noise; saturated pixels still count as lit
     lit = signal_e > _LIT_FRACTION * detector.full_well_e
     shows = lit & (signal_e - 4 * np.abs(sampled.error) * exposure < detector.full_well_e)
@@ -372,6 +371,13 @@ def _allocated(squares: F32, goal: F32, most: int) -> NDArray[np.int32]:
     fits = fuller.sum(axis=1) <= most
     numbers[over[fits]] = fuller[fits]
     return numbers
+
+
+def sensor_noise_e(camera: Camera, signal_e: NDArray[Any], exposure_s: float) -> NDArray[Any]:
+    """Return the noise of the sensor at a signal: that of light, of dark current and of the readout."""
+    detector = camera.detector
+    dark_e = detector.dark_current_e_s * exposure_s
+    return np.asarray(np.sqrt(np.maximum(signal_e, 0) + dark_e + detector.read_noise_e_rms**2))
 
 
 def green_per_second(spec: SampleSpec) -> F64:

@@ -35,6 +35,7 @@ _PEBBLES = 0.5  # fraction of the variance of slopes
 _PEBBLE_CELLS = (4, 8, 16, 32, 64)  # texels; each cell holds at most one pebble, with a radius of up to 0.4 cells
 _PEBBLE_SHARE = 0.5  # fraction of the cells with a pebble
 _STEEPEST = 1.5
+_SHARPER = 2**-0.5  # of a pixel is averaged over, since the samples of the pixel average, too
 _UNIT = 2.0**-11  # slopes are stored as int16 in this unit
 
 
@@ -79,12 +80,8 @@ class Detail:
         self._fall = dr.opaque(mi.Float, relief.hurst - 1)
         self._pyramid = _pyramid()
 
-    def turned(self, normal: Any, point: Any, view: Any, distance_m: Any, dust: Any, dither: Any) -> Any:
-        """Return unit normals turned by the slopes at points of L.
-
-        `dither` in [0, 1), one number per pixel, chooses between two neighbouring levels of the pyramid. The levels
-        therefore mix from pixel to pixel, and nothing is random within a pixel.
-        """
+    def turned(self, normal: Any, point: Any, view: Any, distance_m: Any, dust: Any) -> Any:
+        """Return unit normals turned by the slopes at points of L."""
         footprint = distance_m * self._pixel * dr.rsqrt(dr.maximum(dr.abs(dr.dot(normal, view)), _GRAZING))
         # slopes refer to the coordinate plane (xy, yz or xz) that is most nearly perpendicular to the normal
         a = dr.abs(normal)
@@ -101,7 +98,7 @@ class Detail:
             # this is nearly a cosine: 1 in the middle of a step, 0 where the next begins
             weight = (1 - 4 * dr.square(turn - step)) * dr.exp2(self._fall * octave)
             per_m = _power_of_two(-mi.Int32(octave)) * (self._per_m / tile)
-            pair = self._slopes(k, u * per_m, v * per_m, footprint * per_m * _SIDE, dither)
+            pair = self._slopes(k, u * per_m, v * per_m, footprint * per_m * _SIDE)
             c, s = float(np.cos(k * _TURN)), float(np.sin(k * _TURN))
             su += weight * (c * pair[0] - s * pair[1])
             sv += weight * (s * pair[0] + c * pair[1])
@@ -114,16 +111,22 @@ class Detail:
         )
         return dr.normalize(normal - off)
 
-    def _slopes(self, k: int, u: Any, v: Any, texels: Any, dither: Any) -> tuple[Any, Any]:
+    def _slopes(self, k: int, u: Any, v: Any, texels: Any) -> tuple[Any, Any]:
         """Return slopes along the axes of tile k at positions in tiles, averaged over `texels` texels."""
-        level = mi.Int32(dr.floor(_log2(dr.maximum(texels, 1.0)) + dither))
-        shown = level < _LEVELS
-        level = dr.clip(level, 0, _LEVELS - 1)  # a ray without a hit may give any number
-        side = mi.Int32(_SIDE) >> level
+        level = _log2(dr.maximum(_SHARPER * texels, 1.0))
         c, s = float(np.cos(k * _TURN)), float(np.sin(k * _TURN))
-        tu, tv = c * u + s * v, c * v - s * u
-        x = (tu - dr.floor(tu)) * mi.Float(side)
-        y = (tv - dr.floor(tv)) * mi.Float(side)
+        u, v = c * u + s * v, c * v - s * u
+        u, v = u - dr.floor(u), v - dr.floor(v)
+        shown = level < _LEVELS
+        whole = mi.Int32(dr.clip(level, 0, _LEVELS - 1))  # a ray without a hit may give any number
+        coarser = level - mi.Float(whole)
+        fine, coarse = (self._of_level(n, u, v, shown & (n < _LEVELS)) for n in (whole, whole + 1))
+        return tuple(dr.lerp(*pair, coarser) * _UNIT for pair in zip(fine, coarse, strict=True))
+
+    def _of_level(self, level: Any, u: Any, v: Any, shown: Any) -> tuple[Any, Any]:
+        """Return slopes of a level in units of `_UNIT` at positions from 0 to 1 in a tile."""
+        side = mi.Int32(_SIDE) >> level
+        x, y = u * mi.Float(side), v * mi.Float(side)
         column, row = mi.Int32(x), mi.Int32(y)
         x, y = x - mi.Float(column), y - mi.Float(row)
         # the texels of the larger levels come first; an index that rounds up to `side` belongs to the next tile
@@ -131,8 +134,7 @@ class Detail:
         texel = mi.UInt32(start + (row & last) * side + (column & last))
         corners = dr.gather(mi.Vector4i, self._pyramid, texel, shown)
         su, sv = ([mi.Float(c << 16 >> 16 if low else c >> 16) for c in corners] for low in (True, False))
-        first, second = (dr.lerp(dr.lerp(of[0], of[1], x), dr.lerp(of[2], of[3], x), y) for of in (su, sv))
-        return first * _UNIT, second * _UNIT
+        return tuple(dr.lerp(dr.lerp(of[0], of[1], x), dr.lerp(of[2], of[3], x), y) for of in (su, sv))
 
 
 def _log2(x: Any) -> Any:

@@ -192,7 +192,7 @@ class Light:
         """
         normal = hit.normal
         if strata is not None:
-            normal = hit.shading_normal(self.detail, strata.dither())
+            normal = hit.shading_normal(self.detail)
         return Reflection(self.surface, self.scene, hit, normal, -rays.d, banded=self.banded)
 
 
@@ -465,7 +465,7 @@ class CellStrata(Strata):
         """Return the time of each sample after the middle of its pixel's exposure; None: at that time."""
         if self._exposure is None:
             return None
-        stratum = (self.index * self._step + self._number * 0x9E3779B1) & self._last
+        stratum = (self.index * self._step + (self._number ^ self._key) * 0x9E3779B1) & self._last
         return (mi.Float(stratum) + self.jitter(TIME_DIMENSION)[0]) * self._exposure - self._half
 
     def jitter(self, dimension: int) -> tuple[Any, Any]:

@@ -73,12 +73,6 @@ class Strata:
         parity = (self.index ^ (self.index >> (self.side.bit_length() - 1))) & 1
         return 1 - 2 * mi.Float(parity)
 
-    def dither(self) -> Any:
-        """Return a number in [0, 1) for each pixel, the same for all samples and frames."""
-        h = self.pixel * 0x9E3779B1
-        h ^= h >> 15
-        return mi.Float((h * 0x85EBCA77) >> 8) * 2.0**-24
-
     def disc(self, dimension: int) -> Any:
         """Return a point of the unit disc; the samples of a pixel share an even set of points, chosen by a hash.
 

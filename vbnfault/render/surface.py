@@ -196,12 +196,12 @@ class Hit:
         """Return the distance from the camera, for hits of its own rays."""
         return self.distance_m if isinstance(self.start_m, float) else self.distance_m + self.start_m
 
-    def shading_normal(self, detail: Detail | None, dither: Any) -> Any:
-        """Return the normal turned by the relief finer than facets; `dither` in [0, 1) is one number per pixel."""
+    def shading_normal(self, detail: Detail | None) -> Any:
+        """Return the normal turned by the relief finer than facets."""
         if detail is None:
             return self.normal
         point = self._rays(self.distance_m)
-        return detail.turned(self.normal, point, self._rays.d, self.range_m, self.dust, dither)
+        return detail.turned(self.normal, point, self._rays.d, self.range_m, self.dust)
 
     def shadow_rays(self, direction: Any) -> Any:
         """Return rays from the hits in a direction.
@@ -299,9 +299,9 @@ class VehicleHit(Hit):
         """Return the dust cover of the ground; 0 on the vehicle."""
         return dr.select(self.on_vehicle, 0, self._ground.dust)
 
-    def shading_normal(self, detail: Detail | None, dither: Any) -> Any:
+    def shading_normal(self, detail: Detail | None) -> Any:
         """Return the ground's shading normal; the vehicle has no finer relief."""
-        return dr.select(self.on_vehicle, self.normal, self._ground.shading_normal(detail, dither))
+        return dr.select(self.on_vehicle, self.normal, self._ground.shading_normal(detail))
 
     def shadow_rays(self, direction: Any) -> Any:
         """Return rays from the hits in a direction; they start off the facet."""
