@@ -4,7 +4,7 @@
 
 A camera 150 m above ground of 67P stands still, turns, flies sideways, or flies down. Its image is a part of a
 frame of 512 px and 30°, a quarter of the frame from its middle, so that what flies down moves by as much in all of
-it; with `--size 512` it has the size of the frame. For each kind and length of motion, a line gives the error of
+it; with `--size 512` it is the frame. For each kind and length of motion, a line gives the error of
 the signal over the noise of the sensor: its median with its sign, and its root mean square, of all lit pixels and
 of the best 99 % of them; then that of single pixels over frames with samples of their own: its median, its 99th
 percentile, and the fraction below 0.3, also of the pixels that get new rays; the error of the sub-frames' mean;
@@ -66,7 +66,8 @@ def session_above_ground(size: int, render: dict[str, Any], count: int, **more: 
     camera_m = vertices_m[np.argmax(vertices_m @ UP_T)] + HEIGHT_M * UP_T
     right, *_ = np.linalg.svd(UP_T[None])[2][1:]
     T_from_C = np.stack([right, np.cross(-UP_T, right), -UP_T], axis=1)
-    T_from_C = T_from_C @ Rotation.from_euler("y", OFF_AXIS_DEG, degrees=True).as_matrix()
+    if size < FRAME_PX:
+        T_from_C = T_from_C @ Rotation.from_euler("y", OFF_AXIS_DEG, degrees=True).as_matrix()
     sun = UP_T + 1.2 * right
     values = [*camera_m, *Rotation.from_matrix(T_from_C.T).as_quat(scalar_first=True), *(sun / np.linalg.norm(sun))]
     names = (

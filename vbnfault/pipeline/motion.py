@@ -38,6 +38,7 @@ _APART_PX, _APART_OF_LENGTH = 0.12, 0.02
 _FARTHEST_PX = 64  # from such a step, within which pixels get new rays
 # New rays over the samples of the whole view, their least number over its pixels, and range of those of a pixel.
 _NEW_RAYS, _LEAST_RAYS_PER_PX, _SAMPLES = 0.6, 32, (16, 1024)
+_SURELY = 0.5  # of the noise allowed, below which a quarter of the rays will do: two halves of them tell little
 # Where the first and the last line are: direction in which pixels are exposed one after the other, x and y.
 _LATER = {"up": (0, 1), "down": (0, -1), "left": (1, 0), "right": (-1, 0)}
 
@@ -273,30 +274,30 @@ def _trace(
 ) -> None:
     """Add to some pixels, bool[y, x], the sunlight on rays that are spread over the exposure, in place.
 
-    Those with too much noise of sampling get other rays, four times as many.
+    A quarter of the rays shows which pixels need them all, or four times as many where the scene allows it.
     """
     from .. import render
 
-    fraction, rest = spec.scene.render.noise_fraction, moved[:, where]
+    table, rest = spec.scene.render, moved[:, where]
     samples = 1 << int(np.log2(np.clip(wanted, *_SAMPLES)))
-    for again in (0, 1):
+    more = max(samples, min(4 * samples, table.max_samples_per_pixel))
+    for again, count in enumerate((samples,) if table.noise_fraction is None else (samples // 4, more)):
         pixels = np.flatnonzero(where).astype(np.uint32)
         light, signal, error = render.direct_in_cells(
             spec.terrain.surface,
             replace(scene, key=(scene.key ^ (0x2545F491 + again)) & 0xFFFFFFFF),
             weights * exposure_s,
             render.Cells(pixel=pixels, cell=np.zeros_like(pixels), side=1),
-            samples << 2 * again,
+            count,
             exposure_s,
         )
         moved[:, where] = np.maximum(rest + light, 0)
-        if fraction is None:
-            return
+        if table.noise_fraction is None:
+            break
         variance = np.zeros(where.shape, np.float32)
         variance[where] = (error / sensor_noise_e(spec.camera, signal, exposure_s)) ** 2
         mean = cv2.blur(variance, (3, 3)) / np.maximum(cv2.blur(where.astype(np.float32), (3, 3)), 1e-6)
-        noisy = mean[where] > fraction**2
+        noisy = where & (mean > (_SURELY * table.noise_fraction) ** 2)
         if not noisy.any():
-            return
-        rest = rest[:, noisy]
-        where = where & (mean > fraction**2)
+            break
+        rest, where = rest[:, noisy[where]], noisy
