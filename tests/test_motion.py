@@ -215,6 +215,27 @@ def test_blur_is_the_mean_of_sub_frames(kind: str, px: int) -> None:
     assert got.sum() == pytest.approx(true.sum(), rel=2e-3)
 
 
+def test_noisy_pixels_get_more_of_the_new_rays(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A quarter of the rays goes to all pixels that need some, and then all of them to those that stay noisy."""
+    traced, direct = [], render.direct_in_cells
+
+    def counted(surface: Any, scene: Any, weights: Any, cells: Any, samples: int, exposure_s: float = 0.0) -> Any:
+        if exposure_s:
+            traced.append((len(cells.pixel), samples))
+        return direct(surface, scene, weights, cells, samples, exposure_s)
+
+    bright = SCENE | {"body": SCENE["body"] | {"reflectance": 0.6}}
+    for fraction in (0.02, 10.0):
+        monkeypatch.undo()
+        spec = spec_of(bright | {"render": SCENE["render"] | {"noise_fraction": fraction}}, velocity=(0, 500.0, 0))
+        rendering = render_view(spec, resolve(spec))
+        monkeypatch.setattr(render, "direct_in_cells", counted)
+        motion.move(spec, rendering, meter(spec, rendering))
+    (all_px, few), (noisy_px, many), (of_all_px, _), (fewer_px, _) = traced
+    assert 0 < fewer_px < noisy_px < all_px == of_all_px
+    assert many in (4 * few, 8 * few, 16 * few)
+
+
 def test_nothing_changes_without_motion() -> None:
     """A camera that stands still has the same bits as in a scene without `[motion]`."""
     tables = [SCENE, {name: table for name, table in SCENE.items() if name != "motion"}]
