@@ -97,17 +97,18 @@ def test_an_image_moves_by_whole_pixels_and_continues_as_its_mirror_image() -> N
     assert np.array_equal(fit_frames.shifted(image, (0, 0)), image)
 
 
-def test_raw_images_are_stretched_by_a_root_and_halved() -> None:
+def test_raw_images_are_halved_and_stretched_by_a_root() -> None:
     display = fit_replay.Display(bias_dn=100, top_dn=4195, stretch=0.5)
     raw = np.full((12, 12), 4200, dtype=np.uint16)  # above the top code
     raw[6:] = 104
-    # over the bias: 255 and 3.985 √4 = 7.97, not yet in whole numbers; next to the edge a neighbour weighs 0.0325
-    column = [255, 255, round(0.9675 * 255 + 0.0325 * 7.97), round(0.9675 * 7.97 + 0.0325 * 255), 8, 8]
+    # 255 √(4 / 4095) = 7.97; next to the edge a neighbour weighs 0.0325
+    edge = [round(255 * (part + (1 - part) * 4 / 4095) ** 0.5) for part in (0.9675, 0.0325)]
+    column = [255, 255, *edge, 8, 8]
     assert display.developed(raw, 2).tolist() == [[value] * 6 for value in column]
     assert display.developed(raw.T, 2).T.tolist() == [[value] * 6 for value in column]
-    # 3.985 √2 = 5.64 and 3.985 √3 = 6.90 have the mean 6.27; rounded first, 6 and 7 would give 7
-    raw[0::2], raw[1::2] = 102, 103
-    assert display.developed(raw, 2)[2:-2].tolist() == [[6] * 6] * 2
+    # the mean of -2 and 10 DN is 4, too; stretched first, 0 and 12.6 would give 6
+    raw[0::2], raw[1::2] = 98, 110
+    assert display.developed(raw, 2)[2:-2].tolist() == [[8] * 6] * 2
     # a black 500 DN above the bias: 255 √(3594 / 4095) = 238.9, but the largest number is white
     raw[:] = 4194
     assert (display.developed(raw, 1, -500.0) == 239).all()

@@ -11,7 +11,8 @@ Pose, exposure, gain and black of a real frame are never known well enough, so e
 - the black: the difference of the median levels of the skies, where the frame's is not clipped.
 
 All else is of the scene. Frames that are smaller than the camera's image by a whole factor are means of as many
-pixels, as published frames are; the means are taken after the stretch and rounded afterwards.
+pixels; the means are taken before the stretch. So are those of Rosetta's frames: single pixels of their sky are
+darker than the sky around by up to a half, which the mean of four stretched pixels, none below 0, cannot be.
 """
 
 from __future__ import annotations
@@ -82,15 +83,15 @@ class Display:
     step: float = 1.0
 
     def developed(self, raw: NDArray[Any], factor: int, black_dn: float = 0.0) -> F32:
-        """Return a raw image stretched, then reduced by a whole factor, in levels of 0 to 255, float32[y, x].
+        """Return a raw image reduced by a whole factor, then stretched, in levels of 0 to 255, float32[y, x].
 
         `black_dn` is how far the black of the frame lies below the bias. A pixel at the top code is white.
         """
-        above = np.clip(raw.astype(np.float32) - np.float32(self.bias_dn - black_dn), 0, None)
-        shown = np.minimum((above / np.float32(self.top_dn - self.bias_dn)) ** np.float32(self.stretch), 1)
-        shown[raw >= self.top_dn] = 1
+        above = raw.astype(np.float32) - np.float32(self.bias_dn - black_dn)
+        above[raw >= self.top_dn] = self.top_dn - self.bias_dn
+        of_white = np.clip(reduced(above, factor) / np.float32(self.top_dn - self.bias_dn), 0, 1)
         step = np.float32(self.step)
-        return step * np.floor(255 / step * reduced(shown, factor) + np.float32(0.5))
+        return step * np.floor(255 / step * of_white ** np.float32(self.stretch) + np.float32(0.5))
 
     def fraction(self, level: float) -> float:
         """Return the fraction of white that a level stands for."""
