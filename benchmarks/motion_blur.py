@@ -4,11 +4,11 @@
 
 A camera 150 m above ground of 67P stands still, turns, flies sideways, or flies down. Its image is a part of a
 frame of 512 px and 30°, a quarter of the frame from its middle, so that what flies down moves by as much in all of
-it; with `--size 512` it is the frame. For each kind and length of motion, a line gives the error of
-the signal over the noise of the sensor: its median with its sign, and its root mean square, of all lit pixels and
-of the best 99 % of them; then that of single pixels over frames with samples of their own: its median, its 99th
-percentile, and the fraction below 0.3, also of the pixels that get new rays; the error of the sub-frames' mean;
-and the time of the moved frame, from the render to its electrons, over that of a still one.
+it; with `--size 512` it is the frame. For each kind and length of motion, a line gives the error of the signal
+over the noise of the sensor: its median with its sign, and its root mean square, of all lit pixels and of the best
+99 % of them; then that of single pixels over frames with samples of their own: its median, its 99th percentile,
+and the fraction below 0.3, also of the pixels that get new rays; the error of the sub-frames' mean; and the time
+of the moved frame, from the render to its electrons, over that of a still one.
 
 With --cycles, Blender renders the same frames of smooth, Lambertian ground with as many samples per pixel (see
 `blender_cycles.py`), and a second line gives its time, and how far the two images differ.

@@ -25,6 +25,7 @@ from vbnfault.pipeline.noise_budget import green_per_second
 from vbnfault.pipeline.rendering import render_view
 from vbnfault.pipeline.resolve import resolve
 from vbnfault.pipeline.spec import SampleSpec
+from vbnfault.render.light import _TIME_STEPS
 from vbnfault.scene import config
 from vbnfault.scene.trajectory import as_trajectory
 from vbnfault.world.sky import SkyFrame
@@ -234,6 +235,34 @@ def test_noisy_pixels_get_more_of_the_new_rays(monkeypatch: pytest.MonkeyPatch) 
     (all_px, few), (noisy_px, many), (of_all_px, _), (fewer_px, _) = traced
     assert 0 < fewer_px < noisy_px < all_px == of_all_px
     assert many in (4 * few, 8 * few, 16 * few)
+
+
+@pytest.mark.parametrize("samples", [n for n in _TIME_STEPS if n >= 64])
+def test_times_and_places_of_samples_are_even_together(samples: int) -> None:
+    """An edge covers a known fraction of a moving pixel: the distribution of a sum of three uniform numbers."""
+    columns = 1 << (samples.bit_length() // 2)  # half the bits, rounded up: one bit less than the length
+    k = np.arange(samples)
+    rng = np.random.default_rng(samples)
+    squares = {"lattice": 0.0, "random": 0.0}
+    for px in (1, 5, 20):
+        for _ in range(60):
+            x, y = (k % columns + rng.random(samples)) / columns, (k // columns + rng.random(samples))
+            y *= columns / samples
+            edge, along = 2 * np.pi * rng.random(2)
+            widths = np.abs([np.cos(edge), np.sin(edge), px * np.cos(along - edge)])
+            at = (rng.random() - 0.5) * widths.sum()
+            ends = [(1, at)]
+            for width in widths:
+                ends = [(sign * s, v + s * width / 2) for sign, v in ends for s in (1, -1)]
+            covered = sum(sign * max(v, 0) ** 3 for sign, v in ends) / (6 * widths.prod())
+            even = (k * _TIME_STEPS[samples] + rng.integers(samples)) % samples
+            for name, order in (("lattice", even), ("random", rng.permutation(samples))):
+                time = (order + rng.random(samples)) / samples - 0.5
+                place = (x - 0.5) * np.cos(edge) + (y - 0.5) * np.sin(edge) + px * time * np.cos(along - edge)
+                squares[name] += ((place < at).mean() - covered) ** 2
+    # Where an edge cuts points that are even in three dimensions, they err as N^-2/3; with random times, as N^-1/2.
+    # The ratio therefore falls as N^-1/6, from 0.71 at 64 samples; 180 errors give it to 8 %.
+    assert squares["lattice"] ** 0.5 < 0.9 * (64 / samples) ** (1 / 6) * squares["random"] ** 0.5
 
 
 def test_nothing_changes_without_motion() -> None:

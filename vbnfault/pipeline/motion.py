@@ -36,7 +36,8 @@ _ROUNDS = 2  # in which the place is found from which light comes
 # Pixels whose paths depart by more than this from those around, up to either end, may hide one another.
 _APART_PX, _APART_OF_LENGTH = 0.12, 0.02
 _FARTHEST_PX = 64  # from such a step, within which pixels get new rays
-# New rays over the samples of the whole view, their least number over its pixels, and range of those of a pixel.
+# There are so many new rays for each sample of the whole view, at least so many for each of its pixels, and a pixel
+# gets from 16 to 1024 of them.
 _NEW_RAYS, _LEAST_RAYS_PER_PX, _SAMPLES = 0.6, 32, (16, 1024)
 _SURELY = 0.5  # of the noise allowed, below which a quarter of the rays will do: two halves of them tell little
 # Where the first and the last line are: direction in which pixels are exposed one after the other, x and y.
@@ -150,10 +151,10 @@ class Paths:
         return float(max(longest)) * self.exposure_s
 
     def sources(self, time_s: float, rows: slice = slice(None)) -> F32:
-        """Return column and row, float32[y, x, 2] from the middle of the first pixel of some rows, of the light.
+        """Return where the light comes from that each pixel of some rows gets, float32[y, x, 2].
 
-        It is the light that each pixel of these rows gets `time_s` after the middle of its exposure, as if ground
-        beyond the rows moved as that at their border.
+        It is that of `time_s` after the middle of the pixel's exposure, as if ground beyond the rows moved as that
+        at their border. The last axis is column and row, counted from the middle of the first pixel of these rows.
         """
         speed, bend = self.speed_px_s[rows], self.bend_px_s2[rows]
         here = _places(*speed.shape[:2])
@@ -166,7 +167,7 @@ class Paths:
         return here - at
 
     def reach(self, rows: slice) -> slice:
-        """Return the rows that the light of some rows comes from, and some more."""
+        """Return the rows that the light of some rows comes from, with a margin."""
         height, half_s = len(self.speed_px_s), self.exposure_s / 2
         speed, bend = np.abs(self.speed_px_s[rows, :, 1]).max(), np.abs(self.bend_px_s2[rows, :, 1]).max()
         most = int(1.2 * (speed * half_s + bend * half_s**2)) + 3
@@ -208,7 +209,7 @@ def _places(height: int, width: int) -> F32:
 
 
 def _looked_up(array: F32, place: F32) -> F32:
-    """Return values at columns and rows, float32[y, x, 2]; those at the border go on beyond it."""
+    """Return values at columns and rows, float32[y, x, 2]; beyond the border they are those at the border."""
     return np.asarray(cv2.remap(array, place, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
 

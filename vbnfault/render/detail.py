@@ -35,7 +35,7 @@ _PEBBLES = 0.5  # fraction of the variance of slopes
 _PEBBLE_CELLS = (4, 8, 16, 32, 64)  # texels; each cell holds at most one pebble, with a radius of up to 0.4 cells
 _PEBBLE_SHARE = 0.5  # fraction of the cells with a pebble
 _STEEPEST = 1.5
-_SHARPER = 2**-0.5  # of a pixel is averaged over, since the samples of the pixel average, too
+_SHARPER = 2**-0.5  # widths of a pixel that the pyramid averages over; the samples of the pixel average, too
 _UNIT = 2.0**-11  # slopes are stored as int16 in this unit
 
 
