@@ -190,6 +190,24 @@ def test_charge_gathers_dark_current_until_its_row_is_read(architecture: str) ->
     assert (full == 255).all()
 
 
+@pytest.mark.parametrize("architecture", ["frame_transfer_ccd", "interline_ccd"])
+@pytest.mark.parametrize("direction", ["up", "down"])
+def test_the_store_has_pixels_of_its_own(architecture: str, direction: str) -> None:
+    """After i of its rows, columns differ by the root of i times the deviation of a pixel's dark current; with a
+    reference at the end, by that of the rows that are left."""
+    made = ccd(architecture)
+    uneven = replace(made.individual, dark_nonuniformity=0.2)
+    shape, light = (64, 1024), np.zeros((64, 1024), np.float32)
+    rows = np.arange(64) if direction == "up" else np.arange(64)[::-1]
+    for reference, passed in ((False, rows), (True, 63 - rows)):
+        move = replace(made.transfer, column_reference=reference)
+        device = Device(replace(made, individual=uneven, transfer=move), 1, shape=shape, direction=direction)
+        gathered = device.expected_e(light, 0.0) + device.offset_e
+        assert gathered.mean(axis=1) == pytest.approx(rows, rel=0.03, abs=1e-3)
+        # a deviation of 1024 columns has an error of 2.2 %, and pixels vary by 0.2 of 1 e a row
+        assert gathered.std(axis=1) == pytest.approx(0.2 * np.sqrt(passed), rel=0.1, abs=1e-3)
+
+
 def test_four_nodes_read_each_half_to_its_own_side() -> None:
     made = ccd("full_frame_ccd", nodes=4)
     device = Device(made, 1, shape=(64, 64))

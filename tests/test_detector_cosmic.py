@@ -269,6 +269,18 @@ def test_diffusion_spreads_charge_by_its_depth() -> None:
     assert deep[25, 30] < 0.05 * deep.sum()
 
 
+def test_diffusion_of_all_depths_adds_in_squares() -> None:
+    model = CosmicRayModel(
+        pixel_pitch_um=1.0, thickness_um=20.0, diffusion_um=3.0, least_diffusion_um=4.0, width_e_per_um=0.0
+    )
+    at = np.arange(101) + 0.5
+    for depth, expected in ((0.0, 16.0), (19.98, 25.0)):
+        image = image_of(model, one(x_px=50.5, y_px=50.5, depth_um=depth, length_um=0.01), (101, 101))
+        profile = image.sum(axis=0, dtype=np.float64) / image.sum(dtype=np.float64)
+        # a pixel adds 1/12; cut at 4 σ, a Gaussian loses at most 0.1 % of its variance
+        assert (profile * (at - 50.5) ** 2).sum() == pytest.approx(expected + 1 / 12, rel=3e-3)
+
+
 def test_little_diffusion_is_none() -> None:
     rays = MODEL.draw(SHAPE, 500.0, np.random.default_rng(9))
     sharp, soft = image_of(EVEN, rays, SHAPE), image_of(replace(EVEN, diffusion_um=1e-6), rays, SHAPE)

@@ -101,11 +101,12 @@ def test_raw_images_are_halved_and_stretched_by_a_root() -> None:
     display = fit_replay.Display(bias_dn=100, top_dn=4195, stretch=0.5)
     raw = np.full((12, 12), 4200, dtype=np.uint16)  # above the top code
     raw[6:] = 104
-    # 255 √(4 / 4095) = 7.97; next to the edge a neighbour weighs 0.0325
-    edge = [round(255 * (part + (1 - part) * 4 / 4095) ** 0.5) for part in (0.9675, 0.0325)]
-    column = [255, 255, *edge, 8, 8]
-    assert display.developed(raw, 2).tolist() == [[value] * 6 for value in column]
-    assert display.developed(raw.T, 2).T.tolist() == [[value] * 6 for value in column]
+    # 255 √(4 / 4095) = 7.97; next to the edge a neighbour weighs 0.026 in a column, 0.036 in a row
+    for image, leak in ((raw, 0.026), (raw.T, 0.036)):
+        edge = [round(255 * (part + (1 - part) * 4 / 4095) ** 0.5) for part in (1 - leak, leak)]
+        levels = display.developed(image, 2)
+        lines = levels if image is raw else levels.T
+        assert lines.tolist() == [[value] * 6 for value in (255, 255, *edge, 8, 8)]
     # the mean of -2 and 10 DN is 4, too; stretched first, 0 and 12.6 would give 6
     raw[0::2], raw[1::2] = 98, 110
     assert display.developed(raw, 2)[2:-2].tolist() == [[8] * 6] * 2
@@ -167,13 +168,24 @@ def test_a_noisy_frame_is_rendered_with_the_higher_gain() -> None:
         sky = 8 + deviation * rng.normal(size=body.shape) + np.arange(len(body)) % 3 - 1  # columns are no noise
         return fit_frames.look(np.where(body > 40, body, sky))
 
-    for variance, gain in ((0.7, 1.0), (1.25, 1.0), (1.6, 1.4), (3.0, 1.4), (9.0, 2.5)):
+    for variance, gain in ((0.7, 1.0), (1.25, 1.0), (1.6, 1.4), (2.2, 1.4), (9.0, 2.5)):
         one = look_at(variance**0.5)
         # of 19,000 differences, each with two neighbours, the variance has a deviation of 1.3 %; spots of 4 levels
         # are left out, which cuts the tails of strong noise
-        assert variance > 1 or fit_replay.noise_variance(one) == pytest.approx(variance, rel=4 * 0.013)
-        assert fit_replay.nearest_gain(one, look_at(1.0), (1.0, 1.4, 2.5)) == gain
-    assert fit_replay.nearest_gain(look_at(3.0), look_at(1.0), (1.0,)) == 1
+        assert variance > 1 or fit_replay.noise_variance(one, 1.0) == pytest.approx(variance, rel=4 * 0.013)
+        assert fit_replay.nearest_gain(one, look_at(1.0), (1.0, 1.4, 2.5), 1.0) == gain
+    assert fit_replay.nearest_gain(look_at(3.0), look_at(1.0), (1.0,), 1.0) == 1
+
+
+def test_the_noise_of_a_stretched_frame_is_that_of_its_light() -> None:
+    body, rng = disc(80, 80), np.random.default_rng(4)
+    noise = rng.normal(0, 3.0, body.shape)
+    variances = []
+    for black in (0.0, 40.0):
+        light = np.where(body > 40, 2000.0, 60.0 + black + noise)
+        variances.append(fit_replay.noise_variance(fit_frames.look(np.sqrt(light)), 0.5))
+    # as above; levels are not rounded here
+    assert variances == pytest.approx([9.0, 9.0], rel=4 * 0.013)
 
 
 def test_the_black_of_a_frame_is_that_of_its_sky() -> None:

@@ -102,11 +102,15 @@ def _maps(sensor: Sensor, seed: int, shape: tuple[int, int], temperature_K: floa
     moved = None  # a dark frame has this signal, too
     if sensor.measured is None or sensor.measured.dark_e_s is None:
         moved = transfer_dark_e(sensor, rate, direction)
+    offset = offset_e(own)
+    if moved is not None and sensor.transfer.column_reference:
+        last = moved.max(axis=0)  # of the row that waits longest
+        offset -= last - last.mean()
     return _Maps(
         drawn=drawn,
         individual=own,
         response=response(own),
-        offset_e=offset_e(own),
+        offset_e=offset,
         dark_rate_e_s=rate,
         transfer_dark_e=moved,
     )

@@ -116,9 +116,11 @@ def transfer_dark_e(sensor: Sensor, dark_rate_e_s: F32, direction: str) -> F32 |
     """Return the electrons from dark current that charge packets collect during transfer, float32[y, x].
 
     A full-frame CCD moves each packet through all pixels between its own pixel and the register. It stays in each
-    for the readout time of a row, so a hot pixel leaves a line. Packets in the store of a frame-transfer CCD and in
-    the registers of an interline CCD wait equally long; their dark current is assumed to be the median of the
-    image. In a frame-transfer CCD a packet also passes the image pixels on its quick transfer to the store.
+    for the readout time of a row, so a hot pixel leaves a line. Packets wait equally long in the store of a
+    frame-transfer CCD and in the registers of an interline CCD, whose pixels are of the same silicon: they have the
+    rates of the image's pixels, turned by 180°. So a pattern of columns grows from the row that is read first, as
+    in frames of Rosetta's navigation camera. In a frame-transfer CCD a packet also passes the image pixels on its
+    quick transfer to the store.
 
     Returns None for a CMOS sensor, and for a CCD without transfer times.
     """
@@ -127,9 +129,9 @@ def transfer_dark_e(sensor: Sensor, dark_rate_e_s: F32, direction: str) -> F32 |
         return None
     if sensor.architecture == "full_frame_ccd":
         return passing_dark_e(sensor, dark_rate_e_s, direction)
-    even = np.full_like(dark_rate_e_s, np.median(dark_rate_e_s))
+    store = np.ascontiguousarray(dark_rate_e_s[::-1, ::-1])
     waiting = partial(smear, exposure_s=0.0, row_transfer_s=move.row_readout_s)
-    return along_columns(sensor, direction, waiting, even) + passing_dark_e(sensor, dark_rate_e_s, direction)
+    return along_columns(sensor, direction, waiting, store) + passing_dark_e(sensor, dark_rate_e_s, direction)
 
 
 def passing_dark_e(sensor: Sensor, dark_rate_e_s: F32, direction: str) -> F32:

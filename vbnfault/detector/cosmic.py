@@ -141,7 +141,9 @@ class CosmicRayModel:
         silicon real distributions are wider.
     diffusion_um
         Gaussian σ of charge from the far face when it is collected. Charge from depth z has √(z/thickness) of this
-        (drift in a constant field). 0 switches diffusion off.
+        (drift in a constant field).
+    least_diffusion_um
+        σ that charge from all depths has besides. Both 0 switch diffusion off.
     """
 
     pixel_pitch_um: float
@@ -150,6 +152,7 @@ class CosmicRayModel:
     electrons_per_um: float = 80.0
     width_e_per_um: float = XI_E_PER_UM
     diffusion_um: float = 0.0
+    least_diffusion_um: float = 0.0
 
     def expected_count(self, shape: tuple[int, int], exposure_s: float) -> float:
         """Return the mean number of tracks on a (height, width) sensor: flux/2 × area × time."""
@@ -207,7 +210,7 @@ class CosmicRayModel:
         weight = chord_um * self._local_e_per_um(rays.seed[track], _rank(track))
         total = np.bincount(track, weight, minlength=len(rays))
         electrons = weight * (rays.electrons * end / np.where(total > 0, total, 1))[track]
-        if not self.diffusion_um:
+        if not (self.diffusion_um or self.least_diffusion_um):
             x, y = start[:, track] + step[:, track] * (a + b) / 2
             # rounding may put the middle of a piece on the far border
             column = np.clip(np.floor(x).astype(np.int64), 0, width - 1)
@@ -225,8 +228,8 @@ class CosmicRayModel:
         track = track[piece]
         x, y = start[:, track] + step[:, track] * middle
         depth = np.clip(rays.depth_um[track] + slant[piece] * middle, 0, self.thickness_um)
-        sigma = self.diffusion_um / self.pixel_pitch_um * np.sqrt(depth / self.thickness_um)
-        return _spread(x, y, sigma, (electrons / parts)[piece], shape)
+        sigma = np.hypot(self.least_diffusion_um, self.diffusion_um * np.sqrt(depth / self.thickness_um))
+        return _spread(x, y, sigma / self.pixel_pitch_um, (electrons / parts)[piece], shape)
 
     def _inside(
         self, shape: tuple[int, int], x: F64, y: F64, depth: F64, theta: F64, phi: F64, length_um: F64

@@ -73,6 +73,11 @@ class Transfer:
         default=0.0, ge=0, description="time to shift the charge by one pixel in the serial register"
     )
     row_readout_s: float = Field(default=0.0, ge=0, description="time from the readout of one row to the next")
+    column_reference: bool = Field(
+        default=False,
+        description="whether each column's dark current in the row that is read last, less the mean of these, is "
+        "subtracted, as a reference of covered rows does",
+    )
     leak: Fraction = Field(
         default=0.0,
         description="sensitivity to light of the covered register (interline) or of the store (global shutter), "

@@ -35,9 +35,9 @@ from ..scene.trajectory import FlownPose, Trajectory
 from .frames import F32, Look, compare, look, shift_between, shifted, similarity_between
 
 _SEARCH_PX = 16  # largest shift, for frames of 512 px
-# This part of a mean over pixels is light of the pixels beside them. Noise of neighbours in the sky of Rosetta's
-# frames correlates by 0.07, which asks for 0.035; limb and ground are sharper and ask for less.
-_LEAK = 0.0325
+# This part of a mean over pixels is light of each of the pixels beside them, in a column and in a row: noise of
+# neighbours in the sky of Rosetta's frames correlates by twice as much.
+_LEAKS = 0.026, 0.036
 # The exposure is metered on the first of these percentiles whose level is below the given one.
 _WHITE, _PERCENTILES = 250, (50.0, 40.0, 30.0, 20.0, 10.0)
 _MOST_BLACK = 1e-3  # of white: more is light. Of 32 frames of Rosetta's the black differs by 4e-4
@@ -55,7 +55,7 @@ class Pair:
 
 
 def replay_scene(scene: Scene) -> Scene:
-    """Return a scene that stores raw mosaics and gives every sample each of its faults.
+    """Return a scene that stores raw mosaics of one individual and gives every sample each of its faults.
 
     Raises InputError for a camera without a detector file.
     """
@@ -65,8 +65,9 @@ def replay_scene(scene: Scene) -> Scene:
     plan = {"mode": "per_sample", "faulty_fraction": float(count > 0), "on_invisible": "drop"}
     plan |= {"classes_per_sample": (count, count)} if count else {}
     dataset = {"layers": ("raw",), "mask_any": None}
+    parts = {"plan": plan, "dataset": dataset, "camera": {"individuals": 1}}
     return scene.model_copy(
-        update={"plan": scene.plan.model_copy(update=plan), "dataset": scene.dataset.model_copy(update=dataset)}
+        update={name: getattr(scene, name).model_copy(update=values) for name, values in parts.items()}
     )
 
 
@@ -174,7 +175,7 @@ class Replay:
             trajectory = with_pose(trajectory, row, *moved)
             raw = self._raw(row, trajectory, settings | {"gain": self.gains[0]})
         before = look(self.display.developed(raw, factor))
-        gain = nearest_gain(real, before, self.gains)
+        gain = nearest_gain(real, before, self.gains, self.display.stretch)
         if gain != self.gains[0]:
             raw = self._raw(row, trajectory, settings | {"gain": gain})
             before = look(self.display.developed(raw, factor))
@@ -225,25 +226,30 @@ def step_of(frame: F32) -> float:
     return 1.0 if np.array_equal(frame, np.round(frame)) else 1 / 257
 
 
-def nearest_gain(real: Look, rendered: Look, gains: Sequence[float]) -> float:
-    """Return the gain whose noise in the sky is nearest to the frame's; its variance goes with the gain's square.
+def nearest_gain(real: Look, rendered: Look, gains: Sequence[float], stretch: float) -> float:
+    """Return the gain whose noise in the sky is nearest to the frame's.
 
-    `rendered` has the first of the gains.
+    The variance goes with the gain where it is of photons, with its square where it is of the readout: with its
+    power of 1.5. `rendered` has the first of the gains; levels are light to the power `stretch`.
     """
     if len(gains) == 1 or real.clipped:
         return gains[0]
-    ratio = noise_variance(real) / noise_variance(rendered)
+    ratio = noise_variance(real, stretch) / noise_variance(rendered, stretch)
     if not ratio > 0:
         return gains[0]
-    return min(gains, key=lambda gain: abs(np.log(ratio * (gains[0] / gain) ** 2)))
+    return min(gains, key=lambda gain: abs(np.log(ratio * (gains[0] / gain) ** 1.5)))
 
 
-def noise_variance(one: Look) -> float:
-    """Return the variance of the temporal noise in the sky, along columns, whose pattern and smear are no noise."""
+def noise_variance(one: Look, stretch: float) -> float:
+    """Return the variance of the temporal noise of light in the sky, whatever its black.
+
+    It is taken along columns, whose pattern and smear are no noise.
+    """
     calm = one.sky & (np.abs(one.image - ndimage.median_filter(one.image, 9)) < 4)
     calm[1:] &= calm[:-1]
     calm[0] = False
-    return float(np.diff(one.image, axis=0, prepend=0)[calm].var() / 2) if calm.sum() > 1000 else float("nan")
+    light = one.image.astype(np.float64) ** (1 / stretch)
+    return float(np.diff(light, axis=0, prepend=0)[calm].var() / 2) if calm.sum() > 1000 else float("nan")
 
 
 def metered_on(real: Look) -> tuple[float, float]:
@@ -286,8 +292,8 @@ def reduced(image: F32, factor: int) -> F32:
     """Return the means of squares of pixels, with the light of neighbours that published frames show."""
     if factor == 1:
         return image
-    weights = [_LEAK, *[(1 - 2 * _LEAK) / factor] * factor, _LEAK]
-    for axis in (0, 1):
+    for axis, leak in enumerate(_LEAKS):
+        weights = [leak, *[(1 - 2 * leak) / factor] * factor, leak]
         size = image.shape[axis]
         padded = np.pad(image, [(1, 1) if k == axis else (0, 0) for k in (0, 1)], mode="symmetric")
         taken = [padded.take(np.arange(k, k + size, factor), axis=axis) for k in range(factor + 2)]
