@@ -443,7 +443,7 @@ def test_a_scene_takes_the_device_and_its_identity_the_files(tmp_path: Path, fra
     write(tmp_path / "dark.png", dark)
     other = built(tmp_path)
     assert other.attributes["scene_hash"] != first.attributes["scene_hash"]
-    # a hot pixel no longer counts in the mean of the flat, to which all responses of its colour refer: a part in 1e5
+    # a hot pixel no longer counts in the mean of the flat, to which all responses of its colour refer: 1e-5 of them
     changed = other.read_sample(0).layers["raw"].astype(int) - raw
     assert changed[6, 8]
     assert np.abs(changed).max() == 1
