@@ -273,7 +273,8 @@ def test_light_of_a_flare_smears_in_the_image_as_in_its_mask(exposure_s: float) 
     result = vbnfault.inject(image, {"straylight": {"model": "texture"}}, camera=camera, sun=(90.0, 30.0), seed=3)
     changed, mask = result.image != image, result.masks[0]
     assert 0.1 < mask.mean() < 0.9
-    assert (changed != mask).mean() < 0.05  # levels that noise moves across a rounding, at the edge of the flare
+    # levels that noise moves across a rounding, at the edge of the flare and in the weak lines below it
+    assert (changed != mask).mean() < 0.07
     assert (mask.all(axis=0).mean() > 0.2) == (exposure_s < 0.01)
 
 

@@ -429,9 +429,9 @@ _HIDDEN = 3.0  # height over which dust hides relief, over the relief's deviatio
 _UNITS_M = (
     (260.0, 0.35),
     (110.0, 0.35),
-    (45.0, 0.45),
-    (18.0, 0.6),
-    (8.0, 0.3),
+    (45.0, 0.3),
+    (18.0, 0.2),
+    (8.0, 0.15),
 )  # size of units of the ground, and how their cover differs
 _CLOD_CELLS_M = (2.1, 1.2, 0.7)
 _CRACK_DEPTH = 0.30  # of the cracks between blocks, per unit of the blocks' height
