@@ -229,15 +229,14 @@ def step_of(frame: F32) -> float:
 def nearest_gain(real: Look, rendered: Look, gains: Sequence[float], stretch: float) -> float:
     """Return the gain whose noise in the sky is nearest to the frame's.
 
-    The variance goes with the gain where it is of photons, with its square where it is of the readout: with its
-    power of 1.5. `rendered` has the first of the gains; levels are light to the power `stretch`.
+    Its variance goes with the gain's square, a little less where it is of photons. `rendered` has the first of the gains; levels are light to the power `stretch`.
     """
     if len(gains) == 1 or real.clipped:
         return gains[0]
     ratio = noise_variance(real, stretch) / noise_variance(rendered, stretch)
     if not ratio > 0:
         return gains[0]
-    return min(gains, key=lambda gain: abs(np.log(ratio * (gains[0] / gain) ** 1.5)))
+    return min(gains, key=lambda gain: abs(np.log(ratio * (gains[0] / gain) ** 2)))
 
 
 def noise_variance(one: Look, stretch: float) -> float:
