@@ -229,7 +229,8 @@ def step_of(frame: F32) -> float:
 def nearest_gain(real: Look, rendered: Look, gains: Sequence[float], stretch: float) -> float:
     """Return the gain whose noise in the sky is nearest to the frame's.
 
-    Its variance goes with the gain's square, a little less where it is of photons. `rendered` has the first of the gains; levels are light to the power `stretch`.
+    Its variance goes with the gain's square, a little less where it is of photons. `rendered` has the first of the
+    gains; levels are light to the power `stretch`.
     """
     if len(gains) == 1 or real.clipped:
         return gains[0]
