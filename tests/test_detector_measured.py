@@ -443,11 +443,8 @@ def test_a_scene_takes_the_device_and_its_identity_the_files(tmp_path: Path, fra
     write(tmp_path / "dark.png", dark)
     other = built(tmp_path)
     assert other.attributes["scene_hash"] != first.attributes["scene_hash"]
-    # a hot pixel no longer counts in the mean of the flat, to which all responses of its colour refer: 1e-5 of them
-    changed = other.read_sample(0).layers["raw"].astype(int) - raw
-    assert changed[6, 8]
-    assert np.abs(changed).max() == 1
-    assert np.count_nonzero(changed) <= 4
+    changed = np.argwhere(other.read_sample(0).layers["raw"] != raw)
+    assert (changed == [6, 8]).all()
     assert other.read_sample(0).layers["defects"][6, 8] & HOT
     with pytest.raises(InputError, match=r"camera.individuals = 2: must be 1, since the sensor file's defects"):
         built(tmp_path, individuals=2)

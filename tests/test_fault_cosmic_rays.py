@@ -108,8 +108,10 @@ def test_tracks_that_end_leave_a_part_of_their_charge_and_length() -> None:
     ended = parts[:, 0] < 1 - 1e-3
     # u⁸ is above 1 - 1e-3 in 0.013 % of them; four standard deviations
     assert ended.mean() == pytest.approx(0.6, abs=4 * np.sqrt(0.24 / len(parts)) + 0.001)
-    # electrons are rounded to 0.001: parts of 0.01 or more keep 3 digits
-    large = parts[ended & (parts[:, 0] > 0.01), 0]
+    # electrons are rounded to 0.001, so the least parts are 0; those of 0.01 or more keep 3 digits. Of all, 0.01 to
+    # the power of 1/8 are below; four standard deviations
+    large, below = parts[ended & (parts[:, 0] > 0.01), 0], 0.01**0.125
+    assert len(large) / ended.sum() == pytest.approx(1 - below, abs=4 * np.sqrt(below * (1 - below) / ended.sum()))
     assert stats.kstest(large, lambda part: (part**0.125 - 0.01**0.125) / (1 - 0.01**0.125)).pvalue > 1e-3
 
 

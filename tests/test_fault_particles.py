@@ -343,7 +343,7 @@ def test_a_grain_hides_what_is_behind_it_and_the_ground_hides_a_grain() -> None:
 
 
 def test_tracks_in_a_navigation_camera() -> None:
-    """Published loss of dust, sizes and albedo give about a hundred tracks at perihelion, a few at 3.6 au."""
+    """Published loss of dust, sizes and albedo give some tens of tracks at perihelion, hardly one at 3.6 au."""
     detector = MosaicDetector(
         sensor=load_sensor("rosetta_navcam"), seed=3, width_px=1024, height_px=1024, direction="up"
     )
@@ -360,7 +360,7 @@ def test_tracks_in_a_navigation_camera() -> None:
         fault = make("particles", density_per_m3=per_m3, least_noise=5.0)
         tracks.append(np.mean([fault.draw(c, rng(seed))["count"] for seed in range(4)]))
     assert noise_e == 1.6
-    assert 50 < tracks[0] < 200
+    assert 10 < tracks[0] < 100
     assert tracks[1] < 6
 
 

@@ -265,7 +265,7 @@ def test_images_with_one_sun_share_its_straylight_and_have_the_bits_of_their_own
     assert (results[0].image != results[2].image).any()
 
 
-@pytest.mark.parametrize("exposure_s", [0.3, 5e-4])
+@pytest.mark.parametrize("exposure_s", [0.3, 2.5e-4])
 def test_light_of_a_flare_smears_in_the_image_as_in_its_mask(exposure_s: float) -> None:
     """In a frame-transfer CCD a short exposure has lines above and below a flare; both say where."""
     image = np.full((128, 128), 20, np.uint8)
@@ -273,8 +273,7 @@ def test_light_of_a_flare_smears_in_the_image_as_in_its_mask(exposure_s: float) 
     result = vbnfault.inject(image, {"straylight": {"model": "texture"}}, camera=camera, sun=(90.0, 30.0), seed=3)
     changed, mask = result.image != image, result.masks[0]
     assert 0.1 < mask.mean() < 0.9
-    # levels that noise moves across a rounding, at the edge of the flare and in the weak lines below it
-    assert (changed != mask).mean() < 0.07
+    assert (changed != mask).mean() < 0.05  # levels that noise moves across a rounding, at the edge of the flare
     assert (mask.all(axis=0).mean() > 0.2) == (exposure_s < 0.01)
 
 

@@ -35,8 +35,8 @@ from ..scene.trajectory import FlownPose, Trajectory
 from .frames import F32, Look, compare, look, shift_between, shifted, similarity_between
 
 _SEARCH_PX = 16  # largest shift, for frames of 512 px
-# This part of a mean over pixels is light of each of the pixels beside them, in a column and in a row: noise of
-# neighbours in the sky of Rosetta's frames correlates by twice as much.
+# A pixel that is a mean also has this part of the light of each neighbour, above and below it and at its sides.
+# Noise of such neighbours in the sky of Rosetta's frames correlates by twice as much.
 _LEAKS = 0.026, 0.036
 # The exposure is metered on the first of these percentiles whose level is below the given one.
 _WHITE, _PERCENTILES = 250, (50.0, 40.0, 30.0, 20.0, 10.0)

@@ -36,7 +36,7 @@ _ROUNDS = 2  # in which the place is found from which light comes
 # Pixels whose paths depart by more than this from those around, up to either end, may hide one another.
 _APART_PX, _APART_OF_LENGTH = 0.12, 0.02
 _FARTHEST_PX = 64  # from such a step, within which pixels get new rays
-# There are so many new rays for each sample of the whole view, at least so many for each of its pixels, and a pixel
+# New rays come to 0.6 of all samples of the view, or to 32 for each of its pixels if that is more. A noisy pixel
 # gets from 16 to 1024 of them.
 _NEW_RAYS, _LEAST_RAYS_PER_PX, _SAMPLES = 0.6, 32, (16, 1024)
 _SURELY = 0.5  # of the noise allowed, below which a quarter of the rays will do: two halves of them tell little
@@ -151,7 +151,7 @@ class Paths:
         return float(max(longest)) * self.exposure_s
 
     def sources(self, time_s: float, rows: slice = slice(None)) -> F32:
-        """Return where the light comes from that each pixel of some rows gets, float32[y, x, 2].
+        """Return the places from which the pixels of some rows get their light, float32[y, x, 2].
 
         It is that of `time_s` after the middle of the pixel's exposure, as if ground beyond the rows moved as that
         at their border. The last axis is column and row, counted from the middle of the first pixel of these rows.
