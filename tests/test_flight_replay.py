@@ -200,8 +200,35 @@ def test_the_black_of_a_frame_is_that_of_its_sky() -> None:
     assert display.black_excess_dn(rendered, real) == pytest.approx(-1.2, abs=0.04)
     bright = fit_frames.look(np.where(body > 40, body, 20.0))  # smear or glow, and no black
     assert display.black_excess_dn(bright, rendered) == 0
-    clipped = fit_frames.look(np.where(body > 40, body, 0.0))
-    assert display.black_excess_dn(clipped, rendered) == 0
+
+
+def test_the_black_of_a_clipped_frame_leaves_as_much_of_the_image_dark() -> None:
+    display = fit_replay.Display(bias_dn=100, top_dn=4195, stretch=0.5)
+    row, column = np.indices((160, 160)) + 0.5
+    out = np.hypot(column - 80, row - 80) - 40
+    raw = np.where(out < 0, 2100.0, 100 + 60 * np.exp(-np.clip(out, 0, None) / 30))
+    real, rendered = (fit_frames.look(display.developed(raw, 1, black)) for black in (-20.0, 0.0))
+    assert 0.3 < (real.image == 0).mean() < 0.8
+    # levels are whole numbers, of which one is 2.2 DN wide at 20 DN
+    assert display.black_excess_dn(real, rendered) == pytest.approx(-20, abs=1.1)
+
+
+@pytest.mark.parametrize(("stretch", "unit"), [(1.0, 1e-3), (0.5, 5e-4)])
+def test_smear_is_no_body_and_tells_the_exposure(stretch: float, unit: float) -> None:
+    """A column has 80 px of the disc at most; each row of it and of its sky gets a part of the sum."""
+    body = (disc(80, 80) / 255) ** (1 / stretch)
+    sums = np.where(body > (40 / 255) ** (1 / stretch), body, 0).sum(axis=0)
+    below = np.arange(160)[:, None] >= 80
+    still = fit_frames.look(disc(80, 80))
+    assert not still.smeared
+    for above_row, below_row in ((2 * unit, 2 * unit), (4 * unit, 2.6 * unit)):
+        light = body + sums * np.where(below, below_row, above_row)
+        one = fit_frames.look(255 * np.clip(light, 0, 1) ** stretch)
+        assert one.smeared
+        assert (one.lit & still.lit).sum() / (one.lit | still.lit).sum() > 0.98
+        # the light of the body has its smear, too: of 80 px, as much again as 80 times the fraction
+        own = fit_replay.smear(one, stretch) * (1 + 80 * 0.5 * (above_row + below_row))
+        assert own == pytest.approx(0.5 * (above_row + below_row), rel=0.1)
 
 
 def test_centre_and_limb_of_the_body_lie_where_the_table_says(frames: Path, real_shape: Path) -> None:

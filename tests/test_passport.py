@@ -18,6 +18,7 @@ import vbnfault
 from vbnfault import cli
 from vbnfault.core.errors import InputError
 from vbnfault.fit import passport as fit_passport
+from vbnfault.fit.frames import look
 from vbnfault.fit.replay import Replay
 from vbnfault.fit.stars import encircled_radii
 from vbnfault.scene.trajectory import COLUMNS, load_trajectory
@@ -159,6 +160,19 @@ def test_distances_are_those_of_shifted_values() -> None:
     assert np.isnan(none.distance)
 
 
+def test_a_frame_of_a_short_exposure_is_replayed_with_its_smear(frames: Path) -> None:
+    """A stop that lets in 11.6 times the light and no attenuator: the exposure is as many times shorter."""
+    table = load_trajectory(str(frames / "poses.csv"))
+    open_stop = SMALL | {"camera.transmission": 1.0, "camera.f_number": 1.5}
+    short = Replay(vbnfault.load_scene("rosetta67p", open_stop), table)
+    frame = short.display.developed(short.session.simulate(2).layers["raw"], 2)
+    assert look(frame).smeared
+    pair = Replay(vbnfault.load_scene("rosetta67p", SMALL), table).pair(2, frame)
+    assert pair.settings["transmission"] == pytest.approx((5.1 / 1.5) ** 2, rel=0.1)
+    assert pair.rendered.smeared
+    assert pair.figures["iou"] > 0.98
+
+
 # --- stars ------------------------------------------------------------------------------------------------------
 
 
@@ -184,6 +198,17 @@ def test_radii_of_stars_are_those_of_a_gaussian(sigma_px: float, stretch: float)
     found = encircled_radii(levels, light, np.ones(levels.shape, bool))
     # half a level of rounding in 78 px is 5 % of the light of the faintest, and less of the median star
     assert found == pytest.approx((wide * np.sqrt(2 * np.log(2)), wide * np.sqrt(2 * np.log(5))), rel=0.06)
+
+
+def test_faint_stars_do_not_hide_how_wide_bright_ones_are() -> None:
+    """Noise of 1.5 in 78 px is a thirteenth of the light of a faint star at least: its radii mean little."""
+    light, rng = star_field(0.9, 1.0, 6)[1], np.random.default_rng(8)
+    for y, x in rng.integers(12, 244, (20, 2)):
+        light[y - 1 : y + 2, x - 1 : x + 2] += 0.08 * np.outer((1, 2, 1), (1, 2, 1)) / 4
+    light = (light + 1.5 / 255 * rng.normal(size=light.shape)).astype(np.float32)
+    wide = np.sqrt(0.9**2 + 2 / 12)
+    found = encircled_radii(255 * light, light, np.ones(light.shape, bool))
+    assert found == pytest.approx((wide * np.sqrt(2 * np.log(2)), wide * np.sqrt(2 * np.log(5))), rel=0.1)
 
 
 def test_a_sky_without_stars_says_nothing() -> None:

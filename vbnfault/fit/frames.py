@@ -66,11 +66,13 @@ class Look:
     """Hold an image with its background and brightness, and what follows from them.
 
     `level` float32[y, x] is the brightness, 0 in the background and 1 at the 99th percentile of the lit body; `lit`
-    bool[y, x] the lit silhouette, `sky` bool[y, x] what lies well outside it.
+    bool[y, x] the lit silhouette, `sky` bool[y, x] what lies well outside it. `smeared` says whether columns have
+    backgrounds of their own.
     """
 
     image: F32
     background: float
+    smeared: bool
     bright: float
     level: F32
     lit: Mask
@@ -85,11 +87,9 @@ class Look:
 def look(image: NDArray[Any]) -> Look:
     """Return an image's brightness, lit silhouette and sky."""
     image = np.asarray(image, dtype=np.float32)
-    body = image > _BODY_LEVEL * np.percentile(image, 99.5)
-    far = ndimage.distance_transform_edt(~body) > 0.1 * np.sqrt(body.sum())
-    background = float(np.median(image[far])) if far.any() else 0.0
-    bright = float(np.percentile(image[body], _BRIGHT_PERCENTILE)) if body.any() else 1.0
-    level = (image - _column_background(image, far, background, bright)) / max(bright - background, 1e-6)
+    background, bright, level, smeared = _levels(image, image > _BODY_LEVEL * np.percentile(image, 99.5))
+    if smeared:  # what is surely the body may have been the smear
+        background, bright, level, _ = _levels(image, level > _BODY_LEVEL)
     # spots of the sky are no body: keep what is large, or near the largest part
     labels, count = ndimage.label(ndimage.median_filter(level, 3) > LIT)
     sizes = np.bincount(labels.ravel(), minlength=count + 1)
@@ -100,17 +100,34 @@ def look(image: NDArray[Any]) -> Look:
     kept[0] = False
     lit = (level > LIT) & ndimage.binary_dilation(kept[labels], iterations=2)
     sky = ndimage.distance_transform_edt(~lit) > max(3.0, 0.05 * np.sqrt(lit.sum() / np.pi))
-    return Look(image=image, background=background, bright=bright, level=level, lit=lit, sky=sky)
+    return Look(image=image, background=background, smeared=smeared, bright=bright, level=level, lit=lit, sky=sky)
 
 
-def _column_background(image: F32, sky: Mask, background: float, bright: float) -> F32:
-    """Return the background of each column, float32[x]: the same for all, unless smear or lost columns show."""
+def _levels(image: F32, body: Mask) -> tuple[float, float, F32, bool]:
+    """Return background, brightness and `Look.level` of an image, and whether it is smeared.
+
+    `body` holds pixels that are surely the body. Where smear or lost columns show, the background is that of each
+    column, above and below the body's middle: one smears as charge is cleared, the other as it is read.
+    """
+    far = ndimage.distance_transform_edt(~body) > 0.1 * np.sqrt(body.sum())
+    background = float(np.median(image[far])) if far.any() else 0.0
+    bright = float(np.percentile(image[body], _BRIGHT_PERCENTILE)) if body.any() else 1.0
+    middle = round(ndimage.center_of_mass(body)[0]) if body.any() else 0
+    halves = slice(None, middle), slice(middle, None)
+    columns = [column_levels(image[part], far[part], background) for part in halves]
+    smeared = bool(max(np.abs(of - background).max() for of in columns) > _SMEAR * (bright - background))
+    level = image - np.float32(background)
+    for part, of in zip(halves if smeared else (), columns, strict=False):
+        level[part] = image[part] - of
+    return background, bright, level / np.float32(max(bright - background, 1e-6)), smeared
+
+
+def column_levels(image: F32, sky: Mask, background: float) -> F32:
+    """Return the median of each column's sky, float32[x], and `background` where a column has none."""
     with np.errstate(all="ignore"), warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # of columns without sky
         columns = np.nanmedian(np.where(sky, image, np.nan), axis=0)
-    columns = np.where(np.isfinite(columns), columns, background)
-    smeared = np.abs(columns - background).max() > _SMEAR * (bright - background)
-    return np.asarray(columns if smeared else np.full_like(columns, background), dtype=np.float32)
+    return np.where(np.isfinite(columns), columns, background).astype(np.float32)
 
 
 def shift_between(real: Look, rendered: Look, *, search_px: int) -> tuple[float, float]:

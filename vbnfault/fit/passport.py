@@ -70,6 +70,7 @@ OF_PAIRS = {
 OF_PAIRS |= {"rank_smooth": "rank correlation, smoothed to the shape's plates"}
 _RESAMPLES = 1000
 _SHEET_PAIRS, _PAIR_PX = 12, 560
+_SHOWN = "metering_level", "gain", "black_dn", "transmission"  # of what each frame set
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -355,7 +356,7 @@ def _write_page(
             for name, values in figures.items()
         ],
         settings=[
-            [name, *(number_text(one["settings"][key], 4) for key in ("metering_level", "gain", "black_dn"))]
+            [name, *(number_text(one["settings"].get(key, math.nan), 4) for key in _SHOWN)]
             for name, one in result["frames"].items()
         ],
         pairs=[(name, image_url(_side_by_side(real, rendered), 2 * _PAIR_PX)) for name, real, rendered in chosen],

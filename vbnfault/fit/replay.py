@@ -7,8 +7,11 @@ Pose, exposure, gain and black of a real frame are never known well enough, so e
   is;
 - the exposure, metered so that the rendered body is as bright as the frame's in its median; an overexposed frame is
   metered on a percentile that is not yet white;
+- where its columns are smeared: a transmission with which an exposure as bright smears as much, since a camera has
+  more than one way to let in less light, and a shorter exposure smears more;
 - the gain, of those that the camera has, whose noise in the sky is nearest to the frame's;
-- the black: the difference of the median levels of the skies, where the frame's is not clipped.
+- the black: the difference of the median levels of the skies; where a part of the frame is clipped, what leaves as
+  much of the image at 0.
 
 All else is of the scene. Frames that are smaller than the camera's image by a whole factor are means of as many
 pixels; the means are taken before the stretch. So are those of Rosetta's frames: single pixels of their sky are
@@ -32,7 +35,7 @@ from ..core.errors import InputError
 from ..pipeline import Session
 from ..scene.config import Scene
 from ..scene.trajectory import FlownPose, Trajectory
-from .frames import F32, Look, compare, look, shift_between, shifted, similarity_between
+from .frames import F32, Look, column_levels, compare, look, shift_between, shifted, similarity_between
 
 _SEARCH_PX = 16  # largest shift, for frames of 512 px
 # A pixel that is a mean also has this part of the light of each neighbour, above and below it and at its sides.
@@ -41,6 +44,9 @@ _LEAKS = 0.026, 0.036
 # The exposure is metered on the first of these percentiles whose level is below the given one.
 _WHITE, _PERCENTILES = 250, (50.0, 40.0, 30.0, 20.0, 10.0)
 _MOST_BLACK = 1e-3  # of white: more is light. Of 32 frames of Rosetta's the black differs by 4e-4
+_FEW_DARK = 0.02  # of the pixels at 0: with more, the black lies in the light of the sky
+# Relative error of a transmission that follows from smear, largest change of it at once, and most renderings for it
+_SAME_SMEAR, _MOST_LIGHT, _MOST_TRIES = 0.05, 20.0, 6
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -101,10 +107,14 @@ class Display:
     def black_excess_dn(self, real: Look, rendered: Look) -> float:
         """Return by how many DN the sky of a frame is brighter than that of an aligned image.
 
-        0 where the frame's sky is clipped, or so much brighter that its light is no black.
+        Of a clipped frame it follows from the fraction of its pixels at 0. It is 0 where the frame has no sky, or
+        one so much brighter that its light is no black.
         """
+        dark = float((real.image == 0).mean())
+        if dark > _FEW_DARK:
+            return -self.fraction(float(np.quantile(rendered.image, dark))) * (self.top_dn - self.bias_dn)
         sky = real.sky & rendered.sky
-        if real.clipped or not sky.any():
+        if not sky.any():
             return 0.0
         # levels are whole numbers, so means first; tracks hardly move the median of these
         levels = [float(np.median(ndimage.uniform_filter(one.image, 9)[sky])) for one in (real, rendered)]
@@ -174,6 +184,7 @@ class Replay:
             moved = mended_pose(pose, similarity, self.scene.camera.fov_deg, frame.shape)
             trajectory = with_pose(trajectory, row, *moved)
             raw = self._raw(row, trajectory, settings | {"gain": self.gains[0]})
+        raw = self._smeared(row, trajectory, real, raw, factor, settings)
         before = look(self.display.developed(raw, factor))
         gain = nearest_gain(real, before, self.gains, self.display.stretch)
         if gain != self.gains[0]:
@@ -196,6 +207,28 @@ class Replay:
         plate_px = self._plate_m / (pixel_m / frame.shape[1])
         figures = compare(real, rendered, sun_xy, plate_px, self.display.stretch)
         return Pair(name=trajectory.name[row], real=real, rendered=rendered, figures=figures, settings=settings)
+
+    def _smeared(
+        self, row: int, trajectory: Trajectory, real: Look, raw: NDArray[Any], factor: int, settings: dict[str, Any]
+    ) -> NDArray[Any]:
+        """Return a raw image whose columns smear as the frame's, and set the `transmission` that it was taken with.
+
+        A value above 1 stands for a wider stop. An image without smear is returned as it is, and so is that of a
+        lens whose prescription says what it transmits.
+        """
+        lens, stretch = self.session.base_camera.lens, self.display.stretch
+        if not real.smeared or lens.real is not None:
+            return raw
+        wanted, transmission = smear(real, stretch), lens.transmission
+        for _ in range(_MOST_TRIES):
+            found = smear(look(self.display.developed(raw, factor)), stretch)
+            # what the lens scatters into the sky goes with the light of columns, too, so the next one is nearer
+            ratio = min(wanted / found, _MOST_LIGHT) if found > 0 else _MOST_LIGHT
+            if abs(ratio - 1) < _SAME_SMEAR:
+                break
+            settings["transmission"] = transmission = ratio * transmission
+            raw = self._raw(row, trajectory, settings | {"gain": self.gains[0]})
+        return raw
 
     def _raw(self, row: int, trajectory: Trajectory, settings: dict[str, Any]) -> NDArray[Any]:
         camera = self.scene.camera.model_copy(update=settings)
@@ -224,6 +257,14 @@ class Replay:
 def step_of(frame: F32) -> float:
     """Return the distance of the levels that a frame of 0 to 255 tells apart: 1 with 8 bits, 1/257 with 16."""
     return 1.0 if np.array_equal(frame, np.round(frame)) else 1 / 257
+
+
+def smear(one: Look, stretch: float) -> float:
+    """Return the light of a column's sky over the sum of the light of its body, by regression over the columns."""
+    body = np.where(one.lit, one.image.astype(np.float64), 0) ** (1 / stretch)
+    sky = column_levels(one.image, one.sky, one.background) ** (1 / stretch)
+    columns = one.lit.any(axis=0)
+    return float(np.polyfit(body.sum(axis=0)[columns], sky[columns], 1)[0])
 
 
 def nearest_gain(real: Look, rendered: Look, gains: Sequence[float], stretch: float) -> float:

@@ -43,7 +43,8 @@ def encircled_radii(image: F32, light: F32, good: Mask) -> tuple[float, float]:
     """Return the radii in px that hold 50 and 80 % of the light of stars, or NaN where fewer than three show.
 
     They are those of the image, of which the pixels are a part. Hits of single pixels and tracks are left out.
-    The light of each star counts up to 5 px; the median over the stars leaves out what is no star.
+    The light of each star counts up to 5 px. The median over the stars leaves out what is no star; each counts by
+    its light, since noise in 78 px hides where the light of a faint one ends.
 
     Parameters
     ----------
@@ -54,20 +55,21 @@ def encircled_radii(image: F32, light: F32, good: Mask) -> tuple[float, float]:
     good
         bool[y, x], pixels of the sky.
     """
-    radii, curves = np.linspace(0, STAR_PX, 41), []
+    radii, curves, lights = np.linspace(0, STAR_PX, 41), [], []
     for row, column in stars(image, 250.0, good) if good.any() else []:
         part = light[row - STAR_PX : row + STAR_PX + 1, column - STAR_PX : column + STAR_PX + 1].astype(np.float64)
-        if (curve := _growth(part, radii)) is not None:
-            curves.append(curve)
+        if (found := _growth(part, radii)) is not None:
+            curves.append(found[0])
+            lights.append(found[1])
     if len(curves) < _FEWEST_STARS:
         return float("nan"), float("nan")
-    median = np.maximum.accumulate(np.median(curves, axis=0)) + 1e-9 * radii
-    half, most = np.interp((0.5, 0.8), median, radii)
+    median = np.quantile(curves, 0.5, axis=0, weights=lights, method="inverted_cdf")
+    half, most = np.interp((0.5, 0.8), np.maximum.accumulate(median) + 1e-9 * radii, radii)
     return float(half), float(most)
 
 
-def _growth(part: NDArray[np.float64], radii: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """Return the fraction of a star's light within each radius in px, or None of what is no star."""
+def _growth(part: NDArray[np.float64], radii: NDArray[np.float64]) -> tuple[NDArray[np.float64], float] | None:
+    """Return the fraction of a star's light within each radius in px and its core's light, or None of no star."""
     axis = np.arange(-STAR_PX, STAR_PX + 1)
     away = np.hypot(axis, axis[:, None])
     part = part - np.median(part[away > STAR_PX - 1])
@@ -84,4 +86,4 @@ def _growth(part: NDArray[np.float64], radii: NDArray[np.float64]) -> NDArray[np
     light = np.repeat(np.repeat(part, _FINE, 0), _FINE, 1)
     within, _ = np.histogram(distance, radii, weights=light)
     total = float(within.sum())
-    return np.append(0, np.cumsum(within)) / total if total > 0 else None
+    return (np.append(0, np.cumsum(within)) / total, float(core.sum())) if total > 0 else None
