@@ -45,8 +45,8 @@ _LEAKS = 0.026, 0.036
 _WHITE, _PERCENTILES = 250, (50.0, 40.0, 30.0, 20.0, 10.0)
 _MOST_BLACK = 1e-3  # of white: more is light. Of 32 frames of Rosetta's the black differs by 4e-4
 _FEW_DARK = 0.02  # of the pixels at 0: with more, the black lies in the light of the sky
-# Relative error of a transmission that follows from smear, largest change of it at once, and most renderings for it
-_SAME_SMEAR, _MOST_LIGHT, _MOST_TRIES = 0.05, 20.0, 6
+# Relative error of smear and brightness of smeared frames, largest change of light at once, and most renderings
+_SAME_SMEAR, _MOST_LIGHT, _MOST_TRIES = 0.02, 20.0, 8
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -213,20 +213,24 @@ class Replay:
     ) -> NDArray[Any]:
         """Return a raw image whose columns smear as the frame's, and set the `transmission` that it was taken with.
 
-        A value above 1 stands for a wider stop. An image without smear is returned as it is, and so is that of a
-        lens whose prescription says what it transmits.
+        A value above 1 stands for a wider stop. The `metering_level` is set anew, since smear adds to the body. An
+        image without smear is returned as it is, and so is that of a lens with a transmission of its own.
         """
-        lens, stretch = self.session.base_camera.lens, self.display.stretch
+        lens, stretch, display = self.session.base_camera.lens, self.display.stretch, self.display
         if not real.smeared or lens.real is not None:
             return raw
-        wanted, transmission = smear(real, stretch), lens.transmission
+        wanted, transmission, level = smear(real, stretch), lens.transmission, settings["metering_level"]
         for _ in range(_MOST_TRIES):
-            found = smear(look(self.display.developed(raw, factor)), stretch)
+            black = display.black_excess_dn(real, look(display.developed(raw, factor)))
+            one = look(display.developed(raw, factor, black))
+            bright = float(np.percentile(one.image[one.lit], settings["metering_percentile"]))
             # what the lens scatters into the sky goes with the light of columns, too, so the next one is nearer
+            found, brighter = smear(one, stretch), level / display.fraction(bright)
             ratio = min(wanted / found, _MOST_LIGHT) if found > 0 else _MOST_LIGHT
-            if abs(ratio - 1) < _SAME_SMEAR:
+            if max(abs(ratio - 1), abs(brighter - 1)) < _SAME_SMEAR:
                 break
             settings["transmission"] = transmission = ratio * transmission
+            settings["metering_level"] *= brighter
             raw = self._raw(row, trajectory, settings | {"gain": self.gains[0]})
         return raw
 
