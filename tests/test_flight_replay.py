@@ -221,7 +221,7 @@ def test_smear_is_no_body_and_tells_the_exposure(stretch: float, unit: float) ->
     below = np.arange(160)[:, None] >= 80
     still = fit_frames.look(disc(80, 80))
     assert not still.smeared
-    for above_row, below_row in ((2 * unit, 2 * unit), (4 * unit, 2.6 * unit)):
+    for above_row, below_row in ((2 * unit, 2 * unit), (4 * unit, 0.8 * unit)):
         light = body + sums * np.where(below, below_row, above_row)
         one = fit_frames.look(255 * np.clip(light, 0, 1) ** stretch)
         assert one.smeared

@@ -115,7 +115,7 @@ def _levels(image: F32, body: Mask) -> tuple[float, float, F32, bool]:
     bright = float(np.percentile(image[body], _BRIGHT_PERCENTILE)) if body.any() else 1.0
     middle = round(ndimage.center_of_mass(body)[0]) if body.any() else 0
     halves = slice(None, middle), slice(middle, None)
-    columns = [column_levels(image[part], far[part], background) for part in halves]
+    columns = [_column_levels(image[part], far[part], background) for part in halves]
     smeared = bool(max(np.abs(of - background).max() for of in columns) > _SMEAR * (bright - background))
     level = image - np.float32(background)
     for part, of in zip(halves if smeared else (), columns, strict=False):
@@ -123,7 +123,7 @@ def _levels(image: F32, body: Mask) -> tuple[float, float, F32, bool]:
     return background, bright, level / np.float32(max(bright - background, 1e-6)), smeared
 
 
-def column_levels(image: F32, sky: Mask, background: float) -> F32:
+def _column_levels(image: F32, sky: Mask, background: float) -> F32:
     """Return the median of each column's sky, float32[x], and `background` where a column has none."""
     with np.errstate(all="ignore"), warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # of columns without sky

@@ -35,7 +35,7 @@ from ..core.errors import InputError
 from ..pipeline import Session
 from ..scene.config import Scene
 from ..scene.trajectory import FlownPose, Trajectory
-from .frames import F32, Look, column_levels, compare, look, shift_between, shifted, similarity_between
+from .frames import F32, Look, compare, look, shift_between, shifted, similarity_between
 
 _SEARCH_PX = 16  # largest shift, for frames of 512 px
 # A pixel that is a mean also has this part of the light of each neighbour, above and below it and at its sides.
@@ -264,11 +264,12 @@ def step_of(frame: F32) -> float:
 
 
 def smear(one: Look, stretch: float) -> float:
-    """Return the light of a column's sky over the sum of the light of its body, by regression over the columns."""
-    body = np.where(one.lit, one.image.astype(np.float64), 0) ** (1 / stretch)
-    sky = column_levels(one.image, one.sky, one.background) ** (1 / stretch)
-    columns = one.lit.any(axis=0)
-    return float(np.polyfit(body.sum(axis=0)[columns], sky[columns], 1)[0])
+    """Return the mean light of a column's sky over the sum of its body's, by regression over the body's columns."""
+    light = one.image.astype(np.float64) ** (1 / stretch)
+    body, sky = (np.where(mask, light, 0).sum(axis=0) for mask in (one.lit, one.sky))
+    rows = one.sky.sum(axis=0)
+    columns = one.lit.any(axis=0) & (rows > 0)
+    return float(np.polyfit(body[columns], sky[columns] / rows[columns], 1)[0])
 
 
 def nearest_gain(real: Look, rendered: Look, gains: Sequence[float], stretch: float) -> float:
