@@ -18,7 +18,7 @@ import vbnfault
 from vbnfault import cli
 from vbnfault.core.errors import InputError
 from vbnfault.fit import passport as fit_passport
-from vbnfault.fit.frames import look
+from vbnfault.fit.frames import look, read_frame
 from vbnfault.fit.replay import Replay
 from vbnfault.fit.stars import encircled_radii
 from vbnfault.scene.trajectory import COLUMNS, load_trajectory
@@ -171,6 +171,16 @@ def test_a_frame_of_a_short_exposure_is_replayed_with_its_smear(frames: Path) ->
     assert pair.settings["transmission"] == pytest.approx((5.1 / 1.5) ** 2, rel=0.1)
     assert pair.rendered.smeared
     assert pair.figures["iou"] > 0.98
+
+
+def test_lost_columns_are_no_smear(frames: Path) -> None:
+    """Grey columns have backgrounds of their own, and say nothing of the exposure."""
+    frame = read_frame(frames, "frame_2")
+    middle = int(np.flatnonzero(look(frame).lit.any(axis=0)).mean())
+    frame[:, middle - 6 : middle : 3] = 40
+    assert look(frame).smeared
+    scene = vbnfault.load_scene("rosetta67p", SMALL)
+    assert "transmission" not in Replay(scene, load_trajectory(str(frames / "poses.csv"))).pair(2, frame).settings
 
 
 # --- stars ------------------------------------------------------------------------------------------------------

@@ -44,9 +44,10 @@ _LEAKS = 0.026, 0.036
 # The exposure is metered on the first of these percentiles whose level is below the given one.
 _WHITE, _PERCENTILES = 250, (50.0, 40.0, 30.0, 20.0, 10.0)
 _MOST_BLACK = 1e-3  # of white: more is light. Of 32 frames of Rosetta's the black differs by 4e-4
-_FEW_DARK = 0.02  # of the pixels at 0: with more, the black lies in the light of the sky
-# Relative error of smear and brightness of smeared frames, largest change of light at once, and most renderings
-_SAME_SMEAR, _MOST_LIGHT, _MOST_TRIES = 0.02, 20.0, 8
+_FEW_DARK = 0.25  # of the sky at 0: with more, which lost lines seldom are, the black lies in the light of the sky
+# Ratio of smears from which the exposure was a shorter one, and not a column lost; relative error of smear and
+# brightness that is left, largest change of light at once, and most renderings
+_SMEARED, _SAME_SMEAR, _MOST_LIGHT, _MOST_TRIES = 2.0, 0.02, 20.0, 8
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -110,12 +111,12 @@ class Display:
         Of a clipped frame it follows from the fraction of its pixels at 0. It is 0 where the frame has no sky, or
         one so much brighter that its light is no black.
         """
-        dark = float((real.image == 0).mean())
-        if dark > _FEW_DARK:
-            return -self.fraction(float(np.quantile(rendered.image, dark))) * (self.top_dn - self.bias_dn)
-        sky = real.sky & rendered.sky
+        sky, dark = real.sky & rendered.sky, real.image == 0
         if not sky.any():
             return 0.0
+        if dark[sky].mean() > _FEW_DARK:
+            level = float(np.quantile(rendered.image, dark.mean()))
+            return -self.fraction(level) * (self.top_dn - self.bias_dn)
         # levels are whole numbers, so means first; tracks hardly move the median of these
         levels = [float(np.median(ndimage.uniform_filter(one.image, 9)[sky])) for one in (real, rendered)]
         excess = self.fraction(levels[0]) - self.fraction(levels[1])
@@ -217,9 +218,11 @@ class Replay:
         image without smear is returned as it is, and so is that of a lens with a transmission of its own.
         """
         lens, stretch, display = self.session.base_camera.lens, self.display.stretch, self.display
-        if not real.smeared or lens.real is not None:
+        plain = look(display.developed(raw, factor))
+        wanted = smear(real, stretch) if real.smeared and lens.real is None and plain.lit.any() else 0.0
+        if wanted <= _SMEARED * smear(plain, stretch):
             return raw
-        wanted, transmission, level = smear(real, stretch), lens.transmission, settings["metering_level"]
+        transmission, level = lens.transmission, settings["metering_level"]
         for _ in range(_MOST_TRIES):
             black = display.black_excess_dn(real, look(display.developed(raw, factor)))
             one = look(display.developed(raw, factor, black))
@@ -264,12 +267,17 @@ def step_of(frame: F32) -> float:
 
 
 def smear(one: Look, stretch: float) -> float:
-    """Return the mean light of a column's sky over the sum of its body's, by regression over the body's columns."""
+    """Return the mean light of a column's sky over the sum of its body's, by regression over the body's columns.
+
+    It is at least 0, and 0 of a body that leaves no sky in its columns.
+    """
     light = one.image.astype(np.float64) ** (1 / stretch)
     body, sky = (np.where(mask, light, 0).sum(axis=0) for mask in (one.lit, one.sky))
     rows = one.sky.sum(axis=0)
     columns = one.lit.any(axis=0) & (rows > 0)
-    return float(np.polyfit(body[columns], sky[columns] / rows[columns], 1)[0])
+    if len(np.unique(body[columns])) < 2:
+        return 0.0
+    return max(float(np.polyfit(body[columns], sky[columns] / rows[columns], 1)[0]), 0.0)
 
 
 def nearest_gain(real: Look, rendered: Look, gains: Sequence[float], stretch: float) -> float:
