@@ -56,7 +56,7 @@ _LARGE_PART, _NEAR_BODY = 0.02, 0.4
 _SMEAR = 0.1  # of the brightness: columns whose sky differs by more are smeared
 _ALIGNED_SIGMA_PX = 1.5  # blur before the similarity is searched: finer texture is random
 _MOST_TURN_RAD, _MOST_SCALE = 0.035, 0.02  # errors of pose that are mended
-# Of the statistics of the body. Below 0.03, half of Rosetta's frames have ten pixels or fewer
+# These limits hold for the statistics of the body. Half of Rosetta's frames have ten pixels or fewer below 0.03
 _FEWEST_PX, _DARK, _CLOSED_PX, _PROFILE_PX = 200, 0.05, 12, 8
 _PLATE_PX = 4.0
 _CLIPPED = 0.5  # of the sky at 0: such a frame tells nothing of its background

@@ -38,15 +38,17 @@ from ..scene.trajectory import FlownPose, Trajectory
 from .frames import F32, Look, compare, look, shift_between, shifted, similarity_between
 
 _SEARCH_PX = 16  # largest shift, for frames of 512 px
-# A pixel that is a mean also has this part of the light of each neighbour, above and below it and at its sides.
-# Noise of such neighbours in the sky of Rosetta's frames correlates by twice as much.
+# A pixel of a halved frame also holds these fractions of the light of its neighbours: the first of each above and
+# below it, the second of each at its sides. Noise of neighbours in Rosetta's skies correlates by twice as much.
 _LEAKS = 0.026, 0.036
 # The exposure is metered on the first of these percentiles whose level is below the given one.
 _WHITE, _PERCENTILES = 250, (50.0, 40.0, 30.0, 20.0, 10.0)
 _MOST_BLACK = 1e-3  # of white: more is light. Of 32 frames of Rosetta's the black differs by 4e-4
-_FEW_DARK = 0.25  # of the sky at 0: with more, which lost lines seldom are, the black lies in the light of the sky
-# Ratio of smears from which the exposure was a shorter one, and not a column lost; relative error of smear and
-# brightness that is left, largest change of light at once, and most renderings
+# Where more of the sky than this is 0, the frame's black is brighter than a part of its sky. Lost lines are fewer.
+_FEW_DARK = 0.25
+# A frame that smears more than its image by the first factor had a shorter exposure; lost columns do not smear. The
+# search stops at the second, a relative error; it changes the light by the third at most, and renders at most the
+# fourth times.
 _SMEARED, _SAME_SMEAR, _MOST_LIGHT, _MOST_TRIES = 2.0, 0.02, 20.0, 8
 
 
@@ -185,7 +187,8 @@ class Replay:
             moved = mended_pose(pose, similarity, self.scene.camera.fov_deg, frame.shape)
             trajectory = with_pose(trajectory, row, *moved)
             raw = self._raw(row, trajectory, settings | {"gain": self.gains[0]})
-        raw = self._smeared(row, trajectory, real, raw, factor, settings)
+        if real.smeared:
+            raw = self._smeared(row, trajectory, real, raw, factor, settings)
         before = look(self.display.developed(raw, factor))
         gain = nearest_gain(real, before, self.gains, self.display.stretch)
         if gain != self.gains[0]:
@@ -212,14 +215,14 @@ class Replay:
     def _smeared(
         self, row: int, trajectory: Trajectory, real: Look, raw: NDArray[Any], factor: int, settings: dict[str, Any]
     ) -> NDArray[Any]:
-        """Return a raw image whose columns smear as the frame's, and set the `transmission` that it was taken with.
+        """Return a raw image whose columns smear as the frame's do, and set the `transmission` that makes them.
 
-        A value above 1 stands for a wider stop. The `metering_level` is set anew, since smear adds to the body. An
-        image without smear is returned as it is, and so is that of a lens with a transmission of its own.
+        A value above 1 stands for a wider stop. The `metering_level` is set anew, since smear adds to the body. The
+        image is returned as it is where the frame hardly smears more, and where the lens has its own transmission.
         """
         lens, stretch, display = self.session.base_camera.lens, self.display.stretch, self.display
         plain = look(display.developed(raw, factor))
-        wanted = smear(real, stretch) if real.smeared and lens.real is None and plain.lit.any() else 0.0
+        wanted = smear(real, stretch) if lens.real is None and plain.lit.any() else 0.0
         if wanted <= _SMEARED * smear(plain, stretch):
             return raw
         transmission, level = lens.transmission, settings["metering_level"]
@@ -267,9 +270,9 @@ def step_of(frame: F32) -> float:
 
 
 def smear(one: Look, stretch: float) -> float:
-    """Return the mean light of a column's sky over the sum of its body's, by regression over the body's columns.
+    """Return how much the mean light of a column's sky grows with the sum of light of the body in that column.
 
-    It is at least 0, and 0 of a body that leaves no sky in its columns.
+    It is the slope of a regression over the body's columns, at least 0, and 0 where the body leaves no sky in them.
     """
     light = one.image.astype(np.float64) ** (1 / stretch)
     body, sky = (np.where(mask, light, 0).sum(axis=0) for mask in (one.lit, one.sky))

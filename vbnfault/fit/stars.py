@@ -69,7 +69,7 @@ def encircled_radii(image: F32, light: F32, good: Mask) -> tuple[float, float]:
 
 
 def _growth(part: NDArray[np.float64], radii: NDArray[np.float64]) -> tuple[NDArray[np.float64], float] | None:
-    """Return the fraction of a star's light within each radius in px and its core's light, or None of no star."""
+    """Return the fraction of a star's light within each radius in px, and its light; None if it is no star."""
     axis = np.arange(-STAR_PX, STAR_PX + 1)
     away = np.hypot(axis, axis[:, None])
     part = part - np.median(part[away > STAR_PX - 1])
