@@ -219,16 +219,21 @@ class Replay:
 
         A value above 1 stands for a wider stop. The `metering_level` is set anew, since smear adds to the body. The
         image is returned as it is where the frame hardly smears more, and where the lens has its own transmission.
+        Body and sky are those of the frame: strong smear passes for a part of the body.
         """
         lens, stretch, display = self.session.base_camera.lens, self.display.stretch, self.display
-        plain = look(display.developed(raw, factor))
-        wanted = smear(real, stretch) if lens.real is None and plain.lit.any() else 0.0
+
+        def seen(raw: NDArray[Any], black_dn: float = 0.0) -> Look:
+            """Return the image with the frame's body and sky."""
+            return replace(real, image=display.developed(raw, factor, black_dn))
+
+        plain = seen(raw)
+        wanted = smear(real, stretch) if lens.real is None else 0.0
         if wanted <= _SMEARED * smear(plain, stretch):
             return raw
         transmission, level = lens.transmission, settings["metering_level"]
         for _ in range(_MOST_TRIES):
-            black = display.black_excess_dn(real, look(display.developed(raw, factor)))
-            one = look(display.developed(raw, factor, black))
+            one = seen(raw, display.black_excess_dn(real, seen(raw)))
             bright = float(np.percentile(one.image[one.lit], settings["metering_percentile"]))
             # what the lens scatters into the sky goes with the light of columns, too, so the next one is nearer
             found, brighter = smear(one, stretch), level / display.fraction(bright)
