@@ -43,28 +43,22 @@ def contrast(real: Look, rendered: Look, stretch: float) -> tuple[float, float]:
     return float(a.std() / b.std()), float(np.cov(a, b)[0, 1] / b.var())
 
 
-def curvature(one: Look, stretch: float, *, above: bool) -> float:
-    """Return the quadratic over the linear term of the columns' sky as a function of the body's light."""
-    light = (one.image / 255.0) ** (1 / stretch)
-    height = len(light)
-    body, sky = [], []
-    for column in np.flatnonzero(one.lit.any(axis=0)):
-        rows = np.flatnonzero(one.lit[:, column])
-        away = round(AWAY * height)
-        part = light[: max(rows[0] - away, 0), column] if above else light[rows[-1] + away :, column]
-        if len(part) > away / 2:
-            body.append(light[rows, column].sum())
-            sky.append(np.median(part))
-    x = np.array(body) / max(body)
-    quadratic, linear, _ = np.polyfit(x, np.array(sky) / np.mean(sky), 2)
-    return float(quadratic / linear)
-
-
 def straight(one: Look, *, above: bool) -> float:
     """Return the stretch with which the smear goes with the body's light in a straight line; NaN without one."""
-    bent = np.array([curvature(one, stretch, above=above) for stretch in STRETCHES])
-    turns = np.flatnonzero((bent[:-1] > 0) & (bent[1:] <= 0))
-    if not len(turns):
+    height = len(one.lit)
+    away, row = round(AWAY * height), np.arange(height)[:, None]
+    first, last = one.lit.argmax(axis=0), height - 1 - one.lit[::-1].argmax(axis=0)
+    part = row < first - away if above else row >= last + away
+    columns = one.lit.any(axis=0) & (part.sum(axis=0) > away / 2)
+    image, lit = one.image[:, columns] / 255, one.lit[:, columns]
+    level = np.nanmedian(np.where(part[:, columns], image, np.nan), axis=0)
+    bent = []  # quadratic over linear term of the columns' sky as a function of the body's light
+    for stretch in STRETCHES:
+        body, sky = (np.where(lit, image, 0) ** (1 / stretch)).sum(axis=0), level ** (1 / stretch)
+        quadratic, linear, _ = np.polyfit(body / body.max(), sky / sky.mean(), 2)
+        bent.append(quadratic / linear)
+    turns = [k for k in range(len(bent) - 1) if bent[k] > 0 >= bent[k + 1]]
+    if not turns:
         return float("nan")
     k = turns[0]
     return float(np.interp(0.0, [-bent[k], -bent[k + 1]], STRETCHES[k : k + 2]))
@@ -77,6 +71,8 @@ def main() -> int:
     parser.add_argument("--pairs", type=Path)
     parser.add_argument("--stretch", type=float, default=0.5)
     given, failed = parser.parse_args(), False
+    if not (given.images or given.pairs):
+        parser.error("needs images or --pairs")
     if given.pairs:
         names = sorted(path.stem.removesuffix("_real") for path in given.pairs.glob("*_real.png"))
         looks = [[look(read_frame(given.pairs, f"{n}_{which}")) for which in ("real", "rendered")] for n in names]

@@ -224,7 +224,7 @@ class Replay:
         lens, stretch, display = self.session.base_camera.lens, self.display.stretch, self.display
 
         def seen(raw: NDArray[Any], black_dn: float = 0.0) -> Look:
-            """Return the image with the frame's body and sky."""
+            """Return the developed image with the body and the sky that the frame shows."""
             return replace(real, image=display.developed(raw, factor, black_dn))
 
         plain = seen(raw)
