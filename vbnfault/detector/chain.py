@@ -177,6 +177,14 @@ class Device:
         electrons: F32 = self._run(photo_e, exposure_s, None, acts, before="telegraph")
         return electrons
 
+    def light_e(self, photo_e: F32, exposure_s: float) -> F32:
+        """Return the electrons that light leaves in each pixel, float32[y, x]: with response, crosstalk and smear.
+
+        `photo_e` is as in `expected_e`.
+        """
+        electrons: F32 = self._run(photo_e, exposure_s, None, _NOTHING, before="dark_current")
+        return electrons
+
     def collected_e(
         self, photo_e: F32, exposure_s: float, noise: MosaicNoise | None = None, acts: Acts = _NOTHING
     ) -> F32:

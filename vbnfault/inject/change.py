@@ -51,11 +51,15 @@ def struck(
     before, optical = picture.electrons, acting_at(draws, "electrons")
     after, change = before.array, np.zeros_like(picture.light)
     if optical:
-        after = development.signal(draws, optical).merged.array
+        shared = after = development.signal(draws, optical).merged.array
         change = picture.in_image(after - before.array)
-        noise = _missing_noise(
-            picture, change, lambda light: of(light).signal(draws, optical).merged.array - after, rng
-        )
+
+        def moved(more: Electrons) -> F32:
+            """Return what the faults make of more light, float32[y, x, channel]."""
+            light = before.with_array(before.array + more.array)
+            return of(light).signal(draws, optical).merged.array - shared
+
+        noise = _missing_noise(picture, change, picture.collected(after), moved, rng)
         change, after = change + noise, after + (picture.seen(noise).array if noise.any() else 0)
     inside = any(acting_at(draws, step) for step in MOSAIC_STEPS)
     if inside or (optical and development.exposure.camera.detector.mosaic is not None):
@@ -68,10 +72,10 @@ def struck(
     return numbers, None if inside or on_image else after
 
 
-def _missing_noise(picture: Picture, change: F32, act: Callable[[Electrons], F32], rng: Rng) -> F32:
+def _missing_noise(picture: Picture, change: F32, after: F32, act: Callable[[Electrons], F32], rng: Rng) -> F32:
     """Return the noise of the light that faults took away or added, over white, float32[y, x, channel].
 
-    `act` returns the change of what the faults make of the image's electrons if these are others.
+    `after` is the light that the pixels collect with the faults, as the image would show it; `act` returns what the faults make of more electrons in the image.
     """
     if not change.any():
         return np.zeros_like(change)
@@ -83,7 +87,7 @@ def _missing_noise(picture: Picture, change: F32, act: Callable[[Electrons], F32
     light, moved = on_device(picture.light), on_device(change)
     # the lowest bit of a variate's number says nothing of its size, and serves as the sign of the perturbation
     signs = be.Float(1 - 2 * be.Int32(code & 1))
-    probe = evaluated(light + dr.sqrt(light * white + read2) / white * signs).reshape(shape)
+    probe = evaluated(dr.sqrt(light * white + read2) / white * signs).reshape(shape)
     left = on_device(picture.in_image(act(picture.seen(probe)))) * white
     variance = left * left
     # a fault that acts on each pixel alone keeps the signs; a blur mixes them, and its variance varies slowly
@@ -93,8 +97,7 @@ def _missing_noise(picture: Picture, change: F32, act: Callable[[Electrons], F32
         smooth = cv2.blur(evaluated(variance).reshape(shape), (_NEARBY_PX, _NEARBY_PX))
         mixed = be.UInt8(flat(near)) > round(255 * _MIXED)
         variance = dr.select(mixed, on_device(smooth), variance)
-    after = dr.maximum(light + moved, 0) * white
-    missing = dr.maximum(after + read2 - variance, 0)
+    missing = dr.maximum(dr.maximum(on_device(after), 0) * white + read2 - variance, 0)
     noise = dr.select(moved != 0, (poisson_of_codes(missing, code) - missing) / white, 0)
     dr.eval(noise, missing)
     out = evaluated(noise)
@@ -125,6 +128,10 @@ def _through_sensor(picture: Picture, development: Development, draws: Draws, af
     noise = poisson(added, draw_normals(added.shape, rng("inject", "charge"))) - added
     change = (with_it - without) / np.float32(plain.sensor.readout.system_gain_dn_per_e) + noise
     # the difference lacks what the plain sensor adds to the image, but a saturated pixel is white
-    room = sample(picture.electrons.white_e - picture.electrons.array, sensor.sensor.pattern)
+    seen = picture.seen(picture.light)
+    room = sample(seen.white_e - seen.array, sensor.sensor.pattern)
     full = (with_it >= sensor.device.saturated_dn) & (with_it != without)
-    return picture.spread(np.where(full, np.maximum(change, room), change))
+    # light that the sensor only lets through keeps its place; what the sensor makes of it beyond is interpolated
+    optical = after - picture.electrons.array
+    beyond = np.where(full, np.maximum(change, room), change) - sample(optical, sensor.sensor.pattern)
+    return optical + picture.spread(beyond)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from ..core.quantities import RGBI, Electrons, Radiance
 from ..core.shared_results import SharedResults
 from ..detector import GreyDetector, ThreeColourDetector
 from ..faults import Fault, FaultContext
+from ..faults.contract import with_sensor
 from ..pipeline.development import Development, Draws, without
 from ..pipeline.exposure import reference_exposure_s
 from ..pipeline.injection import draw_faults, visible_draws
@@ -37,6 +38,12 @@ F32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 _LEAST_PX = 16
+# Keys of a device that make its pixels differ
+_PATTERNS = (
+    *("prnu", "prnu_row", "prnu_column", "prnu_low", "dsnu_e", "dsnu_row_e", "dsnu_column_e", "dark_nonuniformity"),
+    *("dose_TeV_g", "dead_fraction", "dead_fraction_yr", "stuck_fraction", "stuck_fraction_yr"),
+    *("rts_fraction", "trap_fraction", "trap_fraction_TeV_g", "years"),
+)
 _UNSEEN = (
     "changes nothing in any of its draws; it is too weak here, or other faults hide it, as by turning all white"
 )
@@ -241,6 +248,8 @@ class Injector:
         camera, assumed = self._camera(_shape(given), camera, grey=grey)
         drawing = _Drawing(faults=self.faults, seed=self.scene.dataset.seed, index=index, state=state)
         picture = None
+        if isinstance(given, np.ndarray):
+            camera = _without_pattern(camera)
         if isinstance(given, Electrons | Radiance):
             light = given if isinstance(given, Electrons) else camera.expose(given, camera.exposure_s)
         else:
@@ -412,6 +421,15 @@ class Injector:
         """Return why some of the classes cannot act on an image."""
         dark = [name for name in names if self.faults[name].needs_sun and context.sun_xy_px is None]
         return dict.fromkeys(dark, "needs the Sun before the camera; give its position: image.sun, --sun or sun=")
+
+
+@lru_cache(maxsize=8)
+def _without_pattern(camera: Camera) -> Camera:
+    """Return a camera whose sensor has no drawn pattern: an image shows that of the device that took it."""
+    if camera.detector.mosaic is None:
+        return camera
+    nothing = dict.fromkeys(_PATTERNS, 0.0)
+    return with_sensor(camera, individual=replace(camera.mosaic.sensor.individual, hot_growth=None, **nothing))
 
 
 def _development(
