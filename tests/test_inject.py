@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache
@@ -13,6 +14,7 @@ import pytest
 
 import vbnfault
 from vbnfault.camera import Camera
+from vbnfault.core.errors import InputError
 from vbnfault.core.files import resources
 from vbnfault.core.registry import forget
 from vbnfault.detector.three_colour import ThreeColourDetector
@@ -177,14 +179,14 @@ def test_light_that_a_sensor_saw_halves_with_its_noise(detector: str, raw: bool,
     four standard deviations, 2.2 %, and 1 % for what the sensor's model rounds.
     """
     camera = CAMERA | {"detector": detector, "exposure_s": exposure_s}
-    levels = {"black_dn": 0.0, "white_dn": 1.0, "raw": raw}
+    levels = {"black_dn": 0.0, "white_dn": 1.0, "raw": raw, "response": "linear"}
     own = vbnfault.inject(np.full((32, 32), 0.1, np.float32), {"test_half": {}}, camera=camera, image_keys=levels)
     sensor = own.camera.mosaic
     white, read = float(sensor.white_e.max()), sensor.read_noise_e_rms
     rng = np.random.default_rng(0)
     electrons = rng.poisson(4000, (256, 256)) + rng.normal(0, read, (256, 256))
     given = (electrons / white).astype(np.float32)
-    result = vbnfault.inject(given, {"test_half": {}}, camera=camera, seed=3, image_keys=levels, raw=raw)
+    result = vbnfault.inject(given, {"test_half": {}}, camera=camera, seed=3, image_keys=levels)
     after = result.image * white
     variance = 2000 + read**2 + 2 / 12 / sensor.sensor.readout.system_gain_dn_per_e**2
     assert after.mean() == pytest.approx(2000, rel=2e-3)
@@ -222,6 +224,22 @@ def test_a_raw_mosaic_changes_where_the_defects_are() -> None:
         )
         assert result.image.dtype == np.uint16
         assert set(np.unique(result.image[~result.masks[0]])) == {900}
+
+
+def test_a_mosaic_in_the_upper_bits_of_its_numbers_changes_as_in_the_lower_ones() -> None:
+    image = np.random.default_rng(2).integers(200, 900, (64, 64)).astype(np.uint16)
+    camera = {"detector": "generic_cmos", "exposure_s": 0.01, "fov_deg": 5.0}
+    faults = {"vignetting": {"on_axis_illuminance_dn": [200.0, 200.0]}}
+    top = 2**12 - 1
+    low, high = (
+        vbnfault.inject(
+            image * k, faults, camera=camera, image_keys={"raw": True, "black_dn": 64 * k, "white_dn": top * k}
+        )
+        for k in (1, 16)
+    )
+    assert low.injected.all()
+    assert high.image.max() > top
+    np.testing.assert_allclose(high.image / 16, low.image, atol=1)
 
 
 # --- response and Sun ---------------------------------------------------------------------------------------------
@@ -264,6 +282,43 @@ def test_faults_that_an_image_cannot_have_are_left_out_with_a_reason() -> None:
     assert result.left_out == {
         "straylight": "needs the Sun before the camera; give its position: image.sun, --sun or sun="
     }
+
+
+@pytest.mark.parametrize(
+    ("known", "sentence"),
+    [
+        ({"faults": ["dust_on_optics"]}, "must be tables by class"),
+        ({"camera": "rosetta_navcam"}, "must be keys of [camera]"),
+        ({"commanded": ["dust"]}, "dust is none of dust_on_optics"),
+        ({"depth_m": np.ones((96, 64))}, "depth_m of shape [96, 64]: must be [64, 96]"),
+        ({"sun": "nome"}, "image.sun = 'nome': must be 'auto', 'none'"),
+        ({"sun": ("a", 1)}, "image.sun = ('a', 1): must be x and y"),
+        ({"sun": (0, 0, 0)}, "image.sun = (0, 0, 0): must be x and y"),
+        ({"image_keys": {"raw": True}}, "cannot be a raw mosaic"),
+    ],
+)
+def test_mistakes_of_a_caller_are_named(known: dict[str, Any], sentence: str) -> None:
+    faults = known.pop("faults", {"dust_on_optics": {}})
+    with pytest.raises(InputError, match=re.escape(sentence)):
+        vbnfault.inject(np.full((64, 96), 90, np.uint8), faults, **{"camera": CAMERA, **known})
+
+
+@pytest.mark.parametrize(("circle_deg", "away_deg", "seen"), [(180, 89, True), (180, 101, False), (220, 101, True)])
+def test_the_sun_behind_a_fisheye_makes_no_straylight(circle_deg: float, away_deg: float, seen: bool) -> None:
+    angle = np.radians(away_deg)
+    calibration = {"model": "fisheye", "fx": 24.0, "cx": 47.5, "cy": 35.5, "width_px": 96, "height_px": 72}
+    result = vbnfault.inject(
+        np.full((72, 96), 9000, np.uint16),
+        {"straylight": {"model": "texture"}},
+        camera={"calibration": calibration | {"circle_deg": circle_deg}, "exposure_s": 0.02},
+        sun=(np.sin(angle), 0.0, np.cos(angle)),
+    )
+    assert result.injected.tolist() == [seen]
+
+
+def test_the_sun_may_be_in_the_corner_of_the_frame() -> None:
+    result = vbnfault.inject(np.full((64, 96), 90, np.uint8), {"straylight": {}}, camera=CAMERA, sun=(0, 0))
+    assert result.sun_xy_px == pytest.approx([0, 0], abs=1e-6)
 
 
 def test_what_was_assumed_is_said() -> None:

@@ -241,6 +241,29 @@ def test_results_below_the_images_are_no_images_of_the_next_run(tmp_path: Path) 
         assert inject_files([pictures], scene, pictures / "out", progress=False).names == ("00.png", "01.png")
 
 
+def test_results_lie_below_their_folder_for_images_of_a_folder_beside(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene, first = load_scene("quickstart", BATCH), _pictures(tmp_path / "a", 1)
+    monkeypatch.chdir(_pictures(tmp_path / "b", 2))
+    before = (first / "00.png").read_bytes()
+    batch = inject_files(["../a/00.png", "01.png"], scene, Path("../out"), progress=False)
+    assert batch.names == ("a/00.png", "b/01.png")
+    assert (first / "00.png").read_bytes() == before
+    assert (tmp_path / "out" / "a" / "00.png").is_file()
+
+
+def test_images_are_made_again_when_a_file_that_the_scene_names_changed(tmp_path: Path) -> None:
+    pictures, curve = _pictures(tmp_path / "in", 1), tmp_path / "curve.csv"
+    keys = {"image.response": "table", "image.response_file": str(curve)}
+    found = []
+    for middle in (0.2, 0.6, 0.2):
+        curve.write_text(f"0,0\n0.5,{middle}\n1,1\n")
+        inject_files([pictures], load_scene("quickstart", BATCH | keys), tmp_path / "out", progress=False)
+        found.append((tmp_path / "out" / "00.png").read_bytes())
+    assert found[0] == found[2] != found[1]
+
+
 def test_a_batch_goes_on_past_a_damaged_image_and_names_it(tmp_path: Path) -> None:
     pictures = _pictures(tmp_path / "in", 3)
     (pictures / "01.png").write_bytes((pictures / "01.png").read_bytes()[:200])
@@ -365,13 +388,18 @@ def test_a_response_that_falls_is_refused(tmp_path: Path) -> None:
 
 
 def test_unusable_batches(tmp_path: Path) -> None:
-    pictures, scene = _pictures(tmp_path / "in", 2), load_scene("quickstart", BATCH)
+    pictures, scene = _pictures(tmp_path / "in", 2), load_scene("quickstart", BATCH | {"image.noise_free": True})
+    _pictures(tmp_path / "clean", 1)
     (tmp_path / "empty").mkdir()
+    (tmp_path / "link").symlink_to("in")
     for images, out, labels, sentence in (
         ([tmp_path / "empty"], "out", "png", "holds no image"),
         ([str(tmp_path / "none*.png")], "out", "png", "matches no file"),
         ([pictures, pictures / "00.png"], "out", "png", "is named twice"),
         ([pictures], "in", "png", "holds the images, which would be replaced"),
+        ([pictures], "in/../in", "png", "holds the images, which would be replaced"),
+        ([pictures / "00.png"], "link", "png", "holds the images, which would be replaced"),
+        ([tmp_path / "clean" / "00.png"], ".", "png", "holds the images, which would be replaced"),
     ):
         with pytest.raises(InputError, match=sentence):
             inject_files(images, scene, tmp_path / out, labels=labels, progress=False)

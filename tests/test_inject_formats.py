@@ -335,6 +335,18 @@ def test_a_film_becomes_images_with_masks_and_a_film(tmp_path: Path) -> None:
     assert changed.stat().st_mtime_ns == at
 
 
+def test_a_damaged_image_holds_no_film_back_and_hides_none_that_ends_early(tmp_path: Path) -> None:
+    (tmp_path / "in").mkdir()
+    for name in ("whole.mkv", "cut.mkv"):
+        film_file(tmp_path / "in" / name, "ffv1", "bgr0")
+    data = (tmp_path / "in" / "cut.mkv").read_bytes()
+    (tmp_path / "in" / "cut.mkv").write_bytes(data[: int(0.6 * len(data))])
+    (tmp_path / "in" / "z.png").write_bytes(b"\x89PNG\r\n\x1a\n")
+    with pytest.raises(VbnfaultError, match=r"z\.png: is .*cut\.mkv: frame"):
+        inject_files([tmp_path / "in"], load_scene("quickstart", SCENE), tmp_path / "out", progress=False)
+    assert {path.name for path in (tmp_path / "out").glob("*.mkv")} == {"whole.mkv", "cut.mkv"}
+
+
 @pytest.mark.parametrize(
     ("name", "codec", "pixels", "left"),
     [

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import pickle
+import re
+from typing import Any
 
 import pytest
 from test_inject import CAMERA, MODELS, only
@@ -34,7 +36,7 @@ def test_batches_of_a_training_loop_have_the_draws_of_their_numbers() -> None:
     with pytest.raises(InputError, match="must be uint8 or float32"):
         transform(batch[0], [0])
     assert transform(batch[:0], [])[1].shape == (0, 3, 48, 64)
-    with pytest.raises(InputError, match="5 images: 2 numbers and 5 Suns; must be one for each image"):
+    with pytest.raises(InputError, match=r"5 images: numbers of shape \[2\] and 5 Suns; must be one"):
         transform(batch, [0, 1])
     with pytest.raises(InputError, match=r"^Inject: camera\.fov_degrees: unknown key \(did you mean fov_deg"):
         Inject(faults, camera={"fov_degrees": 3})
@@ -83,3 +85,12 @@ def test_a_batch_whose_images_show_no_sun_goes_on_without() -> None:
     assert list(transform.left_out) == ["straylight"]
     with pytest.raises(InputError, match=r"image\.sun"):
         transform(batch, range(2), suns=[(0.0, 0.0, 0.0)] * 2)
+
+
+@pytest.mark.parametrize(
+    ("keys", "numbers", "sentence"),
+    [({"probability": "a"}, range(2), "probability = 'a'"), ({}, 5, "2 images: numbers of shape []")],
+)
+def test_mistakes_of_a_training_loop_are_named(keys: dict[str, Any], numbers: Any, sentence: str) -> None:
+    with pytest.raises(InputError, match=re.escape(sentence)):
+        Inject({"dust_on_optics": {}}, camera=CAMERA, **keys)(torch.zeros((2, 1, 64, 64)), numbers)

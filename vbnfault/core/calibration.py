@@ -185,8 +185,11 @@ class Calibration:
 
     @property
     def least_z(self) -> float:
-        """Return the least z of a unit direction that has a pixel."""
-        return _LEAST_SLOPE_Z if self.foreshortens else float(np.cos(min(self._curve.end, np.pi - 1e-3)))
+        """Return the least z of a unit direction that has a pixel, behind the camera only in the image circle."""
+        if self.foreshortens:
+            return _LEAST_SLOPE_Z
+        circle = np.pi if self.circle_deg is None else max(np.radians(self.circle_deg / 2), np.pi / 2)
+        return float(np.cos(min(self._curve.end, np.pi - 1e-3, circle)))
 
     @cached_property
     def valid_to_deg(self) -> float:

@@ -112,17 +112,13 @@ def scene_identity(session: pipeline.Session) -> dict[str, Any]:
 
 def _identity(session: pipeline.Session) -> dict[str, Any]:
     """Return what `scene_identity` does; the messages of its errors do not name the scene."""
-    scene = session.scene.resolved()
+    scene = with_contents(session.scene, session.faults)
     scene["body"]["shape_sha256"] = session.body.content_hash
     if session.scene.body.shape not in ("embedded", "ellipsoid"):
         scene["body"]["shape"] = _digest(session.scene.body.shape, "shape")
     if session.scene.camera.detector:
         for key in OF_THE_DETECTOR:
             del scene["camera"][key]  # the value in the detector's file overrides this key
-    scene["faults"] = {name: fault.to_dict() for name, fault in session.faults.items()}
-    for name, table in scene["faults"].items():
-        _contents_of_fault(table, session.faults[name], session.scene)
-    _contents_of_files(scene, session.scene)
     for folder in {fault.packaged_images for fault in session.faults.values()} - {""}:
         images = sorted(resources.data_dir(folder).glob("*.png"))
         data = b"".join(user_files.read_input(path, "texture") for path in images)
@@ -130,9 +126,19 @@ def _identity(session: pipeline.Session) -> dict[str, Any]:
     if session.scene.trajectory is not None and session.scene.trajectory.file is not None:
         scene["trajectory"]["file"] = _digest(session.scene.trajectory.file, "trajectory")
     _leave_out_unused(scene, session.scene)
-    _identify_plugins(scene, session)
     del scene["dataset"]["samples"]
     return scene
+
+
+def with_contents(scene: Scene, faults: Mapping[str, Fault]) -> dict[str, Any]:
+    """Return a resolved scene in which digests replace the paths of the files of faults, camera and sky."""
+    plain = scene.resolved()
+    plain["faults"] = {name: fault.to_dict() for name, fault in faults.items()}
+    for name, table in plain["faults"].items():
+        _contents_of_fault(table, faults[name], scene)
+    _contents_of_files(plain, scene)
+    _identify_plugins(plain, scene, faults)
+    return plain
 
 
 def _leave_out_unused(identity: dict[str, Any], scene: Scene) -> None:
@@ -151,16 +157,16 @@ def _leave_out_unused(identity: dict[str, Any], scene: Scene) -> None:
             del identity["geometry"][key]
 
 
-def _identify_plugins(identity: dict[str, Any], session: pipeline.Session) -> None:
+def _identify_plugins(identity: dict[str, Any], scene: Scene, faults: Mapping[str, Fault]) -> None:
     """Replace the names of plug-ins by the digests of their sources and the models that the scene has of them."""
     del identity["plugins"]
-    plugins = plugins_of(session.faults, session.scene.plugins)
+    plugins = plugins_of(faults, scene.plugins)
     if plugins:
         identity["plugins"] = {
             plugin.name: {
                 "sha256": plugin.sha256,
                 "models": plugin.model_names,
-                "needs_sun": sorted({cls.fault for cls in plugin.models if _needs_sun(cls, session.faults)}),
+                "needs_sun": sorted({cls.fault for cls in plugin.models if _needs_sun(cls, faults)}),
             }
             for plugin in plugins
         }

@@ -12,6 +12,7 @@ import dataclasses
 import glob
 import hashlib
 import json
+import os
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -30,7 +31,7 @@ from ..core.files.whole_files import own, write_json, writing
 from ..core.quantities import Sample
 from ..dataset import build
 from ..dataset.from_scene import with_card
-from ..dataset.identity import IMAGES, is_exact, planned, store_spec
+from ..dataset.identity import IMAGES, is_exact, planned, store_spec, with_contents
 from ..dataset.progress import Progress, size_text
 from ..dataset.work import Job, Tick, attempt
 from ..pipeline import Session
@@ -99,10 +100,14 @@ class Batch:
         sequence = place_in_sequence(self.scene.frames, index)[0]
         return None if sequence < 0 or self.scene.frames[sequence] == 1 else int(self.plan.state[index])
 
+    @cached_property
+    def _scene_with_contents(self) -> str:
+        """Return the scene with what is in the files that it names, as text."""
+        return json.dumps(with_contents(self.scene, self.injector.faults), sort_keys=True)
+
     def key(self, index: int) -> str:
-        """Return a digest of the input of an image: its file, its number, the scene and the Sun."""
-        content, scene = self.content(index), self.scene.model_dump(mode="json")
-        told = json.dumps([content, index, self.sun, len(self.names), scene], sort_keys=True)
+        """Return a digest of the input of an image: its file, its number, the scene with its files and the Sun."""
+        told = json.dumps([self.content(index), index, self.sun, len(self.names), self._scene_with_contents])
         return user_files.sha256(told.encode())
 
     def content(self, index: int) -> str:
@@ -165,7 +170,6 @@ class Batch:
                 sun=self.sun,
                 commanded=self.plan.commanded(index),
                 depth_m=image.depth_m,
-                raw=bool(self.scene.image and self.scene.image.raw),
             )
         except InputError as error:
             raise InputError(f"{path}: {error}") from None
@@ -363,22 +367,33 @@ def inject_files(
     batch = Batch(scene=scene, sources=sources, names=names, out=out, sun=sun)
     options = build.BuildOptions(workers=workers, progress=progress)
     batch.injector.require_faults()  # an unusable scene is reported before any image
+    _check_kept(batch)
+    job = _Images(out, Progress(len(names), shown=progress, noun="images"), dict.fromkeys(range(len(names)), 0))
     if labels == "zarr":
         _build(batch, options)
     else:
-        job = _Images(out, Progress(len(names), shown=progress, noun="images"), dict.fromkeys(range(len(names)), 0))
         with job.progress:
             build.do_tasks(partial(_Worker, batch), job, options)
-        job.raise_failures(of=f" of {len(names)}")
+    failed = {sources[index].parent for index in job.failures}
     for name, film in films.items():
-        if not film.frames:
+        if not film.frames or out / "frames" / name in failed:
             continue
         with writing(out, within=True):
             assemble(out / name, own(out / f"{name}.mkv"), film)
     ended = [film.ended for film in films.values() if film.ended]
+    job.raise_failures(of=f" of {len(names)}", kept="; ".join(["all other images are kept", *ended]))
     if ended:
         raise VbnfaultError("; ".join(ended))
     return batch
+
+
+def _check_kept(batch: Batch) -> None:
+    """Raise InputError if the results would replace an image that is read."""
+    read = {os.path.realpath(file) for path in batch.sources for file in source_files(path)}
+    folders = ("", "clean") if batch.scene.image and batch.scene.image.noise_free else ("",)
+    written = (batch.out / folder / name for folder in folders for name in batch.names)
+    if not read.isdisjoint(map(os.path.realpath, written)):
+        raise InputError(f"--out {batch.out}: holds the images, which would be replaced; choose another folder")
 
 
 def _plan(scene: Scene) -> PlanTable:
@@ -467,13 +482,13 @@ def _frames(
 def _found(images: Sequence[str | Path], out: Path) -> tuple[Path, list[Path]]:
     """Return the folder that holds all images and films, and their paths; those of a folder or glob are sorted."""
     paths: list[Path] = []
-    results = out.absolute()
+    results = out.resolve()
     for given in map(str, images):
         path = Path(given)
         if path.is_dir():
             _check_apart(path, out)
             every = sorted(p for p in path.rglob("*") if p.suffix.lower() in _EVERY and p.is_file())
-            inside = [p for p in every if not p.absolute().is_relative_to(results)]  # results of an earlier run
+            inside = [p for p in every if not p.resolve().is_relative_to(results)]  # results of an earlier run
             if not inside:
                 raise InputError(f"{path}: holds no image; they end with one of {', '.join(_EVERY)}")
             paths += inside
@@ -484,7 +499,7 @@ def _found(images: Sequence[str | Path], out: Path) -> tuple[Path, list[Path]]:
             if not matched:
                 raise InputError(f"{given}: matches no file")
             paths += matched
-    paths = [path.absolute() for path in paths]
+    paths = [path.parent.resolve() / path.name for path in paths]
     if not paths:
         raise InputError("there is no image; name files, folders or globs")
     root = paths[0].parent
@@ -496,5 +511,5 @@ def _found(images: Sequence[str | Path], out: Path) -> tuple[Path, list[Path]]:
 
 def _check_apart(folder: Path, out: Path) -> None:
     """Raise InputError if the results would replace the images of a folder."""
-    if folder.absolute() == out.absolute():
+    if folder.resolve() == out.resolve():
         raise InputError(f"--out {out}: holds the images, which would be replaced; choose another folder")

@@ -75,7 +75,8 @@ def struck(
 def _missing_noise(picture: Picture, change: F32, after: F32, act: Callable[[Electrons], F32], rng: Rng) -> F32:
     """Return the noise of the light that faults took away or added, over white, float32[y, x, channel].
 
-    `after` is the light that the pixels collect with the faults, as the image would show it; `act` returns what the faults make of more electrons in the image.
+    `after` is the light that the pixels collect with the faults, as the image would show it; `act` returns what
+    the faults make of more electrons in the image.
     """
     if not change.any():
         return np.zeros_like(change)

@@ -210,7 +210,7 @@ class Injector:
         depth_m: NDArray[Any] | None = None,
         camera: Camera | None = None,
         context: Mapping[str, Any] | None = None,
-        raw: bool = False,
+        raw: bool | None = None,
     ) -> Injected:
         """Return an image with faults.
 
@@ -236,7 +236,7 @@ class Injector:
         context
             Further fields of `faults.FaultContext` that are known.
         raw
-            Whether the numbers of [y, x] are those of the sensor's mosaic.
+            Whether the numbers of [y, x] are those of the sensor's mosaic; default: as `[image]` says.
 
         Raises
         ------
@@ -244,8 +244,14 @@ class Injector:
             The image cannot be used with this camera.
         """
         given = image if isinstance(image, Electrons | Radiance) else _checked_array(image)
+        unknown = sorted({*(commanded or ())} - {*self.faults})
+        if unknown:
+            raise InputError(f"commanded = {commanded!r}: {unknown[0]} is none of {', '.join(self.faults)}")
+        shape = _shape(given)
+        if depth_m is not None and np.shape(depth_m) != shape:
+            raise InputError(f"depth_m of shape {list(np.shape(depth_m))}: must be {list(shape)}, as the image")
         grey = isinstance(given, np.ndarray) and given.ndim == 2
-        camera, assumed = self._camera(_shape(given), camera, grey=grey)
+        camera, assumed = self._camera(shape, camera, grey=grey)
         drawing = _Drawing(faults=self.faults, seed=self.scene.dataset.seed, index=index, state=state)
         picture = None
         if isinstance(given, np.ndarray):
@@ -253,7 +259,8 @@ class Injector:
         if isinstance(given, Electrons | Radiance):
             light = given if isinstance(given, Electrons) else camera.expose(given, camera.exposure_s)
         else:
-            picture = self._picture(given, camera, drawing, raw=raw)
+            as_raw = bool(self.scene.image and self.scene.image.raw) if raw is None else raw
+            picture = self._picture(given, camera, drawing, raw=as_raw)
             assumed += picture.assumptions
             light = picture.electrons
         known = replace(self._context(camera, sun, depth_m, picture), **(context or {}))
@@ -478,6 +485,10 @@ def inject(
     InputError
         Image, camera or faults cannot be used.
     """
+    if not isinstance(faults, Mapping):
+        raise InputError(f"faults = {faults!r}: must be tables by class, as {{'dust_on_optics': {{}}}}")
+    if not isinstance(camera, Camera | Mapping | None):
+        raise InputError(f"camera = {camera!r}: must be keys of [camera], as {{'detector': 'rosetta_navcam'}}")
     tables: dict[str, Any] = {"title": "inject", "dataset": {"seed": seed}, "faults": dict(faults)}
     if "image_keys" in known:
         tables["image"] = known.pop("image_keys")

@@ -206,8 +206,12 @@ class Picture:
     @cached_property
     def _top_dn(self) -> float:
         """Return the highest whole number: white, or that of a mosaic's converter, if the type holds it."""
-        top = self.camera.mosaic.sensor.readout.top_dn if self.raw else self.response.white_dn
-        return float(min(top, np.iinfo(self.numbers.dtype).max))
+        top = self.response.white_dn
+        if self.raw:  # in proportion, where the numbers are not those of the sensor's own converter
+            readout, black = self.camera.mosaic.sensor.readout, self.response.black_dn
+            white = readout.system_gain_dn_per_e * readout.white_e
+            top = black + (readout.top_dn - readout.bias_dn) * (top - black) / white
+        return float(min(np.rint(top), np.iinfo(self.numbers.dtype).max))
 
 
 def levels(numbers: NDArray[Any], response: Response) -> NDArray[np.uint8]:

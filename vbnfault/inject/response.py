@@ -91,15 +91,19 @@ class Response:
         return self.black_dn + (self.white_dn - self.black_dn) * value
 
 
-@lru_cache(maxsize=8)
 def read_table(path: str) -> F64:
     """Return a response of a CSV file: fraction of white in light and in numbers, float64[n, 2], from 0 to 1.
 
     Raises InputError if it cannot be read, or does not rise.
     """
+    return _table(user_files.read_input(path, "response"), path)
+
+
+@lru_cache(maxsize=8)
+def _table(data: bytes, path: str) -> F64:
+    """Return what `read_table` does from the contents of the file."""
     try:
-        text = user_files.read_input(path, "response").decode()
-        rows = np.atleast_2d(np.loadtxt(io.StringIO(text), delimiter=",", comments="#"))
+        rows = np.atleast_2d(np.loadtxt(io.StringIO(data.decode()), delimiter=",", comments="#"))
     except ValueError as error:  # also of text that is no UTF-8
         raise InputError(f"image.response_file = {path!r}: cannot be read: {error}") from None
     if rows.shape[1] != 2 or len(rows) < 2:

@@ -30,16 +30,20 @@ def sun_direction(
     if isinstance(given, str):
         if given == "none":
             return None
+        if given != "auto":
+            raise InputError(f"image.sun = {given!r}: must be 'auto', 'none', a position or a direction")
         if picture is None:
             raise InputError("image.sun = 'auto': finds the Sun in an image only; give its position")
         given = _saturated_disc(picture, camera, distance_au).tolist()
-    vector = np.asarray(given, dtype=np.float64)
-    if vector.shape not in ((2,), (3,)) or not np.isfinite(vector).all() or not np.any(vector):
-        raise InputError(
-            f"image.sun = {list(map(float, vector.ravel()))}: must be x and y in pixels, or a direction"
-        )
+    try:
+        vector = np.asarray(given, dtype=np.float64)
+    except (TypeError, ValueError):
+        vector = np.zeros(0)
+    if vector.shape not in ((2,), (3,)) or not np.isfinite(vector).all() or not (len(vector) == 2 or vector.any()):
+        raise InputError(f"image.sun = {given!r}: must be x and y in pixels, or a direction, as numbers")
     if len(vector) == 2:
         vector = camera.projection.directions_at(vector[:1], vector[1:]).ravel()
+    vector = vector / np.abs(vector).max()  # the square of a tiny or huge number is none
     return np.asarray(vector / np.linalg.norm(vector))
 
 

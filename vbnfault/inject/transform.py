@@ -60,8 +60,8 @@ class Inject:
         seed: int = 0,
         sun: str | Sequence[float] | None = None,
     ) -> None:
-        if not 0 <= probability <= 1:
-            raise InputError(f"probability = {probability:g}: must be from 0 to 1")
+        if not (isinstance(probability, float | int) and 0 <= probability <= 1):
+            raise InputError(f"probability = {probability!r}: must be from 0 to 1")
         tables: dict[str, Any] = {"title": "inject", "dataset": {"seed": seed}, "faults": faults}
         tables |= {key: table for key, table in (("camera", camera), ("image", image)) if table}
         self._scene = parse_scene(tables, source="Inject")
@@ -114,12 +114,13 @@ class Inject:
             )
         if get_worker_info() is not None:
             llvm.use_one_thread()
-        given = images.contiguous().numpy()
+        given = images.detach().contiguous().numpy()
         changed, masks = np.empty_like(given), np.empty((len(given), len(self.classes), *given.shape[2:]), bool)
         places = [self._sun] * len(given) if suns is None else [self._sun if s is None else s for s in suns]
-        if not len(given) == len(numbers) == len(places):
+        if not np.shape(numbers) == (len(given),) == (len(places),):
             raise InputError(
-                f"{len(given)} images: {len(numbers)} numbers and {len(places)} Suns; must be one for each image"
+                f"{len(given)} images: numbers of shape {list(np.shape(numbers))} and {len(places)} Suns; must be "
+                "one for each image"
             )
         self.left_out = {}
         for planes, out, mask, number, sun in zip(given, changed, masks, numbers, places, strict=True):
