@@ -25,8 +25,8 @@ from .response import Response, read_table
 F32 = NDArray[np.float32]
 
 _COLOURS = ("R", "G", "B")
-# Steps towards the light that an image shows, and how near to the image, over white, the sensor's model must come
-_STEPS, _NEAR = 8, 1e-5
+# Steps towards the light that an image shows, and change of the last one, over white
+_STEPS, _NEAR = 8, 1e-4
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -94,31 +94,31 @@ class Picture:
     def electrons(self) -> Electrons:
         """Return the electrons of each pixel and channel of the camera whose light the numbers show.
 
-        The numbers have passed the sensor, so what smear and measured responses made of the light is taken back, as
-        far as the sensor's own model makes the numbers of it again (multiplicative steps as by Richardson 1972,
-        JOSA 62, 55).
+        The numbers have passed the sensor, so what smear and measured responses made of the light is taken back:
+        light that the sensor's model lacks or has too much is added or taken until the model makes the numbers
+        (Landweber 1951, Am. J. Math. 73, 615), never below 0.
         """
         seen = self.seen(self.light)
         light, near_e = seen.array, _NEAR * float(seen.white_e.max())
         for _ in range(_STEPS if self.camera.detector.mosaic is not None else 0):
-            factor = self._collected_over(light)
-            if np.abs(light * factor - seen.array).max() <= near_e:
+            made = self._collected(light)
+            step = min(float(light.sum() / max(made.sum(), near_e)), 1.0)
+            nearer = cv2.max(light + (seen.array - made) * np.float32(step), 0).reshape(light.shape)
+            far_e, light = cv2.norm(nearer, light, cv2.NORM_INF), nearer
+            if far_e <= near_e:
                 break
-            light = np.divide(seen.array, factor, out=light.copy(), where=light * factor > near_e)
         return seen.with_array(light)
 
     def collected(self, light_e: F32) -> F32:
         """Return light on the camera's channels as the image shows it, float32[y, x, channel of the image]."""
-        if self.camera.detector.mosaic is not None:
-            light_e = light_e * self._collected_over(light_e)
-        return self.in_image(light_e)
+        return self.in_image(light_e if self.camera.detector.mosaic is None else self._collected(light_e))
 
-    def _collected_over(self, light_e: F32) -> F32:
-        """Return what each pixel of the sensor collects of light over what falls on it, float32[y, x, 1]."""
+    def _collected(self, light_e: F32) -> F32:
+        """Return light as the pixels of the sensor collect it, float32[y, x, channel], others between them."""
         mosaic = self.camera.mosaic
         falls = sample(light_e, mosaic.sensor.pattern)
-        collected = mosaic.device.light_e(falls, self.camera.exposure_s)
-        return np.divide(collected, falls, out=np.ones_like(falls), where=falls > 0)[..., None]
+        beyond = mosaic.device.light_e(falls, self.camera.exposure_s) - falls
+        return light_e + self.spread(beyond) if beyond.any() else light_e
 
     def seen(self, light: F32) -> Electrons:
         """Return light of the image, [y, x, channel of the image], as electrons of the camera's channels."""
