@@ -111,6 +111,38 @@ def test_other_programs_read_the_files_with_their_metadata(tmp_path: Path) -> No
     assert b"vbnfault\0faults" in (tmp_path / "grey.png").read_bytes()
 
 
+@pytest.mark.parametrize(
+    ("part", "cards"),
+    [
+        (fits.PrimaryHDU(COLOURS[..., 0]), {"BZERO": 128}),
+        (fits.ImageHDU(GREY.astype(np.uint8)), {"OBS>RVER": "me"}),
+        (fits.CompImageHDU(np.where(GREY < 900, np.nan, GREY / 7).astype(np.float32)), {}),
+        (fits.CompImageHDU(GREY.astype(np.int32), compression_type="HCOMPRESS_1", hcomp_scale=30), {}),
+    ],
+    ids=["offset of bytes", "illegal key", "rounded floats", "rounded whole numbers"],
+)
+def test_fits_keeps_pixels_that_are_not_changed_and_valid_checksums(
+    part: Any, cards: dict[str, Any], tmp_path: Path
+) -> None:
+    path, out = tmp_path / "a.fits", tmp_path / "out.fits"
+    parts = [part] if isinstance(part, fits.PrimaryHDU) else [fits.PrimaryHDU(), part]
+    for key, value in cards.items():
+        part.header[key.replace(">", "E")] = value
+    fits.HDUList(parts).writeto(path, checksum=True)
+    for key in cards:
+        path.write_bytes(path.read_bytes().replace(key.replace(">", "E").encode(), key.encode()))
+    image, before = read_image(path), fits.getdata(path)
+    np.testing.assert_array_equal(image.numbers, np.nan_to_num(before))
+    numbers = image.numbers.copy()
+    numbers[3, 4] += 1
+    before[3, 4] = numbers[3, 4]
+    image.write(out, numbers, "faults")
+    with fits.open(out, checksum="OBS>RVER" not in cards) as file:  # astropy warns of wrong checksums
+        np.testing.assert_array_equal(file[len(parts) - 1].data, before)
+    for key in cards:
+        assert key.encode() in out.read_bytes()
+
+
 def _told_by_exiftool(path: Path) -> dict[str, Any]:
     """Return what exiftool reads in a file, by group and tag, without what belongs to the file and the blocks."""
     run = subprocess.run(
