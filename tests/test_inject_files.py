@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import signal
+import struct
 import subprocess
 import sys
 import time
@@ -51,6 +52,12 @@ def _image_files(folder: Path) -> dict[str, Path]:
     tifffile.imwrite(folder / "big.tif", COLOURS, bigtiff=True, photometric="rgb", byteorder=">", extratags=tag)
     planes = np.moveaxis(COLOURS, -1, 0)
     tifffile.imwrite(folder / "planes.tif", planes, photometric="rgb", planarconfig="separate", extratags=tag)
+    tifffile.imwrite(folder / "reversed.tif", GREY, extratags=[*tag, (269, "H", 1, 2, True)])
+    data = (
+        folder / "reversed.tif"
+    ).read_bytes()  # FillOrder, which tifffile does not write, comes from another tag
+    number, fill_order = (struct.pack("<HHIH", key, 3, 1, 2) for key in (269, 266))
+    (folder / "reversed.tif").write_bytes(data.replace(number, fill_order))
     write_png(folder / "alpha.png", np.dstack([COLOURS, COLOURS[..., :1]]))
     write_png(folder / "grey.png", GREY)
     _fits_file(folder / "unsigned.fits", GREY, OBSERVER="me")
@@ -77,15 +84,15 @@ def test_files_keep_their_kind_and_what_is_written_is_read_back(tmp_path: Path) 
 
 def test_other_programs_read_the_files_with_their_metadata(tmp_path: Path) -> None:
     files = _image_files(tmp_path / "in")
-    for name in ("strips.tif", "none.tif", "tiles.tif", "big.tif", "planes.tif"):
+    for name in ("strips.tif", "none.tif", "tiles.tif", "big.tif", "planes.tif", "reversed.tif"):
         image = read_image(files[name])
         image.write(tmp_path / name, image.numbers, "faults")
         with tifffile.TiffFile(tmp_path / name) as before, tifffile.TiffFile(files[name]) as after:
             np.testing.assert_array_equal(before.asarray(), after.asarray())
             tags = [{t.code: t.value for t in f.pages[0].tags} for f in (before, after)]
         assert tags[0][270] == {"none.tif": "faults"}.get(name, tags[0][270])
-        # compression, the offsets of the blocks, and a description where there was none
-        where = {259, 273, 279, 317, 324, 325} | ({270} - tags[1].keys())
+        # compression, order of bits, the offsets of the blocks, and a description where there was none
+        where = {259, 266, 273, 279, 317, 324, 325} | ({270} - tags[1].keys())
         assert {k: v for k, v in tags[0].items() if k not in where} == {
             k: v for k, v in tags[1].items() if k not in where
         }

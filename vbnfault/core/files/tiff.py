@@ -88,8 +88,8 @@ def tiff_numbers(data: bytes, most_values: int) -> NDArray[Any]:
 def with_numbers(data: bytes, numbers: NDArray[Any], text: str) -> bytes:
     """Return a TIFF file with other numbers, [y, x, sample] in the data type of the former ones.
 
-    The new blocks are appended without compression, and the tags that say where they lie are overwritten, so that
-    all other tags stay as they are. `text` becomes the tag 270, ImageDescription, if the file has none.
+    The new blocks are appended without compression, and the tags that say where and how they lie are overwritten, so
+    that all other tags stay as they are. `text` becomes the tag 270, ImageDescription, if the file has none.
     """
     import tifffile
 
@@ -113,7 +113,7 @@ def with_numbers(data: bytes, numbers: NDArray[Any], text: str) -> bytes:
                     offsets.append(stream.tell())
                     counts.append(stream.write(block.tobytes()))
         where, sizes = (324, 325) if page.is_tiled else (273, 279)
-        for tag, value in ((where, tuple(offsets)), (sizes, tuple(counts)), (259, 1), (317, 1)):
+        for tag, value in ((where, tuple(offsets)), (sizes, tuple(counts)), (259, 1), (266, 1), (317, 1)):
             if tag in page.tags:
                 page.tags[tag].overwrite(value[0] if isinstance(value, tuple) and len(value) == 1 else value)
         if 270 not in page.tags:
