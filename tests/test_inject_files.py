@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import OpenEXR
 import pytest
 import tifffile
 from astropy.io import fits
@@ -148,6 +149,37 @@ def test_fits_keeps_pixels_that_are_not_changed_and_valid_checksums(
         np.testing.assert_array_equal(file[len(parts) - 1].data, before)
     for key in cards:
         assert key.encode() in out.read_bytes()
+
+
+@pytest.mark.parametrize("compression", ["PIZ", "PXR24", "B44", "DWAB"])
+def test_exr_keeps_pixels_that_are_not_changed_the_crop_and_the_other_parts(
+    compression: str, tmp_path: Path
+) -> None:
+    kind = np.float32 if compression == "PXR24" else np.float16  # what the compression rounds
+    values = np.random.default_rng(4).random((64, 64)).astype(kind)
+    window = {
+        "dataWindow": tuple(np.array(xy, np.int32) for xy in ((10, 20), (73, 83))),
+        "displayWindow": tuple(np.array(xy, np.int32) for xy in ((0, 0), (199, 199))),
+    }
+    header = {
+        "type": OpenEXR.scanlineimage,
+        "compression": getattr(OpenEXR, f"{compression}_COMPRESSION"),
+        **window,
+    }
+    parts = [OpenEXR.Part(dict(header), {channel: values}, channel) for channel in ("Y", "Z")]
+    path, out = tmp_path / "a.exr", tmp_path / "out.exr"
+    OpenEXR.File(parts).write(str(path))
+    image = read_image(path)
+    numbers = image.numbers.copy()
+    numbers[3, 4] = 2
+    image.write(out, numbers, "faults")
+    before, after = (OpenEXR.File(str(name), separate_channels=True).parts for name in (path, out))
+    np.testing.assert_array_equal(after[0].channels["Y"].pixels, numbers)
+    np.testing.assert_array_equal(after[1].channels["Z"].pixels, before[1].channels["Z"].pixels)
+    for key in window:
+        np.testing.assert_array_equal(after[0].header[key], window[key])
+    assert after[0].header["vbnfault"] == "faults"
+    assert after[0].header["compression"].name == f"{'PIZ' if compression == 'PIZ' else 'ZIP'}_COMPRESSION"
 
 
 def _told_by_exiftool(path: Path) -> dict[str, Any]:

@@ -188,25 +188,24 @@ class Exr(ImageFile):
     def __init__(self, path: Path) -> None:
         """Read an OpenEXR file."""
         user_files.read_input(path, "image")  # no folder, pipe or device
-        self._header, self._channels = images.read_exr(path)
-        layers = dict.fromkeys(name[: name.rfind(".") + 1] for name in sorted(self._channels))
+        self._file, channels = images.read_exr(path)
+        layers = dict.fromkeys(name[: name.rfind(".") + 1] for name in sorted(channels))
         choices = [[layer + name for name in kind] for kind in ("RGB", "Y") for layer in layers]
-        names = next((choice for choice in choices if self._channels.keys() >= set(choice)), None)
+        names = next((choice for choice in choices if channels.keys() >= set(choice)), None)
         if names is None:
-            known = ", ".join(self._channels)
+            known = ", ".join(channels)
             raise InputError(f"is an OpenEXR file with the channels {known}; must have R, G and B, or Y")
         self._names = names
-        stack = np.stack([self._channels[name] for name in names], axis=-1)
+        stack = np.stack([channels[name] for name in names], axis=-1)
         self.numbers = stack[..., 0] if len(names) == 1 else stack
-        depth = next((self._channels[layer + "Z"] for layer in layers if layer + "Z" in self._channels), None)
+        depth = next((channels[layer + "Z"] for layer in layers if layer + "Z" in channels), None)
         if depth is not None:
             self.depth_m = np.where(depth >= _SKY_M, np.inf, depth).astype(np.float32)
 
     def write(self, path: Path, numbers: NDArray[Any], text: str) -> None:
-        """Write an OpenEXR file with the other channels and the attributes of this one."""
+        """Write an OpenEXR file with the other channels, parts and attributes of this one."""
         planes = np.moveaxis(np.atleast_3d(numbers), -1, 0)
-        changed = dict(zip(self._names, planes, strict=True))
-        images.write_exr_like(path, {**self._header, "vbnfault": text}, {**self._channels, **changed})
+        images.write_exr_like(path, self._file, dict(zip(self._names, planes, strict=True)), text)
 
 
 class Pds(ImageFile):

@@ -9,7 +9,7 @@ import struct
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -20,6 +20,9 @@ from .path_checks import real
 from .tiff import HEADS as TIFF_HEADS
 from .tiff import check_values, tiff_pixels
 from .whole_files import replacing, write_whole
+
+if TYPE_CHECKING:
+    import OpenEXR
 
 F32 = NDArray[np.float32]
 
@@ -116,34 +119,37 @@ def _grey_with_alpha(numbers: NDArray[Any]) -> bytes:
     return out
 
 
-def read_exr(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-    """Return the header of an OpenEXR file, and its channels by name, [y, x] each.
+def read_exr(path: Path) -> tuple[OpenEXR.File, dict[str, NDArray[Any]]]:
+    """Return an OpenEXR file, and the channels of its first part by name, [y, x] each.
 
     Raises InputError, whose message goes on from the file's name, if it is damaged or has channels of unlike size.
     """
     import OpenEXR
 
     try:
-        part = OpenEXR.File(str(path), separate_channels=True).parts[0]
-        channels = {name: np.asarray(channel.pixels) for name, channel in part.channels.items()}
+        file = OpenEXR.File(str(path), separate_channels=True)
+        channels = {name: np.asarray(channel.pixels) for name, channel in file.parts[0].channels.items()}
     except Exception:  # a damaged file fails anywhere in OpenEXR
         raise InputError("is a damaged OpenEXR file") from None
     if not channels or len({array.shape for array in channels.values()}) > 1:
         raise InputError("is an OpenEXR file without channels, or with channels of unlike size")
-    return dict(part.header), channels
+    return file, channels
 
 
-def write_exr_like(path: Path, header: Mapping[str, Any], channels: Mapping[str, NDArray[Any]]) -> None:
-    """Write channels to an OpenEXR file with the attributes of another one. Raises as `write_exr`."""
+def write_exr_like(path: Path, file: OpenEXR.File, channels: Mapping[str, NDArray[Any]], text: str) -> None:
+    """Give the first part of a file of `read_exr` other channels and a text, and write it. Raises as `write_exr`.
+
+    A compression that rounds numbers becomes ZIP, so that all other numbers stay as they are.
+    """
     import OpenEXR
 
-    kept = {key: value for key, value in header.items() if key not in ("channels", "chunkCount", "dataWindow")}
-    with replacing(real(path)) as temporary:
-        temporary.write_bytes(b"")
-        try:
-            OpenEXR.File(kept, {name: np.array(array) for name, array in channels.items()}).write(str(temporary))
-        except RuntimeError as error:
-            raise VbnfaultError(f"{path}: cannot be written: {error}") from None
+    for part in file.parts:
+        if part.header["compression"].name.startswith(("PXR24", "B44", "DWA")):
+            part.header["compression"] = OpenEXR.ZIP_COMPRESSION
+    for name, array in channels.items():
+        file.parts[0].channels[name].pixels = np.array(array)
+    file.parts[0].header["vbnfault"] = text
+    _write_exr(path, file)
 
 
 def _chunks(png: bytes) -> bytes:
@@ -210,14 +216,19 @@ def write_exr(path: Path, channels: Mapping[str, NDArray[Any]]) -> Path:
     import OpenEXR
 
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    # OpenEXR accepts writeable arrays only
+    _write_exr(path, OpenEXR.File(header, {name: array.copy() for name, array in channels.items()}))
+    return path
+
+
+def _write_exr(path: Path, file: OpenEXR.File) -> None:
+    """Write an OpenEXR file. Raises as `write_exr`."""
     with replacing(real(path)) as temporary:
         temporary.write_bytes(b"")  # raises OSError with the system's reason; OpenEXR raises RuntimeError
         try:
-            # OpenEXR accepts writeable arrays only
-            OpenEXR.File(header, {name: array.copy() for name, array in channels.items()}).write(str(temporary))
+            file.write(str(temporary))
         except RuntimeError as error:
             raise VbnfaultError(f"{path}: cannot be written: {error}") from None
-    return path
 
 
 def srgb8(linear: ArrayLike) -> NDArray[np.uint8]:

@@ -88,8 +88,8 @@ def tiff_numbers(data: bytes, most_values: int) -> NDArray[Any]:
 def with_numbers(data: bytes, numbers: NDArray[Any], text: str) -> bytes:
     """Return a TIFF file with other numbers, [y, x, sample] in the data type of the former ones.
 
-    The new blocks are appended without compression, and the tags that say where and how they lie are overwritten, so
-    that all other tags stay as they are. `text` becomes the tag 270, ImageDescription, if the file has none.
+    The new blocks are appended without compression, and the tags that say where and how they lie are overwritten,
+    so that all other tags stay as they are. `text` becomes the tag 270, ImageDescription, if the file has none.
     """
     import tifffile
 
