@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -53,14 +53,8 @@ def decoded_image(data: bytes, most_values: int) -> tuple[F32, F32 | None]:
         return tiff_pixels(data, most_values)
     if not data.startswith(_PNG):
         raise InputError("is not a PNG or TIFF image")
-    if len(data) >= 24:
-        columns, rows = struct.unpack(">II", data[16:24])
-        check_values(rows, columns, _PNG_CHANNELS.get(data[25:26], 1), most_values)
-    chunks = _chunks(data)
-    image = cv2.imdecode(np.frombuffer(chunks, np.uint8), cv2.IMREAD_UNCHANGED) if chunks else None
-    if image is None:
-        raise InputError("is a damaged PNG file")
-    values = np.atleast_3d(_swapped(image)).astype(np.float32) / np.float32(np.iinfo(image.dtype).max)
+    image = _decoded_png(data, most_values)
+    values = image.astype(np.float32) / np.float32(np.iinfo(image.dtype).max)
     colours = values.shape[2] - (values.shape[2] in (2, 4))
     return values[..., :colours], values[..., -1] if values.shape[2] > colours else None
 
@@ -72,29 +66,28 @@ def png_numbers(data: bytes, most_values: int) -> NDArray[Any]:
     """
     if not data.startswith(_PNG):
         raise InputError("is no PNG file, whatever its name says")
+    if data[25:26] == b"\3" or data[24:25] in (b"\1", b"\2", b"\4"):
+        raise InputError("is a PNG file with a palette or packed bits; save it as grey or RGB of 8 or 16 bits")
+    image = _decoded_png(data, most_values)
+    # of grey with alpha OpenCV makes R, G, B and alpha
+    return np.ascontiguousarray(image[..., [0, 3]] if data[25:26] == b"\4" else image)
+
+
+def _decoded_png(data: bytes, most_values: int) -> NDArray[Any]:
+    """Return a PNG file as OpenCV decodes it, uint8 or uint16 [y, x, channel]. Raises InputError."""
     if len(data) >= 26:
         columns, rows = struct.unpack(">II", data[16:24])
         check_values(rows, columns, _PNG_CHANNELS.get(data[25:26], 1), most_values)
-        if data[25:26] == b"\3" or data[24] < 8:
-            raise InputError("is a PNG file with a palette or packed bits; save it as grey or RGB of 8 or 16 bits")
     chunks = _chunks(data)
     image = cv2.imdecode(np.frombuffer(chunks, np.uint8), cv2.IMREAD_UNCHANGED) if chunks else None
     if image is None:
         raise InputError("is a damaged PNG file")
-    if data[25:26] == b"\4":  # grey with alpha, of which OpenCV makes B, G, R and alpha
-        return np.ascontiguousarray(image[..., [0, 3]])
-    return np.ascontiguousarray(np.atleast_3d(_swapped(image)))
+    return np.atleast_3d(_swapped(image))
 
 
 def with_png_numbers(data: bytes, numbers: NDArray[Any], text: str) -> bytes:
     """Return a PNG file with other numbers [y, x, channel], the chunks of the former one, and a text chunk."""
-    if numbers.shape[2] == 2:
-        body = _grey_with_alpha(numbers)
-    else:
-        done, encoded_data = cv2.imencode(".png", np.ascontiguousarray(_swapped(numbers)))
-        if not done:
-            raise VbnfaultError("the image cannot be encoded as PNG")
-        body = encoded_data.tobytes()
+    body = _grey_with_alpha(numbers) if numbers.shape[2] == 2 else png(numbers)
     head = body.index(b"IDAT") - 4
     kept, start = [], len(_PNG)
     while start + 12 <= len(data):
@@ -187,12 +180,13 @@ def write_png(path: Path, image: NDArray[Any], *, smallest: bool = False) -> Pat
     OSError
         The file cannot be written.
     """
-    options = [cv2.IMWRITE_PNG_COMPRESSION, 9] if smallest else []
-    done, data = cv2.imencode(".png", np.ascontiguousarray(_swapped(image)), options)
-    if not done:
-        raise VbnfaultError(f"{path}: the image cannot be encoded as PNG")
-    write_whole(path, data.tobytes())
+    write_whole(path, png(image, smallest=smallest))
     return path
+
+
+def png(image: NDArray[Any], *, smallest: bool = False) -> bytes:
+    """Return an image as the content of a PNG file, with the parameters of `write_png`."""
+    return _encoded(image, ".png", (cv2.IMWRITE_PNG_COMPRESSION, 9) if smallest else ())
 
 
 def encoded(rgb: NDArray[np.uint8], ending: str, quality: int = 0) -> bytes:
@@ -201,8 +195,12 @@ def encoded(rgb: NDArray[np.uint8], ending: str, quality: int = 0) -> bytes:
     `quality`: 1 to 100 of a lossy kind. Raises VbnfaultError if OpenCV cannot encode it.
     """
     lossy = {".webp": cv2.IMWRITE_WEBP_QUALITY, ".jpg": cv2.IMWRITE_JPEG_QUALITY}
-    options = [lossy[ending], quality] if ending in lossy else [cv2.IMWRITE_PNG_COMPRESSION, 4]
-    done, data = cv2.imencode(ending, np.ascontiguousarray(_swapped(rgb)), options)
+    return _encoded(rgb, ending, (lossy[ending], quality) if ending in lossy else (cv2.IMWRITE_PNG_COMPRESSION, 4))
+
+
+def _encoded(image: NDArray[Any], ending: str, options: Sequence[int]) -> bytes:
+    """Return an image as the content of a file. Raises VbnfaultError if OpenCV cannot encode it."""
+    done, data = cv2.imencode(ending, np.ascontiguousarray(_swapped(image)), options)
     if not done:
         raise VbnfaultError(f"the image cannot be encoded as {ending}")
     return bytes(data.tobytes())

@@ -48,18 +48,8 @@ def tiff_pixels(data: bytes, most_values: int) -> tuple[F32, F32 | None]:
     InputError
         The file is damaged, has more than `most_values` values, or holds no single image of grey or RGB.
     """
-    import tifffile  # takes 0.1 s to import
-
-    try:
-        with _without_log_lines(), tifffile.TiffFile(io.BytesIO(data)) as file:
-            page = _only_page(file)
-            check_values(page.imagelength, page.imagewidth, page.samplesperpixel, most_values)
-            _check_kind(page)
-            return _colours(_samples(page, data, most_values), page)
-    except InputError:
-        raise
-    except Exception:  # a damaged file fails anywhere in tifffile, with errors of any type
-        raise InputError("is a damaged TIFF file") from None
+    with _usable_page(data, most_values) as page:
+        return _colours(_samples(page, data, most_values), page)
 
 
 def tiff_numbers(data: bytes, most_values: int) -> NDArray[Any]:
@@ -67,21 +57,28 @@ def tiff_numbers(data: bytes, most_values: int) -> NDArray[Any]:
 
     Raises InputError as `tiff_pixels`, and for a palette.
     """
-    import tifffile
+    with _usable_page(data, most_values) as page:
+        if page.photometric in (_WHITE_IS_0, _PALETTE) or page.bitspersample < 8:
+            raise InputError(
+                "is a TIFF file with a palette, inverted grey or packed bits; save it as plain grey or RGB"
+            )
+        return _samples(page, data, most_values)
+
+
+@contextmanager
+def _usable_page(data: bytes, most_values: int) -> Iterator[TiffPage]:
+    """Open a file for a block that reads its only page. Raises InputError as `tiff_pixels`, also of the block."""
+    import tifffile  # takes 0.1 s to import
 
     try:
         with _without_log_lines(), tifffile.TiffFile(io.BytesIO(data)) as file:
             page = _only_page(file)
             check_values(page.imagelength, page.imagewidth, page.samplesperpixel, most_values)
             _check_kind(page)
-            if page.photometric in (_WHITE_IS_0, _PALETTE) or page.bitspersample < 8:
-                raise InputError(
-                    "is a TIFF file with a palette, inverted grey or packed bits; save it as plain grey or RGB"
-                )
-            return _samples(page, data, most_values)
+            yield page
     except InputError:
         raise
-    except Exception:
+    except Exception:  # a damaged file fails anywhere in tifffile, with errors of any type
         raise InputError("is a damaged TIFF file") from None
 
 

@@ -8,11 +8,9 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from ...core.errors import VbnfaultError
+from ...core.files.images import png
 from ...core.quantities import Sample
 from ...core.registry import Registry, is_name
 from ...store import Store, StoreSpec
@@ -151,15 +149,6 @@ def formats() -> dict[str, type[Format]]:
 def number_text(index: int, samples: int) -> str:
     """Return a sample's index with leading zeros, so that the names of all samples sort as their indices do."""
     return f"{index:0{max(6, len(str(samples - 1)))}d}"
-
-
-def png(image: NDArray[Any]) -> bytes:
-    """Return an image, uint8 or uint16 [y, x] or [y, x, RGB], as the bytes of a PNG file."""
-    swapped = image[..., ::-1] if image.ndim == 3 else image
-    done, data = cv2.imencode(".png", np.ascontiguousarray(swapped))
-    if not done:
-        raise VbnfaultError("an image cannot be encoded as PNG")
-    return data.tobytes()
 
 
 def png_files(spec: StoreSpec, sample: Sample) -> Iterator[tuple[str, str, bytes]]:

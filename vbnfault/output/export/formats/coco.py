@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from .... import __version__
+from ....core.files.images import png
 from ....core.quantities import Sample
 from ....store import Store, StoreSpec
-from ..contract import Closing, Entry, ExportPart, Finished, Format, number_text, png
+from ..contract import Closing, Entry, ExportPart, Finished, Format, number_text
 from ..regions import Region, coco_text, instances, whole
 
 # regions of one class in one image from which they are written as one crowd region: COCO's own limit of detections

@@ -6,9 +6,10 @@ from collections.abc import Collection, Iterable
 
 import numpy as np
 
+from ....core.files.images import png
 from ....core.quantities import Sample
 from ....store import SPLITS, Store, StoreSpec
-from ..contract import Closing, Entry, ExportPart, Finished, Format, number_text, png
+from ..contract import Closing, Entry, ExportPart, Finished, Format, number_text
 from ..regions import Region, instances, polygon
 
 
