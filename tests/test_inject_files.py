@@ -61,6 +61,7 @@ def _image_files(folder: Path) -> dict[str, Path]:
     (folder / "reversed.tif").write_bytes(data.replace(number, fill_order))
     write_png(folder / "alpha.png", np.dstack([COLOURS, COLOURS[..., :1]]))
     write_png(folder / "grey.png", GREY)
+    Image.fromarray(COLOURS).save(folder / "transparent.png", transparency=tuple(COLOURS[0, 0].tolist()))
     _fits_file(folder / "unsigned.fits", GREY, OBSERVER="me")
     _fits_file(folder / "blank.fits", (GREY // 2).astype(np.int16), BLANK=int(GREY[3, 3] // 2), OBSERVER="me")
     _fits_file(folder / "floats.fits", GREY.astype(np.float32), OBSERVER="me")
@@ -117,6 +118,11 @@ def test_other_programs_read_the_files_with_their_metadata(tmp_path: Path) -> No
     image.write(tmp_path / "grey.png", image.numbers, "faults")
     assert profile in (tmp_path / "grey.png").read_bytes()
     assert b"vbnfault\0faults" in (tmp_path / "grey.png").read_bytes()
+    image = read_image(files["transparent.png"])
+    image.write(tmp_path / "transparent.png", image.numbers, "faults")
+    before, after = (Image.open(folder / "transparent.png") for folder in (tmp_path / "in", tmp_path))
+    assert (after.mode, after.info["transparency"]) == ("RGB", before.info["transparency"])
+    np.testing.assert_array_equal(after, before)
 
 
 @pytest.mark.parametrize(

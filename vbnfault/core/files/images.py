@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,6 +28,7 @@ F32 = NDArray[np.float32]
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _PNG_CHANNELS = {b"\0": 1, b"\2": 3, b"\3": 3, b"\4": 2, b"\6": 4}  # by the type of colour in the header
+_NEEDED_CHUNKS = frozenset((b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND"))  # by OpenCV
 # Channels of OpenCV's order B, G, R, alpha in the order R, G, B, alpha, and back.
 _SWAPPED = {3: [2, 1, 0], 4: [2, 1, 0, 3]}
 
@@ -62,23 +63,25 @@ def decoded_image(data: bytes, most_values: int) -> tuple[F32, F32 | None]:
 def png_numbers(data: bytes, most_values: int) -> NDArray[Any]:
     """Return the numbers of a PNG file, uint8 or uint16 [y, x, channel], its alpha last.
 
+    A colour that a chunk tRNS calls transparent is a colour as others, and makes no alpha.
+
     Raises InputError if it is damaged, too large, has a palette or fewer than 8 bits.
     """
     if not data.startswith(_PNG):
         raise InputError("is no PNG file, whatever its name says")
     if data[25:26] == b"\3" or data[24:25] in (b"\1", b"\2", b"\4"):
         raise InputError("is a PNG file with a palette or packed bits; save it as grey or RGB of 8 or 16 bits")
-    image = _decoded_png(data, most_values)
+    image = _decoded_png(data, most_values, _NEEDED_CHUNKS - {b"tRNS"})
     # of grey with alpha OpenCV makes R, G, B and alpha
     return np.ascontiguousarray(image[..., [0, 3]] if data[25:26] == b"\4" else image)
 
 
-def _decoded_png(data: bytes, most_values: int) -> NDArray[Any]:
-    """Return a PNG file as OpenCV decodes it, uint8 or uint16 [y, x, channel]. Raises InputError."""
+def _decoded_png(data: bytes, most_values: int, kinds: Set[bytes] = _NEEDED_CHUNKS) -> NDArray[Any]:
+    """Return what OpenCV makes of some chunks of a PNG file, uint8 or uint16 [y, x, channel]. Raises InputError."""
     if len(data) >= 26:
         columns, rows = struct.unpack(">II", data[16:24])
         check_values(rows, columns, _PNG_CHANNELS.get(data[25:26], 1), most_values)
-    chunks = _chunks(data)
+    chunks = _chunks(data, kinds)
     image = cv2.imdecode(np.frombuffer(chunks, np.uint8), cv2.IMREAD_UNCHANGED) if chunks else None
     if image is None:
         raise InputError("is a damaged PNG file")
@@ -92,7 +95,7 @@ def with_png_numbers(data: bytes, numbers: NDArray[Any], text: str) -> bytes:
     kept, start = [], len(_PNG)
     while start + 12 <= len(data):
         length, kind = struct.unpack_from(">I4s", data, start)
-        if kind not in (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND"):
+        if kind not in (b"IHDR", b"IDAT", b"IEND"):
             kept.append(data[start : start + 12 + length])
         start += 12 + length
     words = b"vbnfault\0" + text.encode("latin-1", "replace")
@@ -145,8 +148,8 @@ def write_exr_like(path: Path, file: OpenEXR.File, channels: Mapping[str, NDArra
     _write_exr(path, file)
 
 
-def _chunks(png: bytes) -> bytes:
-    """Return a PNG file with only the chunks that its pixels need; b"" if it is damaged.
+def _chunks(png: bytes, kinds: Set[bytes]) -> bytes:
+    """Return a PNG file with only the chunks of these kinds; b"" if it is damaged.
 
     OpenCV allocates what a chunk claims to hold, up to 2 GiB, before it finds the file shorter, and libpng writes
     to standard error what it thinks of the other chunks.
@@ -158,7 +161,7 @@ def _chunks(png: bytes) -> bytes:
         start += 12 + length
         if start > len(png) or zlib.crc32(chunk[4:-4]).to_bytes(4, "big") != chunk[-4:]:
             return b""
-        if kind in (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND"):
+        if kind in kinds:
             parts.append(chunk)
         if kind == b"IEND":
             return b"".join(parts) if parts[1].startswith(b"\0\0\0\rIHDR") else b""
