@@ -187,6 +187,8 @@ k: [900.0, 0.0, 520.3, 0.0, 905.0, 371.2, 0.0, 0.0, 1.0]
 binning_x: 0
 binning_y: 0
 roi: {x_offset: 0, y_offset: 0, height: 0, width: 0, do_rectify: false}
+---
+header: {stamp: {sec: 1, nanosec: 0}, frame_id: camera}
 """
 KALIBR = """\
 cam0:
@@ -317,6 +319,11 @@ KNOWN = "must be a camera_info YAML of ROS"
             "image_width, image_height = 1024.5: must be",
         ),
         (ROS.replace("plumb_bob", "kannala"), {}, "distortion_model = 'kannala': must be one of plumb_bob"),
+        (
+            ROS.replace("plumb_bob", "[plumb_bob]"),
+            {},
+            r"distortion_model = \['plumb_bob'\]: must be one of plumb_bob",
+        ),
         (ROS.replace("[900,", "[.nan,"), {}, "fx = nan: must be from 0.001"),
         (ROS.replace("[900,", "[[1],"), {}, r"camera_matrix: \[1\]: must be a number"),
         (

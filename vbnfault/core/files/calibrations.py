@@ -109,11 +109,12 @@ def _colmap(text: str, camera: str) -> Calibration:
 
 
 def _yaml(text: str, camera: str) -> Calibration:
-    """Return the calibration of a YAML file, which tells by its keys whose it is."""
+    """Return the calibration of the first document of a YAML file, which tells by its keys whose it is."""
     import yaml
 
     try:
-        table = yaml.load(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+        # A message that ROS prints ends with "---", behind which another one may begin.
+        table = next(yaml.load_all(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader)), None)
     except (yaml.YAMLError, RecursionError, ValueError) as error:
         where = getattr(error, "problem_mark", None)
         line = "" if where is None else f" in line {where.line + 1}"
@@ -165,7 +166,7 @@ def _ros(table: Mapping[str, Any]) -> Calibration:
     if isinstance(region, Mapping) and any(region.get(k) for k in ("x_offset", "y_offset", "width", "height")):
         raise InputError("roi: must be empty, the whole image that was calibrated")
     key, kind = named("distortion_model")
-    if kind not in _ROS:
+    if kind not in tuple(_ROS):  # a tuple, since YAML may give a list, which has no hash
         raise InputError(f"{key} = {shown(kind)}: must be one of {', '.join(_ROS)}")
     model, counts = _ROS[kind]
     width, height = (named(f"image_{side}", side)[1] for side in ("width", "height"))
