@@ -442,7 +442,8 @@ def test_unusable_files(tmp_path: Path, name: str, content: bytes, sentence: str
     ("keys", "sentence"),
     [
         ({"white_dn": 5.0, "black_dn": 10.0}, "image.white_dn = 5: must be above image.black_dn = 10"),
-        ({"response": "table", "response_file": "missing.csv"}, "missing.csv"),
+        ({"response": "table", "response_file": "missing.csv"}, "image.response_file: missing.csv: .* not found"),
+        ({"response": "table"}, "image.response_file: is missing; response = 'table' needs a CSV file"),
         ({"sun": "auto"}, "no round region of saturated pixels"),
         ({"sun": (float("nan"), 1.0)}, "image.sun"),
     ],

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..core.errors import InputError
+from ..core.errors import InputError, in_file, under_key
 from ..core.files import user_files
 from ..scene.instrument import ResponseCurve
 
@@ -96,21 +96,22 @@ def read_table(path: str) -> F64:
 
     Raises InputError if it cannot be read, or does not rise.
     """
-    return _table(user_files.read_input(path, "response"), path)
+    if not path:
+        raise InputError("image.response_file: is missing; response = 'table' needs a CSV file of two columns")
+    with under_key("image.response_file"), in_file(path):
+        return _table(user_files.read_input(path, "response"))
 
 
 @lru_cache(maxsize=8)
-def _table(data: bytes, path: str) -> F64:
+def _table(data: bytes) -> F64:
     """Return what `read_table` does from the contents of the file."""
     try:
         rows = np.atleast_2d(np.loadtxt(io.StringIO(data.decode()), delimiter=",", comments="#"))
     except ValueError as error:  # also of text that is no UTF-8
-        raise InputError(f"image.response_file = {path!r}: cannot be read: {error}") from None
+        raise InputError(f"cannot be read: {error}") from None
     if rows.shape[1] != 2 or len(rows) < 2:
-        raise InputError(
-            f"image.response_file = {path!r}: needs two columns, light and number, and two rows or more"
-        )
+        raise InputError("needs two columns, light and number, and two rows or more")
     if not (np.isfinite(rows).all() and (np.diff(rows, axis=0) > 0).all()):
-        raise InputError(f"image.response_file = {path!r}: both columns must rise from row to row")
+        raise InputError("both columns must rise from row to row")
     first, last = rows[0], rows[-1]
     return np.asarray((rows - first) / (last - first))
