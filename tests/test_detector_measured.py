@@ -191,8 +191,9 @@ def test_currents_follow_the_temperature_by_their_own_laws(tmp_path: Path) -> No
     )
 
 
-def test_a_fits_file_says_exposure_and_temperature(tmp_path: Path) -> None:
-    dark = np.full(SHAPE, 100, np.int16)
+@pytest.mark.parametrize("kind", [np.int16, np.int64])
+def test_a_fits_file_says_exposure_and_temperature(kind: type, tmp_path: Path) -> None:
+    dark = np.full(SHAPE, 100, kind)
     name = write(tmp_path / "dark.fits", dark, EXPTIME=DARK_S, **{"CCD-TEMP": 0.0})
     table = {"dark": name, "dark_exposure_s": DARK_S, "dark_temperature_K": 273.15}
     by_header, by_keys = (sensor(tmp_path, defects=some).measured for some in ({"dark": name}, table))

@@ -234,7 +234,7 @@ def test_ordinary_frames_give_noise_and_patterns() -> None:
 # --- files ------------------------------------------------------------------------------------------------------
 
 
-def fits(image: np.ndarray, **more: float) -> bytes:
+def fits(image: np.ndarray, **more: float | str) -> bytes:
     """Return a FITS file as the standard asks: cards of 80 characters, blocks of 2880 bytes, unsigned by BZERO."""
     cards = {"BITPIX": 16, "NAXIS": 2, "NAXIS1": image.shape[1], "NAXIS2": image.shape[0], "BZERO": 32768, **more}
     text = "SIMPLE  =                    T".ljust(80) + "".join(
@@ -265,6 +265,8 @@ def test_formats_hold_the_same_numbers(tmp_path: Path) -> None:
         ({"a.png": np.zeros((8, 8), np.uint8)}, r"a\.png: is 8x8 px; must be at least 64 px"),
         ({"a.png": b"no image"}, r"a\.png: is not a PNG"),
         ({"a.fits": b"SIMPLE  = T".ljust(2880)}, r"a\.fits: is no FITS file with an image"),
+        ({"a.fits": fits(np.zeros((70, 70)), EXPTIME="'2'")}, r"a\.fits: EXPTIME = '2': must be a number"),
+        ({"a.fits": fits(np.zeros((70, 70)), BITPIX=24)}, r"a\.fits: BITPIX = 24: must be one of 8, 16, 32, 64"),
         (
             {"a.png": (70, 70), "b.png": (70, 80)},
             r"b\.png: is 80x70 px, but .*a\.png 70x70; frames must have one size",

@@ -17,7 +17,7 @@ _FITS = (".fits", ".fit", ".fts")
 FRAME_TYPES = (".png", ".tif", ".tiff", *_FITS)
 _MOST_VALUES = 400_000_000
 _FITS_BLOCK, _FITS_CARD = 2880, 80
-_FITS_TYPES = {8: "u1", 16: ">i2", 32: ">i4", -32: ">f4", -64: ">f8"}
+_FITS_TYPES = {8: "u1", 16: ">i2", 32: ">i4", 64: ">i8", -32: ">f4", -64: ">f8"}
 
 
 def read_frame(path: Path) -> tuple[NDArray[Any], dict[str, float]]:
@@ -71,23 +71,33 @@ def _fits(data: bytes) -> tuple[NDArray[Any], dict[str, float]]:
         for start in range(0, _FITS_BLOCK, _FITS_CARD):
             key, _, value = block[start : start + _FITS_CARD].decode("latin-1").partition("=")
             cards.setdefault(key[:8].strip(), value.partition("/")[0].strip())
+    cards = {"BSCALE": "1", "BZERO": "0", **cards}
+
+    def number(key: str, kind: type[float] = float) -> Any:
+        try:
+            return kind(cards[key].replace("D", "E"))
+        except ValueError:
+            raise InputError(f"{key} = {cards[key]}: must be a number") from None
+
     try:
-        kind, axes = _FITS_TYPES.get(int(cards["BITPIX"])), int(cards["NAXIS"])
-        columns, rows = (int(cards[f"NAXIS{k}"]) for k in (1, 2))
-        scale, zero = float(cards.get("BSCALE", 1)), float(cards.get("BZERO", 0))
-        known = {
-            name: float(cards[key]) + more
-            for key, name, more in (("EXPTIME", "exposure_s", 0.0), ("CCD-TEMP", "temperature_K", 273.15))
-            if key in cards
-        }
-    except (KeyError, ValueError):
+        bits, axes, columns, rows = (number(key, int) for key in ("BITPIX", "NAXIS", "NAXIS1", "NAXIS2"))
+    except KeyError:
         raise InputError("is no FITS file with an image in its first part") from None
-    if axes != 2 or kind is None:
+    known = {
+        name: number(key) + more
+        for key, name, more in (("EXPTIME", "exposure_s", 0.0), ("CCD-TEMP", "temperature_K", 273.15))
+        if key in cards
+    }
+    if bits not in _FITS_TYPES:
+        raise InputError(f"BITPIX = {bits}: must be one of {', '.join(map(str, _FITS_TYPES))}")
+    if axes != 2:
         raise InputError(f"has an image of {axes} axes; must have two, as raw frames have")
     check_values(rows, columns, 1, _MOST_VALUES)
-    if len(data) < end + rows * columns * np.dtype(kind).itemsize:
+    kind = np.dtype(_FITS_TYPES[bits])
+    if len(data) < end + rows * columns * kind.itemsize:
         raise InputError("is a damaged FITS file: it ends within its image")
-    image = np.frombuffer(data, kind, rows * columns, end).reshape(rows, columns) * scale + zero
+    image = np.frombuffer(data, kind, rows * columns, end).reshape(rows, columns)
+    image = image * number("BSCALE") + number("BZERO")
     whole = np.rint(image)
     if (image == whole).all() and whole.min() >= 0 and whole.max() <= 65535:
         return whole.astype(np.uint16), known
