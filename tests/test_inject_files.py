@@ -185,6 +185,9 @@ def test_exr_keeps_pixels_that_are_not_changed_the_crop_and_the_other_parts(
     for key in window:
         np.testing.assert_array_equal(after[0].header[key], window[key])
     assert after[0].header["vbnfault"] == "faults"
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(InputError, match=r"a\.exr: is a damaged OpenEXR file"):
+        read_image(path)
     assert after[0].header["compression"].name == f"{'PIZ' if compression == 'PIZ' else 'ZIP'}_COMPRESSION"
 
 

@@ -125,6 +125,8 @@ def read_exr(path: Path) -> tuple[OpenEXR.File, dict[str, NDArray[Any]]]:
     try:
         file = OpenEXR.File(str(path), separate_channels=True)
         channels = {name: np.asarray(channel.pixels) for name, channel in file.parts[0].channels.items()}
+        if len(OpenEXR.File(str(path), header_only=True).parts) > len(file.parts):  # it leaves out what is damaged
+            raise ValueError
     except Exception:  # a damaged file fails anywhere in OpenEXR
         raise InputError("is a damaged OpenEXR file") from None
     if not channels or len({array.shape for array in channels.values()}) > 1:
