@@ -20,7 +20,6 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     group.addoption("--facet-m", type=float, help="coarser terrain, for a quick look (default: the scene's)")
     group.addoption("--rounds", type=int, default=5, help="timed rounds after the warm-up")
     group.addoption("--picture", type=Path, help="write our picture and Blender's, side by side, to this PNG")
-    group.addoption("--enforce", action="store_true", help="fail where a target is missed")
 
 
 def pytest_configure(config: pytest.Config) -> None:

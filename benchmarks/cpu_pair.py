@@ -27,9 +27,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-# Names of stages of older versions, and the stages in which their work is done today.
-RENAMED = {"photograph": ("inject_faults", "take_images"), "render_frame": ("render_view",)}
-
 
 def cpu_clock(function: Callable[[], Any]) -> tuple[float, Any]:
     """Return the CPU time of a call in s, of all threads, and its result."""
@@ -151,27 +148,21 @@ def table(before: list[dict[str, float]], now: list[dict[str, float]], *, durati
     what = "ms, least of the rounds" if durations else "ms of CPU, medians"
     lines = [f"{'':<28}{'before':>9}{'now':>9}{'change':>9}{'error':>7}   {what}"]
 
-    def row(names: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]]) -> None:
-        for title, columns in names.items():
-            a, b = (
-                np.array([sum(r[n] for n in c) for r in rounds]) * 1e3
-                for rounds, c in zip((before, now), columns, strict=True)
-            )
-            if durations:
-                lines.append(f"{title:<28}{a.min():9.1f}{b.min():9.1f}{b.min() - a.min():+9.1f}")
-                continue
-            # 1.25 σ/√n is the standard error of a median; 1.48 × the median deviation stands for σ
-            spread = 1.48 * np.median(np.abs((b - a) - np.median(b - a)))
-            error = 1.25 * spread / np.sqrt(len(a))
-            lines.append(f"{title:<28}{np.median(a):9.1f}{np.median(b):9.1f}{np.median(b - a):+9.1f}{error:7.1f}")
+    def row(title: str, names: list[str]) -> None:
+        a, b = (np.array([sum(r.get(n, 0.0) for n in names) for r in rounds]) * 1e3 for rounds in (before, now))
+        if durations:
+            lines.append(f"{title:<28}{a.min():9.1f}{b.min():9.1f}{b.min() - a.min():+9.1f}")
+            return
+        # 1.25 σ/√n is the standard error of a median; 1.48 × the median deviation stands for σ
+        spread = 1.48 * np.median(np.abs((b - a) - np.median(b - a)))
+        error = 1.25 * spread / np.sqrt(len(a))
+        lines.append(f"{title:<28}{np.median(a):9.1f}{np.median(b):9.1f}{np.median(b - a):+9.1f}{error:7.1f}")
 
-    renamed = {old: names for old, names in RENAMED.items() if old in before[0] and names[0] in now[0]}
-    row({name: ((name,), (name,)) for name in now[0] if name in before[0]})
-    row({" + ".join(names): ((old,), names) for old, names in renamed.items()})
-    known = {name for names in renamed.values() for name in names} | set(before[0])
-    added = [name for name in now[0] if name not in known]
-    if added:
-        row({f"new: {' + '.join(added)}": ((), tuple(added))})
+    for name in now[0]:
+        if name in before[0]:
+            row(name, [name])
+    if added := [name for name in now[0] if name not in before[0]]:
+        row(f"new: {' + '.join(added)}", added)
     return "\n".join(lines)
 
 
