@@ -280,12 +280,10 @@ def test_adding_leaves_the_rest_bit_for_bit() -> None:
     rng = np.random.default_rng(1)
     before = Radiance(array=rng.random((8, HEIGHT, WIDTH), dtype=np.float32), wavelength_nm=NODES_NM)
     stars = star_radiance(at((20.5, 20.5)), J_from_C=AXES, sigma_px=1.0, **FRAME)
-    where = np.zeros((HEIGHT, WIDTH), dtype=bool)
-    where[18:21] = True
-    after = stars.added_to(before, where)
+    after = stars.added_to(before)
     changed = (after.array != before.array).any(axis=0)
     assert changed.any()
-    assert not changed[~where].any()
+    assert not changed[~image(stars).any(axis=0)].any()
     assert after.array.dtype == np.float32
 
 
@@ -304,8 +302,6 @@ def test_the_faintest_star_that_an_exposure_shows() -> None:
     faintest = sky.limiting_magnitude(exposure_s=1.0, **limit)
     assert sky.limiting_magnitude(exposure_s=0.01, **limit) == pytest.approx(faintest - 5)
     assert sky.limiting_magnitude(exposure_s=0.0, **limit) == -np.inf
-    with pytest.raises(ValueError, match="threshold_e = 0: must be above 0"):
-        sky.limiting_magnitude(exposure_s=1.0, **{**limit, "threshold_e": 0.0})
     # a comet by daylight takes 0.1 ms: nothing but noise of the brightest star
     assert sky.limiting_magnitude(exposure_s=1e-4, **limit) < sky.BRIGHTEST_V
 
@@ -318,19 +314,6 @@ def test_the_faintest_star_that_an_exposure_shows() -> None:
     black = Radiance(array=np.zeros((8, HEIGHT, WIDTH), dtype=np.float32), wavelength_nm=NODES_NM)
     electrons = detector.electrons_expected(lens.image(added.added_to(black)), 1.0).array
     assert electrons.max() == pytest.approx(13.0, rel=1e-4)
-
-
-@pytest.mark.parametrize(
-    ("change", "says"),
-    [
-        ({"sigma_px": -0.1}, r"sigma_px = -0.1: must be in \[0, 16\]"),
-        ({"sigma_px": float("nan")}, "sigma_px = nan"),
-        ({"sky": np.ones((3, 3), dtype=bool)}, r"sky has shape \(3, 3\), the frame \(64, 96\)"),
-    ],
-)
-def test_refusals(change: dict[str, Any], says: str) -> None:
-    with pytest.raises(ValueError, match=says):
-        star_radiance(at((1.0, 1.0)), **{"J_from_C": AXES, "sigma_px": 1.0, **FRAME, **change})
 
 
 def test_the_stars_cover_the_whole_sky() -> None:

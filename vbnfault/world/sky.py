@@ -54,10 +54,12 @@ COLOUR_RANGE_BV = (-0.4, 4.0)
 
 # The point spread is cut at this many σ, where 6e-7 of a star's light is left on either axis.
 REACH_SIGMA = 5.0
-SIGMA_MAX_PX = 16.0
 
 # Sirius, the brightest star, has V = -1.44. A limiting magnitude below this value shows no star.
 BRIGHTEST_V = -1.5
+
+# Colour of the star for which `limiting_magnitude` is computed: nearly that of the Sun, 0.65.
+LIMIT_BV = 0.6
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -183,11 +185,10 @@ class StarRadiance:
         summed = np.stack([np.bincount(index.ravel(), band, len(pixels)) for band in bands])
         return cls(rows=pixels // width_px, columns=pixels % width_px, radiance=summed.astype(np.float32))
 
-    def added_to(self, radiance: Radiance, where: NDArray[np.bool_] | None = None) -> Radiance:
-        """Return `radiance` with the stars added; if `where` bool[y, x] is given, only in its pixels."""
-        keep = slice(None) if where is None else where[self.rows, self.columns]
+    def added_to(self, radiance: Radiance) -> Radiance:
+        """Return `radiance` with the stars added."""
         array = radiance.array.copy()
-        array[:, self.rows[keep], self.columns[keep]] += self.radiance[:, keep]
+        array[:, self.rows, self.columns] += self.radiance
         return radiance.with_array(array)
 
 
@@ -262,7 +263,7 @@ def star_radiance(
     wavelength_nm
         Band nodes, float64[band].
     sigma_px
-        Standard deviation of the Gaussian point spread in pixels, in [0, 16]. The Gaussian is integrated over the
+        Standard deviation of the Gaussian point spread in pixels, at least 0. The Gaussian is integrated over the
         pixels and cut at 5 σ. With 0, a star lights the one pixel that contains it. Nothing else may blur the frame
         by it again.
     julian_date
@@ -273,16 +274,7 @@ def star_radiance(
         where there is sky.
     lens_falloff
         Whether a lens or a later stage multiplies by cos⁴ θ.
-
-    Raises
-    ------
-    ValueError
-        `sigma_px` is out of range, or `sky` does not have the shape of the frame.
     """
-    if not 0 <= sigma_px <= SIGMA_MAX_PX:
-        raise ValueError(f"sigma_px = {sigma_px:g}: must be in [0, {SIGMA_MAX_PX:g}]")
-    if sky is not None and sky.shape != (frame.height_px, frame.width_px):
-        raise ValueError(f"sky has shape {sky.shape}, the frame {(frame.height_px, frame.width_px)}")
     position, cosines, ahead = frame.positions_px(catalogue.direction_J(julian_date))
     visible = _visible(position, frame, REACH_SIGMA * sigma_px, sky)
     position, stars = position[visible], ahead[visible]
@@ -368,11 +360,10 @@ def limiting_magnitude(
     exposure_s: float,
     sigma_px: float,
     threshold_e: float,
-    colour_BV: float = 0.6,
 ) -> float:
     """Return V of a star whose brightest pixel collects `threshold_e` in its brightest colour.
 
-    The star is on the axis, centred on a pixel. If the result is below `BRIGHTEST_V`, the exposure shows no star.
+    The star is on the axis, centred on a pixel, and has the colour `LIMIT_BV`. If the result is below `BRIGHTEST_V`, the exposure shows no star.
     It is -inf if no light is collected.
 
     Parameters
@@ -387,19 +378,10 @@ def limiting_magnitude(
         As in the camera and in `star_radiance`.
     threshold_e
         Electrons, above 0.
-    colour_BV
-        Colour of the star.
-
-    Raises
-    ------
-    ValueError
-        `threshold_e` is not above 0.
     """
-    if not threshold_e > 0:
-        raise ValueError(f"threshold_e = {threshold_e:g}: must be above 0")
     half = 0.5 / max(sigma_px, 1e-9)
     fraction = float(ndtr(half) - ndtr(-half)) ** 2  # of the light, in the brightest pixel
-    irradiance = star_irradiance_W_m2_nm(0.0, colour_BV, wavelength_nm)[0] * focal_length_px**2
+    irradiance = star_irradiance_W_m2_nm(0.0, LIMIT_BV, wavelength_nm)[0] * focal_length_px**2
     rate = float((np.asarray(electron_rate_weights, dtype=np.float64) @ irradiance).max())
     collected = rate * irradiance_per_radiance * exposure_s * fraction
     return float(2.5 * np.log10(collected / threshold_e)) if collected > 0 else float("-inf")
