@@ -342,10 +342,6 @@ def test_events_are_listed_by_the_command(scene: Path, tmp_path: Path, call: Cal
             {"cause": "c", "faults": ["dust_on_optics"], "onset_s": 1.0, "duration_s": 0.0},
             r"event\[0\]\.duration_s",
         ),
-        (
-            {"cause": "c", "faults": ["dust_on_optics"], "onset_s": 1.0, "duration_s": -2.0},
-            r"event\[0\]\.duration_s",
-        ),
         ({"cause": "c", "faults": ["dust_on_optics"], "onset_s": 1.0, "profile": "slow"}, r"event\[0\]\.profile"),
         ({"cause": "c", "faults": ["dust_on_optics"], "onset_s": 1.0, "profile": "growing"}, r"rise_s must be set"),
         ({"cause": "c", "faults": ["dust_on_optics"], "onset_s": 1.0, "rise_s": 1.0}, r"rise_s must not be set"),

@@ -20,8 +20,6 @@ from vbnfault.core.registry import undoing_registrations
 from vbnfault.detector.interface import with_luminance
 from vbnfault.detector.mosaic import pattern
 from vbnfault.faults import (
-    MOSAIC_STEPS,
-    STEPS,
     Fault,
     dataset_order,
     from_dict,
@@ -60,22 +58,12 @@ def test_contract(name: str, model: str, required: dict[str, dict[str, Any]]) ->
     check_fault(registry()[name][model], required=required.get(name), examples=examples)
 
 
-@pytest.mark.parametrize(("name", "model"), MODELS)
-def test_defaults_are_within_limits(name: str, model: str, required: dict[str, dict[str, Any]]) -> None:
-    fault = from_dict(name, required.get(name, {}) | {"model": model}, source="test.toml")
-    assert (fault.fault, fault.model) == (name, model)
-    assert fault.steps[0] == fault.step
-    assert set(fault.steps) <= set(STEPS)
-    assert fault.needs_mosaic >= bool(set(fault.steps) & set(MOSAIC_STEPS))
-    for f in dataclasses.fields(fault):
-        assert f.metadata["doc"]
-
-
 @pytest.mark.parametrize(("name", "model", "key"), WITH_BOUNDS)
 def test_bad_bounds_are_refused(name: str, model: str, key: str, required: dict[str, dict[str, Any]]) -> None:
     f = registry()[name][model].__dataclass_fields__[key]
     lo, hi = f.metadata["limits"]
     bad: list[Any] = [hi + 1, lo - 1, [lo, hi + 1], "wide", True, None, [lo], [lo, hi, hi], float("nan")]
+    bad += [10**400, -(10**400), 10**5000, [lo, 10**400]]  # beyond floats
     if hi > lo:
         bad.append([hi, lo])
     if f.metadata["integer"]:
@@ -107,18 +95,6 @@ def test_unknown_class_and_model_are_refused() -> None:
         from_dict("vigneting", {}, source="test.toml")
     with pytest.raises(InputError, match=r"faults\.vignetting\.model = 'cos5': must be one of"):
         from_dict("vignetting", {"model": "cos5"}, source="test.toml")
-
-
-@pytest.mark.parametrize(("name", "model"), MODELS)
-def test_params_are_plain(name: str, model: str, required: dict[str, dict[str, Any]]) -> None:
-    def check(value: Any) -> None:
-        assert type(value) in (dict, list, str, int, float, bool, type(None)), type(value)
-        for item in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
-            check(item)
-
-    fault = from_dict(name, required.get(name, {}) | {"model": model}, source="test.toml")
-    context = make_context(96, sun=(30.0, 20.0))
-    check(fault.draw(with_mosaic(context) if fault.needs_mosaic else context, np.random.default_rng(0)))
 
 
 @pytest.mark.parametrize(
