@@ -309,17 +309,17 @@ def test_a_file_replaced_between_its_index_and_a_chunk_is_read_again(
 ) -> None:
     """A sample whose layer cannot be decoded is read again; three times in a row count as damage."""
     wanted = {name: layer.tobytes() for name, layer in sample(3).layers.items()}
-    opened, get, reads = st.open_store(store), disk.read_parts, []
+    opened, get, reads = st.open_store(store), disk.Disk.read_parts, []
     file = opened.file("depth_m", 1)
     whole = file.read_bytes()
 
-    def replace_and_get(path: str, *given: Any) -> Any:
-        if "/depth_m/c/" in path:
-            reads.append(path)
+    def replace_and_get(files: disk.Disk, name: str, *given: Any) -> Any:
+        if name.startswith("depth_m/c/"):
+            reads.append(name)
             file.write_bytes(whole[::-1] if len(reads) <= times else whole)
-        return get(path, *given)
+        return get(files, name, *given)
 
-    monkeypatch.setattr(disk, "read_parts", replace_and_get)
+    monkeypatch.setattr(disk.Disk, "read_parts", replace_and_get)
     if times == 3:
         with pytest.raises(VbnfaultError, match="depth_m of sample 3 cannot be read"):
             opened.read_sample(3)

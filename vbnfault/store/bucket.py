@@ -186,7 +186,7 @@ class Bucket:
     def read_parts(
         self, name: str, tail: int, choose: Callable[[bytes], Sequence[tuple[int, int]]]
     ) -> list[tuple[int, bytes]]:
-        """Return parts of an object, see `disk.read_parts`; only these bytes and the tail are requested."""
+        """Return parts of an object, see `Disk.read_parts`; only these bytes and the tail are requested."""
         import obstore
 
         with self._reading(name):

@@ -87,37 +87,8 @@ def read(path: str | Path, most_bytes: int) -> bytes:
     return parts[0] if len(parts) == 1 else b"".join(parts)
 
 
-def read_parts(
-    path: str | Path, tail: int, choose: Callable[[bytes], Sequence[tuple[int, int]]]
-) -> list[tuple[int, bytes]]:
-    """Return parts of a regular file, each with its start in the file; a part may be shorter at the file's end.
-
-    Parameters
-    ----------
-    path
-        The file, which is opened once, so that all parts are of one version of it.
-    tail
-        Number of bytes at the end of the file that `choose` receives.
-    choose
-        Returns start and length of each part.
-
-    Raises
-    ------
-    Misplaced, OSError, InputError
-        As `read` does.
-    """
-    file, size = _opened(path)
-    try:
-        ranges = choose(os.pread(file, min(tail, size), max(0, size - tail)))
-        # os.pread reserves what it may read, and takes no place beyond 2^63
-        within = [(start, min(length, size - start)) for start, length in ranges]
-        return [(start, os.pread(file, length, start) if length > 0 else b"") for start, length in within]
-    finally:
-        os.close(file)
-
-
 # without O_NONBLOCK, opening a pipe would wait for a writer
-_READING = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+_READING = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
 
 
 def _opened(path: str | Path) -> tuple[int, int]:
@@ -191,7 +162,7 @@ def write(root: Path, files: Iterable[tuple[str, bytes | Path]]) -> None:
                     continue
                 except OSError:  # on another device, or a file system without links
                     content = read(content, _MOST_COPIED_BYTES)
-            flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
+            flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL
             opened.append(os.open(partial, flags, 0o666))
             _write_all(opened[-1], content)
             if len(opened) == _OPEN_AT_ONCE:
@@ -273,16 +244,6 @@ def _make_way(target: Path) -> None:
         shutil.rmtree(target)
 
 
-def remove(root: Path, files: Iterable[str]) -> None:
-    """Remove files below `root` durably, as one batch; files that do not exist are left out."""
-    folders: dict[Path, None] = {}
-    for name in files:
-        with contextlib.suppress(FileNotFoundError, NotADirectoryError):
-            os.unlink(root / name)
-            folders[(root / name).parent] = None
-    _at_once(flush_folder, folders)
-
-
 def remove_partials(folder: str | Path) -> None:
     """Remove the temporary files that a killed process left in a folder or below it."""
     folders = [os.fspath(folder)]  # text, because a large store has half a million folders
@@ -350,8 +311,30 @@ class Disk:
     def read_parts(
         self, name: str, tail: int, choose: Callable[[bytes], Sequence[tuple[int, int]]]
     ) -> list[tuple[int, bytes]]:
-        """Return parts of one version of a file, each with its start; `choose` gets the last `tail` bytes."""
-        return read_parts(self._inside(name), tail, choose)
+        """Return parts of a file, each with its start in the file; a part may be shorter at the file's end.
+
+        Parameters
+        ----------
+        name
+            The file, which is opened once, so that all parts are of one version of it.
+        tail
+            Number of bytes at the end of the file that `choose` receives.
+        choose
+            Returns start and length of each part.
+
+        Raises
+        ------
+        OSError, InputError
+            As `read` does.
+        """
+        file, size = _opened(self._inside(name))
+        try:
+            ranges = choose(os.pread(file, min(tail, size), max(0, size - tail)))
+            # os.pread reserves what it may read, and takes no place beyond 2^63
+            within = [(start, min(length, size - start)) for start, length in ranges]
+            return [(start, os.pread(file, length, start) if length > 0 else b"") for start, length in within]
+        finally:
+            os.close(file)
 
     def names(self, folder: str) -> list[str]:
         """Return the names in a folder; an empty list if there is no such folder."""
@@ -396,15 +379,17 @@ class Disk:
         write(self.path, files)
 
     def remove(self, files: Iterable[str]) -> None:
-        """Remove files durably; names that do not exist are left out."""
-
-        def within() -> Iterator[str]:
-            for name in files:
-                with contextlib.suppress(OSError):
-                    self._inside(name)
-                    yield name
-
-        remove(self.path, within())
+        """Remove files durably, as one batch; names that do not exist, or below a link, are left out."""
+        folders: dict[Path, None] = {}
+        for name in files:
+            try:
+                path = Path(self._inside(name))
+            except OSError:
+                continue
+            with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+                os.unlink(path)
+                folders[path.parent] = None
+        _at_once(flush_folder, folders)
 
     def copied(self, name: str, most_bytes: int, *, link: bool) -> bytes | Path:
         """Return a file as `write` of another store takes it. `link`: where possible, no byte is copied."""

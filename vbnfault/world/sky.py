@@ -363,8 +363,8 @@ def limiting_magnitude(
 ) -> float:
     """Return V of a star whose brightest pixel collects `threshold_e` in its brightest colour.
 
-    The star is on the axis, centred on a pixel, and has the colour `LIMIT_BV`. If the result is below `BRIGHTEST_V`, the exposure shows no star.
-    It is -inf if no light is collected.
+    The star is on the axis, centred on a pixel, and has the colour `LIMIT_BV`. If the result is below
+    `BRIGHTEST_V`, the exposure shows no star. It is -inf if no light is collected.
 
     Parameters
     ----------
