@@ -29,7 +29,7 @@ from hypothesis import HealthCheck, settings
 if threading.current_thread() is threading.main_thread():
     signal.signal(signal.SIGINT, signal.default_int_handler)
     # So does `nohup` for the hang-up of a terminal: handled here, it is ignored by the tests alone.
-    if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+    if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
         signal.signal(signal.SIGHUP, lambda *_: None)
 
 # A loaded machine is slow at everything: no example fails for the seconds that it or its drawing took. What cannot

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import json
 import os
 import platform
@@ -108,7 +109,10 @@ def test_ranges_at_work_at_once_make_one_store(tmp_path: Path, whole: Path) -> N
 def test_ranges_without_locks_of_the_file_system(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole: Path
 ) -> None:
-    monkeypatch.setattr(lock, "fcntl", None)
+    def refuse(*_: object) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(lock.fcntl, "flock", refuse)
     out = tmp_path / "s.zarr"
 
     def others() -> None:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import json
 import os
 import re
@@ -20,7 +21,6 @@ import stat
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 from ..core.errors import InputError, VbnfaultError
@@ -29,14 +29,8 @@ from ..store import Location, Url
 from . import claims
 from .claims import overlap, still_writing, this_process
 
-fcntl: ModuleType | None
-try:
-    import fcntl
-except ImportError:  # Windows has no such locks
-    fcntl = None
-
 # a lock is no link, whose target would be emptied, and no pipe, which would block
-_PLAIN = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+_PLAIN = os.O_NOFOLLOW | os.O_NONBLOCK
 _MOST_BYTES = 65536  # of what a lock says of its owner
 _SECONDS_BETWEEN_TRIES = 0.1
 _SECONDS_TO_PREPARE = 600.0  # after which a command does not wait any longer until another has prepared a store
@@ -124,9 +118,8 @@ def _removed_if_free(file: Path) -> bool:
     except OSError:
         return True
     try:
-        if fcntl is not None:
-            fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)  # shared: others that look do not disturb each other
-            file.unlink(missing_ok=True)
+        fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)  # shared: others that look do not disturb each other
+        file.unlink(missing_ok=True)
     except BlockingIOError:
         return False
     except OSError:
@@ -148,7 +141,7 @@ def _take(path: Path, stem: str, stack: contextlib.ExitStack) -> bool:
         above = next((p for p in path.absolute().parents if os.path.isfile(p)), None)
         why = f"{above} is a file, not a folder" if above else error.strerror
         raise kind_of(error)(f"{path}: nothing can be created here: {why}") from None
-    while fcntl is not None:
+    while True:
         handle = _opened(path, file)
         with contextlib.ExitStack() as undo:
             undo.callback(os.close, handle)
@@ -172,7 +165,6 @@ def _take(path: Path, stem: str, stack: contextlib.ExitStack) -> bool:
                     stack.push(undo.pop_all())
                     return True
             # the file was removed by its owner between our opening and our locking it: try again
-    return False
 
 
 def _opened(path: Path, file: Path) -> int:

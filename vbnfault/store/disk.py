@@ -88,7 +88,7 @@ def read(path: str | Path, most_bytes: int) -> bytes:
 
 
 # without O_NONBLOCK, opening a pipe would wait for a writer
-_READING = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+_READING = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK
 
 
 def _opened(path: str | Path) -> tuple[int, int]:

@@ -24,6 +24,7 @@ import math
 import os
 import pickle
 import re
+import resource
 import signal
 import subprocess
 import sys
@@ -421,14 +422,9 @@ def serve() -> None:
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # CSPICE prints to file descriptor 1, and its text must not mix with the answers
     questions = sys.stdin.buffer
-    try:
-        import resource
-    except ImportError:  # Windows does not have this module
-        resource = None  # type: ignore[assignment]
-    if resource is not None:
-        for limit, value in ((resource.RLIMIT_CORE, 0), (resource.RLIMIT_AS, _ADDRESS_SPACE_BYTES)):
-            hard = resource.getrlimit(limit)[1]
-            resource.setrlimit(limit, (value if hard == resource.RLIM_INFINITY else min(value, hard), hard))
+    for limit, value in ((resource.RLIMIT_CORE, 0), (resource.RLIMIT_AS, _ADDRESS_SPACE_BYTES)):
+        hard = resource.getrlimit(limit)[1]
+        resource.setrlimit(limit, (value if hard == resource.RLIM_INFINITY else min(value, hard), hard))
     import spiceypy
 
     while True:
@@ -436,13 +432,12 @@ def serve() -> None:
             name, arguments, cpu_s = pickle.load(questions)
         except EOFError:
             return
-        if resource is not None:
-            used = resource.getrusage(resource.RUSAGE_SELF)
-            until = math.ceil(used.ru_utime + used.ru_stime + cpu_s)
-            hard = resource.getrlimit(resource.RLIMIT_CPU)[1]
-            resource.setrlimit(
-                resource.RLIMIT_CPU, (until if hard == resource.RLIM_INFINITY else min(until, hard), hard)
-            )
+        used = resource.getrusage(resource.RUSAGE_SELF)
+        until = math.ceil(used.ru_utime + used.ru_stime + cpu_s)
+        hard = resource.getrlimit(resource.RLIMIT_CPU)[1]
+        resource.setrlimit(
+            resource.RLIMIT_CPU, (until if hard == resource.RLIM_INFINITY else min(until, hard), hard)
+        )
         try:
             answer = "done", _QUESTIONS[name](spiceypy, *arguments)
         except InputError as error:

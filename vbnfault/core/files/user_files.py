@@ -131,10 +131,7 @@ def _opened_now(path: Path, what: str, types: Sequence[str], limit_bytes: int) -
         )
     try:
         # O_NONBLOCK, since the name may belong to a pipe by now, which would block.
-        flags = (
-            os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0) | getattr(os, "O_CLOEXEC", 0)
-        )
-        file = os.fdopen(os.open(path, flags), "rb")
+        file = os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb")
     except OSError as error:
         raise InputError(f"{path}: {what} file cannot be read: {error.strerror}.") from None
     try:

@@ -119,7 +119,7 @@ class replacing:
                     remove(self._path)
                 else:
                     with contextlib.suppress(PermissionError):  # `write_whole` has flushed it and set its mode
-                        _flush_at(self._temporary, os.O_RDWR | getattr(os, "O_BINARY", 0))
+                        _flush_at(self._temporary, os.O_RDWR)
                 rename(self._temporary, self._path)
         finally:
             with contextlib.suppress(OSError):  # the first error counts
@@ -134,8 +134,7 @@ def rename(source: Path, target: Path) -> None:
 
 def flush_folder(folder: Path) -> None:
     """Flush the entries of a folder to the device: files made, renamed or removed in it."""
-    if os.name != "nt":  # Windows cannot open folders
-        _flush_at(folder, os.O_RDONLY)
+    _flush_at(folder, os.O_RDONLY)
 
 
 def _flush_at(path: Path, flags: int) -> None:

@@ -17,10 +17,9 @@ from typing import Any
 
 from ..errors import VbnfaultError
 
-# Windows has no SIGHUP.
-_SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
+_SIGNALS: tuple[int, ...] = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 # A terminal sends these to every process of a command; the first process of a build acts on them for all.
-_OF_THE_TERMINAL = tuple(number for number in _SIGNALS if number != signal.SIGTERM)
+_OF_THE_TERMINAL: tuple[int, ...] = (signal.SIGINT, signal.SIGHUP)
 
 _winding_up: list[finishing] = []
 # What reports an exception that Python drops, while a `listening` block runs.
@@ -185,9 +184,6 @@ class finishing:
 @contextlib.contextmanager
 def held() -> Iterator[None]:
     """Hold all signals back within a block. A process that is started within it holds them back too."""
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
     try:
         yield
@@ -209,5 +205,4 @@ def obey_parent() -> None:
     """
     ignore()
     signal.signal(signal.SIGTERM, raise_stopped)
-    if hasattr(signal, "pthread_sigmask"):
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)

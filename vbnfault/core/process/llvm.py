@@ -47,7 +47,6 @@ _SYSTEM_PATTERNS = {
         ("/opt/homebrew/opt", "llvm*/lib/libLLVM*.dylib"),
         ("/usr/local/opt", "llvm*/lib/libLLVM*.dylib"),
     ),
-    "win32": (("C:/Program Files/LLVM", "bin/LLVM-C.dll"),),
 }
 
 

@@ -19,8 +19,6 @@ from typing import Any, TextIO, cast
 
 from .interrupts import Stopped
 
-_SIGPIPE = int(getattr(signal, "SIGPIPE", 13))  # Windows has none
-
 
 @contextlib.contextmanager
 def steady() -> Iterator[None]:
@@ -73,7 +71,7 @@ class _Sentences(logging.Handler):
 
 def is_unread(stop: BaseException) -> bool:
     """Return whether a program ends because the reader of its standard output left."""
-    return isinstance(stop, Stopped) and stop.number == _SIGPIPE
+    return isinstance(stop, Stopped) and stop.number == signal.SIGPIPE
 
 
 def _open_if_closed(number: int) -> None:
@@ -121,5 +119,5 @@ class _Stream:
 def _output_failed(error: OSError) -> None:
     """Raise `Stopped` where the reader of standard output left, else the error with the stream's name."""
     if isinstance(error, BrokenPipeError):
-        raise Stopped(_SIGPIPE) from error
+        raise Stopped(signal.SIGPIPE) from error
     raise OSError(error.errno, error.strerror, "standard output") from error
