@@ -39,7 +39,7 @@ HERE = Path(__file__).resolve().parent
 def test_a_finished_store_is_left_as_it_is(undisturbed: tuple[Path, str], tmp_path: Path) -> None:
     summary = run(tmp_path / "s.zarr")
     assert (summary.built, summary.finished, summary.shards, summary.sites) == (SAMPLES, 0, 5, 3)
-    assert st.verify(tmp_path / "s.zarr") == []
+    assert st.examine(tmp_path / "s.zarr").problems == []
     assert summary.digest == undisturbed[1] == st.digest(undisturbed[0]) == st.digest(tmp_path / "s.zarr")
     times = {p: p.stat().st_mtime_ns for p in (tmp_path / "s.zarr").rglob("c/**/*") if p.is_file()}
     log = tmp_path / "log"
@@ -64,7 +64,7 @@ def test_damage_is_repaired_by_building_exactly_the_samples_concerned(
     summary = run(out, Session(log=str(log)))
     assert (summary.built, summary.digest) == (6, undisturbed[1])  # of samples kept and samples made again
     assert sorted(int(line.split()[1]) for line in log.read_text().splitlines()) == [4, 9, 12, 13, 14, 15]
-    assert st.verify(out) == []
+    assert st.examine(out).problems == []
     assert st.digest(out) == undisturbed[1]
     assert not list(out.rglob("*.partial"))
 
@@ -87,11 +87,11 @@ def test_samples_that_are_not_as_planned_or_labelled_are_built_again(
         sample.scalars.update(changes)  # type: ignore[attr-defined]
     samples[-1].layers["mask_any"] = ~samples[-1].layers["mask"].any(0)  # type: ignore[index]
     st.write_samples(out, samples)
-    assert len(st.verify(out, expected=planned)) >= 5
+    assert len(st.examine(out, expected=planned).problems) >= 5
     log = tmp_path / "log"
     assert run(out, Session(log=str(log)), workers=workers, expected=planned).built == 5
     assert sorted(int(line.split()[1]) for line in log.read_text().splitlines()) == [*wrong, 16]
-    assert st.verify(out, expected=planned) == []
+    assert st.examine(out, expected=planned).problems == []
     assert st.digest(out) == undisturbed[1]
     assert run(out, workers=workers, expected=planned).built == 0
 
@@ -140,7 +140,7 @@ def test_append_keeps_earlier_bits_and_resumes_itself(undisturbed: tuple[Path, s
     assert planned_blocks(out, SAMPLES) == blocks
     assert run(out, samples=23, blocks=blocks).built == 1
     assert planned_blocks(out, SAMPLES, append=5) == (SAMPLES, 5, 5)
-    assert st.verify(out) == []
+    assert st.examine(out).problems == []
     for sample in old:
         again = st.open_store(out).read_sample(sample.index)
         assert all(again.layers[n].tobytes() == a.tobytes() for n, a in sample.layers.items())
@@ -238,7 +238,7 @@ def test_a_store_of_other_versions_is_completed_on_request_and_says_by_whom(
     st.open_store(out).file("depth_m", 1).unlink()  # 4 to 7
     assert made_with("1").built == 5
     assert noted() == {"2": [[9, 10]]}
-    assert st.verify(out) == []
+    assert st.examine(out).problems == []
     assert st.open_store(out).attributes["versions"]["numpy"] == "1"
     for i in range(SAMPLES):
         a, b = st.open_store(out).read_sample(i), st.open_store(undisturbed[0]).read_sample(i)
@@ -437,7 +437,7 @@ def test_a_store_that_may_not_be_read_is_not_taken_for_damaged(
 ) -> None:
     out, log = shutil.copytree(undisturbed[0], tmp_path / "s.zarr"), tmp_path / "log"
     times = {p: p.stat().st_mtime_ns for p in out.rglob("*")}
-    uses = (st.verify, st.digest, lambda path: run(path, Session(log=str(log))))
+    uses = (st.examine, st.digest, lambda path: run(path, Session(log=str(log))))
     with monkeypatch.context() as patch:
         deny(patch, out / what)
         for use in uses:

@@ -89,7 +89,7 @@ class Builds(RuleBasedStateMachine):
 
     def whole(self) -> None:
         assert store.digest(self.out) == reference(self.scene, self.samples)
-        assert store.verify(self.out) == []
+        assert store.examine(self.out).problems == []
         assert [p.name for p in self.folder.iterdir()] == ["s.zarr"]
         assert not list(self.out.rglob(f"*{disk.PARTIAL}"))
         self.sound = set(range(self.samples))

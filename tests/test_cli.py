@@ -176,7 +176,7 @@ def test_the_digest_survives_an_interrupt_and_a_kill(
     assert 2 <= store.open_store(out).finished() < 8
     assert run(monkeypatch, "build", scene, "--out", out) == 0
     assert store.digest(out) == store.digest(built)
-    assert store.verify(out) == []
+    assert store.examine(out).problems == []
     assert not list(out.rglob("*.partial"))
 
 
@@ -323,4 +323,4 @@ def test_the_real_shape_builds(
     out = tmp_path / "real.zarr"
     options = ("--set", f"body.shape={real_shape}", "--samples", 2)
     assert run(monkeypatch, "build", scene, "--out", out, *options) == 0
-    assert store.verify(out) == []
+    assert store.examine(out).problems == []

@@ -73,7 +73,7 @@ def puts(url: str, what: str) -> Callable[[str, str], bool]:
 
 def test_a_build_in_a_bucket_has_the_digest_of_one_on_disk(built: str, digest: str) -> None:
     assert st.digest(built) == digest
-    assert st.verify(built) == []
+    assert st.examine(built).problems == []
     again = run(built, samples=SAMPLES)
     assert (again.built, again.finished, again.digest) == (0, SAMPLES, digest)
     assert " free" not in again.outlook()[0]
@@ -97,8 +97,8 @@ def test_ranges_are_written_at_once_and_damage_is_repaired(url: str, digest: str
     data[50] ^= 1
     store.files.write([(name, bytes(data))])
     store.files.remove([store.file_name("mask", 0)])
-    assert [p.samples for p in st.check_shard(store, 1)] == [(4,)]
-    assert "the shard file mask/c/0/0/0/0 is missing" in st.check_shard(store, 0)[0].sentence
+    assert [p.samples for p in st.examine_shard(store, 1).problems] == [(4,)]
+    assert "the shard file mask/c/0/0/0/0 is missing" in st.examine_shard(store, 0).problems[0].sentence
     again = run(url, samples=SAMPLES)
     assert (again.built, again.digest) == (5, digest)
 
@@ -183,7 +183,7 @@ def test_a_bucket_that_cannot_be_read_is_not_taken_for_an_empty_one(
     built: str, server: S3Server, digest: str
 ) -> None:
     with server.failing(500, lambda method, path: method == "GET"):
-        for action in (lambda: st.is_store(built), lambda: run(built, samples=SAMPLES), lambda: st.verify(built)):
+        for action in (lambda: st.is_store(built), lambda: run(built, samples=SAMPLES), lambda: st.examine(built)):
             with pytest.raises(VbnfaultError, match="cannot be read: 500 Internal Server Error; nothing is lost"):
                 action()
     assert st.digest(built) == digest

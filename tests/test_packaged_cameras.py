@@ -78,7 +78,7 @@ def test_every_lens_and_detector_makes_a_store(number: int, tmp_path: Path) -> N
     dataset.build_scene(scene, tmp_path / "store.zarr", source="test")
     made = store.open_store(tmp_path / "store.zarr")
     expected = dataset.planned(made.spec.attributes, made.spec.faults)
-    assert not store.verify(made, expected=expected)
+    assert not store.examine(made, expected=expected).problems
     assert made.attributes["optics"]["name"] == load_lens(lens).name
     assert made.attributes["optics"]["f_number"] == pytest.approx(5.6, rel=1e-4)
     assert made.attributes["detector"]["name"] == load_sensor(detector).name

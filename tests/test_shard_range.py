@@ -157,7 +157,7 @@ def test_merged_stores_have_the_digest_of_one_build(
     summary = merge(parts, out, move=move)
     assert (summary.finished, summary.before, [*summary.taken.values()]) == (SAMPLES, 0, [8, 10])
     assert summary.digest == st.digest(whole)
-    assert st.verify(out) == []
+    assert st.examine(out).problems == []
     assert [st.open_store(part).finished() for part in parts] == ([0, 0] if move else [8, 10])
     assert merge(parts, out, move=move).before == SAMPLES
     assert run(out).built == 0
@@ -225,7 +225,7 @@ def test_what_a_killed_removal_left_is_removed_and_what_cannot_be_read_is_kept(
     flip(damaged.file("done", 0), -3)
     damaged.file("done", 1).unlink()  # the first file that goes
     merge([*parts, sound], out, move=True)
-    assert st.verify(out) == []
+    assert st.examine(out).problems == []
     assert damaged.file("image", 0).exists()
     assert not damaged.file("image", 1).exists()
 

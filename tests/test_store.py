@@ -24,7 +24,7 @@ from vbnfault.store import disk
 
 
 def test_a_finished_store_verifies_and_reads_back(whole: st.Store) -> None:
-    assert st.verify(whole) == []
+    assert st.examine(whole).problems == []
     assert st.problem_samples(whole) == []
     for i in (0, 5, 9):
         want, got = fake_sample(whole.spec, i), whole.read_sample(i)
@@ -130,20 +130,20 @@ def test_a_sample_that_does_not_fit_is_refused(whole: st.Store, change: object, 
     change(sample)  # type: ignore[operator]
     with pytest.raises(ValueError, match=sentence):
         st.write_samples(whole, [sample])
-    assert st.verify(whole) == []
+    assert st.examine(whole).problems == []
 
 
 def test_unfinished_samples_are_named_and_the_rest_is_kept(tmp_path: Path) -> None:
     store = st.create(tmp_path / "s.zarr", make_spec(), 10)
-    assert st.verify(store) == ["samples 0-9 are not built yet"]
+    assert st.examine(store).problems == ["samples 0-9 are not built yet"]
     st.write_samples(store, [fake_sample(store.spec, i) for i in (0, 3, 5)])
-    assert st.verify(store) == ["samples 1-2, 4, 6-9 are not built yet"]
+    assert st.examine(store).problems == ["samples 1-2, 4, 6-9 are not built yet"]
     with pytest.raises(InputError, match="sample 1 is not finished"):
         store.read_sample(1)
     with pytest.raises(InputError, match="the range is 0 to 9"):
         store.read_sample(10)
     st.write_samples(store, [fake_sample(store.spec, i) for i in (9, 1, 2, 4, 6, 8, 7)])
-    assert st.verify(store) == []
+    assert st.examine(store).problems == []
     assert st.digest(store) == st.digest(filled(tmp_path / "t.zarr"))
 
 
@@ -158,7 +158,7 @@ def test_a_store_without_fault_classes_works(tmp_path: Path) -> None:
     store = filled(tmp_path / "s.zarr", **changes)
     assert zarr.open_array(store.path / "mask", mode="r").shape == (10, 0, 24, 32)
     assert not (store.path / "mask/c").exists()
-    assert st.verify(store) == []
+    assert st.examine(store).problems == []
     assert st.problem_samples(store) == []
     assert store.read_sample(4).layers["mask"].shape == (0, 24, 32)
     assert st.digest(store) == st.digest(filled(tmp_path / "t.zarr", **changes, shard_samples=3))
@@ -166,7 +166,7 @@ def test_a_store_without_fault_classes_works(tmp_path: Path) -> None:
     assert st.problem_samples(store) == [4]
     store = st.append_samples(store, 3)
     st.write_samples(store, [fake_sample(store.spec, i) for i in (4, 10, 11, 12)])
-    assert st.verify(store) == []
+    assert st.examine(store).problems == []
     xarray = pytest.importorskip("xarray")
     with xarray.open_zarr(store.path) as data:
         assert data["mask"].load().shape == (13, 0, 24, 32)
@@ -195,7 +195,7 @@ def test_an_interrupted_append_is_reported_and_mended(whole: st.Store, monkeypat
         monkeypatch.undo()
         # a reader may see this state beside a writer that lives, so that opening does not warn: `verify` reports it
         assert st.open_store(whole.path).samples == samples
-        assert st.verify(whole.path)[0].startswith(sentence)
+        assert st.examine(whole.path).problems[0].startswith(sentence)
         store = st.recover(whole.path)
         assert st.problem_samples(store) == list(range(10, samples))
 
@@ -275,7 +275,7 @@ def test_a_store_of_another_format_is_refused_and_left_as_it_is(
 ) -> None:
     whole.update_attributes({"format_version": version})
     before = {p: p.read_bytes() for p in whole.path.rglob("*") if p.is_file()}
-    for use in (st.open_store, st.verify, st.digest, st.recover, lambda path: st.append_samples(path, 2)):
+    for use in (st.open_store, st.examine, st.digest, st.recover, lambda path: st.append_samples(path, 2)):
         with pytest.raises(InputError, match=sentence):
             use(whole.path)
     assert {p: p.read_bytes() for p in whole.path.rglob("*") if p.is_file()} == before

@@ -94,7 +94,7 @@ def flipped(name: str, number: int) -> Damage:
 def test_damage_is_found_and_mended(whole: st.Store, damage: Damage, sentence: str, concerned: list[int]) -> None:
     before = st.digest(whole)
     damage(whole)
-    assert any(re.match(sentence, problem) for problem in st.verify(whole))
+    assert any(re.match(sentence, problem) for problem in st.examine(whole).problems)
     repaired(whole, concerned, before)
 
 
@@ -103,9 +103,9 @@ def test_every_flipped_byte_of_a_shard_is_found(whole: st.Store) -> None:
     good = file.read_bytes()
     for position in range(0, len(good), 7):
         flip(file, position)
-        assert st.check_shard(whole, 2), position
+        assert st.examine_shard(whole, 2).problems, position
         file.write_bytes(good)
-    assert st.check_shard(whole, 2) == []
+    assert st.examine_shard(whole, 2).problems == []
 
 
 @pytest.mark.parametrize("name", ["image", "mask", "tries", "exposure_s", "parameters"])
@@ -128,7 +128,7 @@ def relabelled(whole: st.Store, index: int, **changes: object) -> list[str]:
     for name, value in changes.items():
         (sample.scalars if name in st.SCALARS else sample.layers)[name] = value  # type: ignore[index]
     st.write_samples(whole, [sample])
-    return st.verify(whole)
+    return st.examine(whole).problems
 
 
 def test_labels_that_contradict_each_other_are_found(whole: st.Store) -> None:
@@ -208,7 +208,7 @@ def test_one_pass_gives_problems_digest_and_counts(whole: st.Store, monkeypatch:
     row = next(line for line in report.counts.lines() if line.startswith(FAULTS[off]))
     here = commanded[[k for k, s in enumerate(splits) if s == splits[i]], off].sum()
     assert f"{here - 1} of {here}" in row
-    (sentence,) = st.verify(whole, expected=lambda i, _: {"injected": commanded[i]}, exact=True)
+    (sentence,) = st.examine(whole, expected=lambda i, _: {"injected": commanded[i]}, exact=True).problems
     assert sentence == f"sample {i}: {FAULTS[off]} is not injected, although the plan commands it"
 
 
@@ -228,10 +228,10 @@ def test_verify_compares_with_the_plan(whole: st.Store) -> None:
         scalars = fake_sample(whole.spec, i).scalars
         return {name: scalars[name] for name in ("site", "proposal", "sun_xy_px", "julian_date", "injected")}
 
-    assert st.verify(whole, expected=plan) == []
-    (sentence,) = st.verify(whole, expected=lambda i, _: plan(i) | ({"site": 2} if i == 3 else {}))
+    assert st.examine(whole, expected=plan).problems == []
+    (sentence,) = st.examine(whole, expected=lambda i, _: plan(i) | ({"site": 2} if i == 3 else {})).problems
     assert sentence == "sample 3: site = 1 is not as planned (2)"
-    (sentence,) = st.verify(whole, expected=lambda i, _: plan(i) | ({"proposal": "{}"} if i == 3 else {}))
+    (sentence,) = st.examine(whole, expected=lambda i, _: plan(i) | ({"proposal": "{}"} if i == 3 else {})).problems
     assert sentence.startswith('sample 3: proposal = {"sun_elevation_deg": 0.3} is not as planned')
 
 
@@ -239,7 +239,7 @@ def test_a_fault_that_was_not_commanded_is_found(whole: st.Store) -> None:
     """The sample is labelled soundly in itself, its checksums are right: the plan alone says that it is wrong."""
     commanded = {i: fake_sample(whole.spec, i).scalars["injected"] for i in range(10)}
     commanded[4] = np.ones(4, bool)  # what had no effect is not injected, and that is no problem
-    assert st.verify(whole, expected=lambda i, _: {"injected": commanded[i]}) == []
+    assert st.examine(whole, expected=lambda i, _: {"injected": commanded[i]}).problems == []
     sample = fake_sample(whole.spec, 1)
     off = int(np.flatnonzero(~commanded[1])[0])
     injected, mask = commanded[1].copy(), sample.layers["mask"].copy()
@@ -247,13 +247,13 @@ def test_a_fault_that_was_not_commanded_is_found(whole: st.Store) -> None:
     changes = {"injected": injected, "mask": mask, "mask_effect": mask, "mask_any": mask[:3].any(0)}
     parameters = {**sample.scalars["parameters"], FAULTS[off]: {"amplitude": 0.1}}
     assert relabelled(whole, 1, **changes, parameters=parameters) == []
-    (sentence,) = st.verify(whole, expected=lambda i, _: {"injected": commanded[i]})
+    (sentence,) = st.examine(whole, expected=lambda i, _: {"injected": commanded[i]}).problems
     assert sentence == f"sample 1: {FAULTS[off]} is injected, but the plan does not command it"
 
 
 def test_a_joint_mask_any_may_hold_more_than_the_masks_but_not_less(tmp_path: Path) -> None:
     store = filled(tmp_path / "s.zarr", mask_any_joint=True)
-    assert st.verify(store) == []
+    assert st.examine(store).problems == []
     index = next(i for i in range(store.samples) if fake_sample(store.spec, i).layers["mask"][:3].any())
     union = fake_sample(store.spec, index).layers["mask"][:3].any(0)
     more, less = union.copy(), union & False
@@ -278,18 +278,18 @@ def test_wrong_coordinates_and_attributes_are_found_and_mended(whole: st.Store) 
     ):
         good = zarr.open_array(whole.path / name, mode="r+")[:]
         zarr.open_array(whole.path / name, mode="r+")[position] = value
-        (sentence,) = st.verify(whole.path)
+        (sentence,) = st.examine(whole.path).problems
         assert sentence.startswith(f"array {name}: its value {position} is {value}, not ")
         st.recover(whole.path)
-        assert st.verify(whole.path) == []
+        assert st.examine(whole.path).problems == []
         np.testing.assert_array_equal(zarr.open_array(whole.path / name, mode="r")[:], good)
     for name, key, wrong in (("mask_any", "faults", ["vignetting"]), ("depth_m", "units", "km")):
         zarr.open_array(whole.path / name, mode="r+").update_attributes({key: wrong})
-        (sentence,) = st.verify(whole.path)
+        (sentence,) = st.examine(whole.path).problems
         assert sentence.startswith(f"array {name}: its attribute {key} = {wrong}, not ")
         st.recover(whole.path)
     assert st.problem_samples(whole.path) == []
-    assert st.verify(whole.path) == []
+    assert st.examine(whole.path).problems == []
     assert st.digest(whole.path) == before
 
 
@@ -313,11 +313,11 @@ def test_consolidated_metadata_that_differ_are_found_and_mended(whole: st.Store,
         root["consolidated_metadata"] = None if damage == "absent" else {"metadata": [3]}
         said = "zarr.json holds no consolidated metadata"
     file.write_text(json.dumps(root))
-    assert st.verify(whole.path) == [said]
+    assert st.examine(whole.path).problems == [said]
     assert st.problem_samples(whole.path) == []
     st.recover(whole.path)
     assert json.loads(file.read_text()) == json.loads(good)
-    assert st.verify(whole.path) == []
+    assert st.examine(whole.path).problems == []
     assert st.digest(whole.path) == before
 
 
@@ -334,7 +334,7 @@ def test_long_names_in_metadata_are_cut_in_the_sentence(whole: st.Store, where: 
     else:
         document[name] = 1
     file.write_text(json.dumps(document))
-    (sentence,) = st.verify(whole.path)
+    (sentence,) = st.examine(whole.path).problems
     assert "[[[" in sentence
     assert len(sentence) < 400
 
@@ -357,7 +357,7 @@ def test_a_missing_array_is_one_sentence_and_made_again(whole: st.Store, name: s
         else:
             file.write_text("{")
         what = "cannot be opened" if damage == "unparsable" else "is missing"
-        (sentence,) = st.verify(whole.path)
+        (sentence,) = st.examine(whole.path).problems
         assert sentence.startswith(f"array {name} {what}")
         store = st.recover(whole.path)
         lost = damage == "folder" and name in store.spec.arrays
@@ -377,7 +377,7 @@ def test_damage_that_decodes_is_found_by_the_stored_checksum(whole: st.Store) ->
     )
     whole.file("depth_m", 0).write_bytes(codec.join_shard({**chunks, 1: other.chunks["depth_m"]}, 4))
     before_sentence = "sample 1: depth_m in depth_m/c/0/0/0 does not match its stored crc32c"
-    assert st.verify(whole) == [before_sentence]
+    assert st.examine(whole).problems == [before_sentence]
 
 
 def test_a_missing_chunk_is_found_although_it_reads_as_zeros(whole: st.Store) -> None:
@@ -386,5 +386,5 @@ def test_a_missing_chunk_is_found_although_it_reads_as_zeros(whole: st.Store) ->
     del chunks[6]
     whole.file("mask", 1).write_bytes(codec.join_shard({i - 4: c for i, c in chunks.items()}, 4))
     assert not whole.read("mask", 6, 7).any()
-    assert st.verify(whole) == ["sample 6: mask has no chunk in mask/c/1/0/0/0"]
+    assert st.examine(whole).problems == ["sample 6: mask has no chunk in mask/c/1/0/0/0"]
     repaired(whole, [6], before)

@@ -35,7 +35,7 @@ def template(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     path = tmp_path_factory.mktemp("damage") / "s.zarr"
     st.create(path, spec(), SAMPLES)
     st.write_samples(path, [sample(i) for i in range(SAMPLES)])
-    assert st.verify(path) == []
+    assert st.examine(path).problems == []
     return path, st.digest(path)
 
 
@@ -64,9 +64,9 @@ def rewrite(file: Path, change: Callable[[dict], None]) -> None:
 def test_the_spare_is_checked_outside_its_attributes_too(store: Path, template: tuple[Path, str], key: str) -> None:
     """The checksum covers the attributes only; a flipped bit in `node_type` was found by random damage."""
     rewrite(store / "spare/zarr.json", lambda document: document.update({key: "gro5p"}))
-    assert any(problem.startswith("spare/zarr.json is damaged") for problem in st.verify(store))
+    assert any(problem.startswith("spare/zarr.json is damaged") for problem in st.examine(store).problems)
     st.recover(store)
-    assert st.verify(store) == []
+    assert st.examine(store).problems == []
     assert st.digest(store) == template[1]
 
 
@@ -92,10 +92,10 @@ def test_either_root_may_be_lost(
     opened = st.open_store(store)
     assert re.search(f"{name} is (damaged|missing); .* the build command mends it", caplog.text)
     assert (opened.attributes, opened.samples) == (attributes, SAMPLES)
-    assert any(problem.startswith(f"{name} is ") for problem in st.verify(store))
+    assert any(problem.startswith(f"{name} is ") for problem in st.examine(store).problems)
     st.recover(store)
     assert json.loads(file.read_text()) == good
-    assert st.verify(store) == []
+    assert st.examine(store).problems == []
     assert st.digest(store) == template[1]
 
 
@@ -103,7 +103,7 @@ def test_both_roots_lost_is_one_sentence(store: Path) -> None:
     for name in ("zarr.json", "spare/zarr.json"):
         rewrite(store / name, lambda d: d["attributes"].update(seed=8))
     with pytest.raises(InputError, match=r"zarr.json and its copy spare/zarr.json are both damaged"):
-        st.verify(store)
+        st.examine(store)
     with pytest.raises(InputError, match="is left alone"):
         st.create(store, spec(), SAMPLES, overwrite=True)
 
@@ -112,9 +112,9 @@ def test_a_store_without_checksum_is_read_and_gets_one(store: Path, template: tu
     """As stores were before there were checksums."""
     shutil.rmtree(store / "spare")
     rewrite(store / "zarr.json", lambda d: d["attributes"].pop("attributes_sha256"))
-    assert st.verify(store) == ["zarr.json has no checksum and no spare copy"]
+    assert st.examine(store).problems == ["zarr.json has no checksum and no spare copy"]
     st.recover(store)
-    assert st.verify(store) == []
+    assert st.examine(store).problems == []
     assert st.digest(store) == template[1]
 
 
@@ -135,7 +135,7 @@ def test_any_key_of_an_array_that_differs_is_found_and_mended(store: Path, name:
         assert any(name in problem for problem in metadata_problems(st.open_store(store))[0]), (key, value)
         st.recover(store)
         assert json.loads(file.read_text()) == good, (key, value)
-    assert st.verify(store) == []
+    assert st.examine(store).problems == []
 
 
 def test_the_documents_are_those_that_zarr_writes(store: Path) -> None:
@@ -181,9 +181,9 @@ def test_whatever_else_has_the_name_of_a_file_or_folder_makes_way(
 ) -> None:
     remove(store / name)
     place(store / name)
-    assert any(name.split("/")[0] in problem for problem in st.verify(store))
+    assert any(name.split("/")[0] in problem for problem in st.examine(store).problems)
     mend(store)
-    assert st.verify(store) == []
+    assert st.examine(store).problems == []
     assert st.digest(store) == template[1]
     assert (store / name).is_file() == (name in FILES)
     assert not (store / name).is_symlink()
@@ -379,7 +379,7 @@ def test_create_removes_only_what_its_own_killed_predecessors_left(tmp_path: Pat
     assert sorted(tmp_path.iterdir()) == sorted([*others, tmp_path / name])
     assert all((folder_ / "image").is_dir() for folder_ in others)
     mend(tmp_path / name)
-    assert st.verify(tmp_path / name) == []
+    assert st.examine(tmp_path / name).problems == []
 
 
 # --- cost -------------------------------------------------------------------------------------------------
@@ -397,7 +397,7 @@ def test_a_store_of_a_million_empty_samples_costs_no_file_a_shard(
             damage.replace_system(patch, system)
             store = st.create(path, spec(), samples)
             assert st.recover(path).finished() == 0
-            assert st.verify(store) == [f"samples 0-{samples - 1} are not built yet"]
+            assert st.examine(store).problems == [f"samples 0-{samples - 1} are not built yet"]
         return system.count
 
     few = operations(tmp_path / "few.zarr", SAMPLES)

@@ -121,7 +121,7 @@ def test_a_folder_link_in_a_store_is_neither_read_nor_written_through(
     (store / name).rename(home / "moved")
     (store / name).symlink_to(home / "moved")
     before = tree(home)
-    assert any(name.split("/")[0] in problem for problem in st.verify(store))
+    assert any(name.split("/")[0] in problem for problem in st.examine(store).problems)
     opened = st.recover(store)
     opened.remove_shard(0)
     opened.files.write([(f"{name}/0/0/0/0", b"new")])
@@ -163,7 +163,7 @@ def test_few_open_files_are_enough_for_a_store(tmp_path: Path) -> None:
     limit = f"ulimit -n 64 && exec {sys.executable} -c '{program}' {tmp_path / 's.zarr'}"
     there = {**os.environ, "PYTHONPATH": os.pathsep.join([*sys.path])}
     subprocess.run(["bash", "-c", limit], env=there, check=True)
-    assert st.verify(tmp_path / "s.zarr") == []
+    assert st.examine(tmp_path / "s.zarr").problems == []
 
 
 # --- names ----------------------------------------------------------------------------------------------------
@@ -250,7 +250,7 @@ def test_a_file_that_is_too_large_is_not_read(
         return data
 
     monkeypatch.setattr(disk.os, "read", reading)
-    problems = st.verify(store)
+    problems = st.examine(store).problems
     assert any(file.split("/")[0] in problem for problem in problems)
     assert max(most) < 10 << 20
 
@@ -271,7 +271,7 @@ def test_a_chunk_whose_index_names_too_many_bytes_is_damage(described_store: Pat
 def test_a_document_of_too_many_values_is_not_parsed(described_store: Path, tmp_path: Path) -> None:
     store = shutil.copytree(described_store, tmp_path / "s.zarr")
     (store / "image/zarr.json").write_bytes(b'{"a": [' + b"[]," * 4_000_000 + b"0]}")
-    (problem,) = st.verify(store)
+    (problem,) = st.examine(store).problems
     assert "image/zarr.json is damaged" in problem
 
 

@@ -134,7 +134,7 @@ def test_a_build_goes_on_where_nobody_reads_its_progress(tmp_path: Path, monkeyp
         with streams.steady():
             done = build(tmp_path / "s.zarr", progress=True)
     assert (done.built, done.digest) == (whole.built, whole.digest)
-    assert store.verify(tmp_path / "s.zarr") == []
+    assert store.examine(tmp_path / "s.zarr").problems == []
 
 
 @pytest.mark.parametrize("closed", [(0,), (1,), (2,), (0, 1, 2)])

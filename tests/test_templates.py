@@ -46,7 +46,7 @@ def test_the_scene_builds_and_verifies(tmp_path: Path) -> None:
     scene = load_scene(path, small)
     assert scene.title == "first"
     dataset.build_scene(scene, tmp_path / "first.zarr", progress=False)
-    assert store.verify(tmp_path / "first.zarr") == []
+    assert store.examine(tmp_path / "first.zarr").problems == []
     whole = tomllib.loads(path.read_text(encoding="utf-8"))
     assert load_scene(path).resolved()["camera"]["fov_deg"] == whole["camera"]["fov_deg"] == 45.0
 

@@ -275,7 +275,7 @@ def test_a_dataset_of_variants_through_the_store_and_back(tmp_path: Path) -> Non
     scene = scene_with(4, 8, dataset={"layers": layers, "shard_samples": 4}, plan={"faulty_fraction": 1.0})
     path = tmp_path / "one.zarr"
     one = vbnfault.build(scene, path, progress=False)
-    assert store.verify(path) == []
+    assert store.examine(path).problems == []
     data = vbnfault.open_dataset(path)
     first = (data["views"].values == 1).reshape(2, 4)
     assert (first.sum(axis=1) > 1).all()
@@ -308,7 +308,7 @@ def test_a_dataset_of_variants_through_the_store_and_back(tmp_path: Path) -> Non
     assert again.digest == one.digest is not None
     # an appended block has whole views, too
     vbnfault.build(scene, path, progress=False, append=4)
-    assert store.verify(path) == []
+    assert store.examine(path).problems == []
     with pytest.raises(InputError, match="multiple of 4"):
         vbnfault.build(scene, path, progress=False, append=3)
 
@@ -329,7 +329,7 @@ def test_damage_to_a_shared_chunk_concerns_all_that_share_it(tmp_path: Path) -> 
     assert store.problem_samples(path) == sharing
     again = vbnfault.build(scene, path, progress=False)
     assert (again.built, again.digest) == (len(sharing), before)
-    assert store.verify(path) == []
+    assert store.examine(path).problems == []
     assert opened.chunk("depth_m", 0) == chunks
 
 

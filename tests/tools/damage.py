@@ -128,10 +128,10 @@ def flip_in_store(path: Path, before: dict[str, Any], rng: np.random.Generator) 
     place, bit = int(rng.integers(file.stat().st_size)), int(rng.integers(8))
     where = f"{file.relative_to(path)}: byte {place}, bit {bit}"
     with flipped(file, place, bit):
-        if not st.verify(path):
+        if not st.examine(path).problems:
             return "harmless" if seen(path) == before else f"MISSED {where}"
         build(path)
-        problems = st.verify(path)
+        problems = st.examine(path).problems
         if problems or seen(path) != before:
             return f"NOT MENDED {where}: {problems}"
     return "found and mended"
@@ -378,7 +378,7 @@ def fails_at(number: int, code: int, command: Callable[[Path], None], folder: Pa
         samples = SAMPLES + (command is append)
         mend(path, samples)
         wrong = [f"also lost: {sorted(lost - {2})}"] if lost - {2} else []
-        wrong += st.verify(path)
+        wrong += st.examine(path).problems
         for i in range(samples):
             layers = st.open_store(path).read_sample(i).layers
             if any(layers[name].tobytes() != array.tobytes() for name, array in sample(i).layers.items()):

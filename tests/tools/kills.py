@@ -166,7 +166,10 @@ class Way:
         """Return the digest of the output, and what is wrong with it."""
         from vbnfault import store
 
-        return {"digest": store.digest(place.out), "problems": [*store.verify(place.out), *self.left(place)]}
+        return {
+            "digest": store.digest(place.out),
+            "problems": [*store.examine(place.out).problems, *self.left(place)],
+        }
 
     def left(self, place: Place) -> list[str]:
         """Return the names of temporary files that are left."""

@@ -26,7 +26,6 @@ from .check import (
     Problem,
     Report,
     SampleDigests,
-    check_shard,
     count_faults,
     digest,
     examine,
@@ -35,7 +34,6 @@ from .check import (
     runs,
     spans,
     unplanned_samples,
-    verify,
 )
 from .codec import Encoded, SharedChunks, encode, mask_union
 from .group import check_free, create, is_store, open_dataset, open_store, write_samples

@@ -139,11 +139,6 @@ class ShardCheck(NamedTuple):
         return wrong.union(*(problem.samples for problem in self.problems))
 
 
-def check_shard(store: Store, number: int) -> list[Problem]:
-    """Return what is unfinished, missing or damaged in one shard; decode and compare every finished layer."""
-    return examine_shard(store, number).problems
-
-
 def examine_shard(store: Store, number: int, *, labels: bool = False) -> ShardCheck:
     """Read one shard once: decode every finished layer, compare it with its checksum, compute its digest.
 
@@ -312,14 +307,14 @@ def problem_samples(store: str | os.PathLike[str] | Url | Store) -> list[int]:
     """Return the samples that must be built or rebuilt: unfinished, missing or damaged ones, in ascending order."""
     store = open_store(store)
     begun = store.begun()
-    wanted = {i for n in begun for p in check_shard(store, n) for i in p.samples}
+    wanted = {i for n in begun for p in examine_shard(store, n).problems for i in p.samples}
     return sorted(wanted.union(*(store.shard(n) for n in {*range(store.shards)}.difference(begun))))
 
 
 def unplanned_samples(store: Store, number: int, expected: Planned, *, exact: bool = False) -> set[int]:
     """Return the finished samples of a shard whose stored scalars differ from the plan.
 
-    The set is empty if the scalars cannot be read: `check_shard` reports that. `examine` explains the parameters.
+    The set is empty if the scalars cannot be read: `examine_shard` reports that. `examine` explains the parameters.
     """
     finished = [i for i, done in store.done(number).items() if done]
     try:
@@ -355,17 +350,6 @@ class Report(NamedTuple):
     counts: FaultCounts
 
 
-def verify(
-    path: str | os.PathLike[str] | Url | Store,
-    *,
-    expected: Planned | None = None,
-    exact: bool = False,
-    progress: Callable[[int], None] | None = None,
-) -> list[str]:
-    """Return the problems that `examine` detects, one sentence each."""
-    return examine(path, expected=expected, exact=exact, progress=progress).problems
-
-
 def examine(
     path: str | os.PathLike[str] | Url | Store,
     *,
@@ -377,8 +361,8 @@ def examine(
 
     First check that every array exists and that its layout, attributes and coordinates match the schema and the
     consolidated metadata. If the layout of an array of samples is wrong, no sample is read. Then check that each
-    sample is complete (`check_shard`) and labelled: masks, `injected`, `parameters` and images must agree, and all
-    samples of a site must be in one split.
+    sample is complete (`examine_shard`) and labelled: masks, `injected`, `parameters` and images must agree, and
+    all samples of a site must be in one split.
 
     Parameters
     ----------
