@@ -191,6 +191,12 @@ def described_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
+def copied(described_store: Path, tmp_path: Path) -> Path:
+    """Return a copy of the described store, to be changed."""
+    return Path(shutil.copytree(described_store, tmp_path / "s.zarr"))
+
+
+@pytest.fixture
 def whole(finished_store: Path, tmp_path: Path) -> Any:
     """Return a copy of the finished store, to be damaged."""
     from vbnfault import store

@@ -17,6 +17,7 @@ from vbnfault.core import spectra
 from vbnfault.detector import ThreeColourDetector
 from vbnfault.faults import FaultContext
 from vbnfault.lens import (
+    Prescription,
     RealLens,
     ThinLens,
     load_lens,
@@ -40,6 +41,11 @@ LENSES = {
 }
 paraxial_ghosts = partial(traced_ghosts, model="paraxial")
 PITCH_UM, SIDE_PX = 5.5, 1024
+
+
+def pixel_mm(lens: Prescription) -> float:
+    """Return the pixel pitch of a camera of 1024 px and 65° across."""
+    return float(2 * paraxial_properties(lens).efl_mm * np.tan(np.radians(32.5)) / 1024)
 
 
 @cache

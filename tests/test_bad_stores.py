@@ -212,12 +212,6 @@ def test_a_half_finished_store_keeps_its_samples(
     assert {name: after[name] for name in before} == before
 
 
-@pytest.fixture
-def copied(described_store: Path, tmp_path: Path) -> Path:
-    """A copy of a finished store, to be damaged."""
-    return Path(shutil.copytree(described_store, tmp_path / "s.zarr"))
-
-
 def _chunk_of_another(path: Path) -> None:
     store = st.open_store(path, "r+")
     chunks = store.chunk("image", 1)

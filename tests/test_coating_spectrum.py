@@ -85,7 +85,7 @@ def context(lens: Prescription, bands: int, detector: ThreeColourDetector) -> Fa
     real = RealLens(prescription=lens, width_px=SIZE, height_px=SIZE, pixel_pitch_um=20.0)
     nodes = spectra.band_nodes_nm(400.0, 700.0, bands)
     camera = Camera(lens=real, detector=detector, exposure_s=1e-3)
-    return sunlit(make_context(SIZE, sun=(0.75 * SIZE, 0.4 * SIZE)), nodes, 1.0, camera=camera)
+    return sunlit(make_context(SIZE, sun_xy_px=(0.75 * SIZE, 0.4 * SIZE)), nodes, 1.0, camera=camera)
 
 
 def pairs(lens: Prescription) -> list[tuple[int, ...]]:

@@ -26,7 +26,7 @@ UNSAID = {"adc/converter", "banding/interference", "blooming/overflow", "transmi
 def test_a_fault_of_a_level_has_this_level(fault: str, model: str, level: int) -> None:
     table, needs = Levels().table, registry()[fault][model]
     assert needs.severity is not None
-    context = make_context(1024, sun=(400.0, 300.0))
+    context = make_context(1024, sun_xy_px=(400.0, 300.0))
     if needs.needs_mosaic:
         context = with_mosaic(context)
     made = from_dict(fault, {"model": model, "severity": level}, source="test.toml")

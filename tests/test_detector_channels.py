@@ -124,7 +124,7 @@ OPTICAL = [
 @pytest.mark.parametrize("name", ["mono", "rgbw", "rgb_nir"])
 def test_optical_faults_act_on_the_channels_there_are(fault: str, model: str, name: str) -> None:
     """On R, G and B as without the others: what happens before the sensor does not know its filters."""
-    context = make_context(96, 64, sun=(30.0, 20.0), architecture="cmos")
+    context = make_context(96, 64, sun_xy_px=(30.0, 20.0), architecture="cmos")
     nodes = spectra.band_nodes_nm(400.0, 900.0, 11)
     context = replace(
         context,

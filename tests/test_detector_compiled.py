@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from test_detector import draw
 
 from vbnfault.core.process.llvm import backend
 from vbnfault.core.quantities import RGBI, Electrons
@@ -13,10 +14,6 @@ from vbnfault.detector import GreyDetector, Noise, ThreeColourDetector
 from vbnfault.detector.noise import NormalField, draw_normals, variates_by_code
 
 EXPOSURE_S = 0.02
-
-
-def draw(seed: int, shape: tuple[int, int]) -> Noise:
-    return Noise.draw(shape, np.random.default_rng(seed))
 
 
 def with_outermost(noise: Noise) -> Noise:

@@ -99,7 +99,7 @@ def values(f: dataclasses.Field[Any], files: list[str]) -> list[Any]:
 
 def context(fault: Fault, key: str) -> FaultContext:
     architecture = ARCHITECTURES.get(key, "frame_transfer_ccd")
-    made = make_context(SIZE, sun=(40.0, 24.0), exposure_s=1e-3, architecture=architecture)
+    made = make_context(SIZE, sun_xy_px=(40.0, 24.0), exposure_s=1e-3, architecture=architecture)
     nodes = spectra.band_nodes_nm(400.0, 700.0, 3)
     made = replace(
         made,

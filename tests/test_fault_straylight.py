@@ -57,7 +57,7 @@ def one(index: int, position: float = 1.0, radius: float = 0.1, brightness: floa
 def test_centroid(
     index: int, width: int, height: int, sun: tuple[float, float], position: float, radius: float
 ) -> None:
-    context = make_context(width, height, sun=sun)
+    context = make_context(width, height, sun_xy_px=sun)
     fault = one(index, position, radius)
     params = fault.draw(context, rng())
     expected = np.array(sun) + position * (np.array([width / 2, height / 2]) - sun)
@@ -71,7 +71,7 @@ def test_centroid(
 
 
 def test_radius_is_that_of_the_outline() -> None:
-    context = make_context(1024, sun=(200.0, 512.0))
+    context = make_context(1024, sun_xy_px=(200.0, 512.0))
     fault = one(2, radius=0.2)
     plane = added(context, fault.draw(context, rng()), fault)[512, :, 1]
     lit = np.flatnonzero(plane > plane.max() / 2)
@@ -82,7 +82,7 @@ def test_radius_is_that_of_the_outline() -> None:
 def test_texture_axis_follows_the_line() -> None:
     # flare 10, a pupil clipped on the Sun's side: its light lies beyond its centre, seen from the Sun
     for sun in ((100.0, 512.0), (512.0, 100.0), (900.0, 900.0)):
-        context = make_context(1024, sun=sun)
+        context = make_context(1024, sun_xy_px=sun)
         fault = one(10, radius=0.15)
         plane = added(context, fault.draw(context, rng()), fault)[..., 1].astype(float)
         y, x = np.mgrid[:1024, :1024] + 0.5
@@ -94,15 +94,15 @@ def test_texture_axis_follows_the_line() -> None:
 
 
 def test_brightness_and_visible_fraction_scale_the_light() -> None:
-    context = make_context(256, sun=(60.0, 60.0))
+    context = make_context(256, sun_xy_px=(60.0, 60.0))
     base = added(context, one(4).draw(context, rng()), one(4))
     assert base.max() == pytest.approx(1.5 * texture("flare_04").levels[0].max(), rel=0.05)
     bright = one(4, brightness=3.0)
     assert np.allclose(added(context, bright.draw(context, rng()), bright), 2 * base, rtol=1e-5, atol=1e-8)
-    half = make_context(256, sun=(60.0, 60.0), visible=0.5)
+    half = make_context(256, sun_xy_px=(60.0, 60.0), sun_visible_fraction=0.5)
     dim = added(half, one(4).draw(half, rng()), one(4))
     assert np.allclose(dim, 0.5 * base, rtol=1e-5, atol=1e-8)
-    for context in (make_context(256, sun=(60.0, 60.0), visible=0.0), make_context(256)):
+    for context in (make_context(256, sun_xy_px=(60.0, 60.0), sun_visible_fraction=0.0), make_context(256)):
         fault = one(4)
         params = fault.draw(context, rng())
         assert not added(context, params, fault).any()
@@ -117,7 +117,7 @@ def own(folder: Path, name: str, colour: tuple[float, float, float], shape: tupl
 
 def test_own_textures_lie_on_the_line_of_the_sun(tmp_path: Path) -> None:
     """Their own size, side and colours; the light is brightness · texture, with the Sun's line to the right."""
-    context = make_context(512, sun=(56.0, 256.0))
+    context = make_context(512, sun_xy_px=(56.0, 256.0))
     wide = own(tmp_path, "wide", (0.5, 0.25, 0.125), shape=(40, 100))
     glare = own(tmp_path, "glare", (0.0, 0.0, 0.2))
     row = {"index": 1, "position": 1.0, "radius": 0.1, "brightness": 1.2}
@@ -128,7 +128,7 @@ def test_own_textures_lie_on_the_line_of_the_sun(tmp_path: Path) -> None:
     assert np.flatnonzero(lit.any(axis=0))[[0, -1]] == pytest.approx([256 - 51, 256 + 50], abs=1)
     assert np.flatnonzero(lit.any(axis=1))[[0, -1]] == pytest.approx([256 - 20, 256 + 19], abs=1)
     np.testing.assert_allclose(light[256, 256], 1.2 * np.array([0.5, 0.25, 0.125]), rtol=1e-4)
-    upright = make_context(512, sun=(256.0, 56.0))  # turned with the line
+    upright = make_context(512, sun_xy_px=(256.0, 56.0))  # turned with the line
     turned = added(upright, fault.draw(upright, rng()), fault)
     np.testing.assert_allclose(turned, light.swapaxes(0, 1), atol=2e-3)
 
@@ -143,7 +143,7 @@ def test_own_textures_close_to_the_sun_stay_closer_than_far_ones(tmp_path: Path)
     close = [own(tmp_path, f"close_{k}", (0.1 * k, 0, 0)) for k in (1, 2, 3)]
     far = [own(tmp_path, f"far_{k}", (0, 0.1 * k, 0)) for k in (1, 2)]
     fault = make("straylight", count=[1, 10], close_textures=close, far_textures=far, glare=0)
-    context, seen = make_context(256, sun=(30.0, 128.0)), set()
+    context, seen = make_context(256, sun_xy_px=(30.0, 128.0)), set()
     for seed in range(40):
         flares = fault.draw(context, np.random.default_rng(seed))["flares"]
         groups = [f["index"] > 3 for f in flares]
@@ -190,7 +190,7 @@ def test_a_scene_takes_own_textures_from_its_folder_and_knows_their_contents(tmp
 
 
 def test_the_papers_example() -> None:
-    context = make_context(1024, sun=(250.0, 180.0))
+    context = make_context(1024, sun_xy_px=(250.0, 180.0))
     fault = make("straylight", flares=PAPER_EXAMPLE, glare=0)
     params = fault.draw(context, rng())
     assert params["flares"] == PAPER_EXAMPLE
@@ -205,7 +205,7 @@ def test_the_papers_example() -> None:
 
 
 def test_draws_follow_the_table_and_keep_the_groups_apart() -> None:
-    context = make_context(512, sun=(100.0, 150.0))
+    context = make_context(512, sun_xy_px=(100.0, 150.0))
     counts, glares = set(), set()
     for seed in range(300):
         params = make("straylight").draw(context, rng(seed))
@@ -229,14 +229,14 @@ def test_draws_follow_the_table_and_keep_the_groups_apart() -> None:
 
 @pytest.mark.parametrize("sun", [(20.0, 20.0), (-300.0, 900.0), (3000.0, 2000.0), (128.0, 128.0)])
 def test_something_shows_whenever_it_can(sun: tuple[float, float]) -> None:
-    context = make_context(256, sun=sun)
+    context = make_context(256, sun_xy_px=sun)
     for seed in range(25):
         fault = make("straylight", count=1, glare=0)
         assert fault.footprint(fault.draw(context, rng(seed)), context).any()  # type: ignore[union-attr]
 
 
 def test_glare_sits_at_the_sun_and_only_near_the_frame() -> None:
-    context = make_context(512, sun=(200.3, 150.8))
+    context = make_context(512, sun_xy_px=(200.3, 150.8))
     fault = make("straylight", count=0, glare=1)
     params = fault.draw(context, rng())
     plane = added(context, params, fault)[..., 1].astype(float)
@@ -245,9 +245,9 @@ def test_glare_sits_at_the_sun_and_only_near_the_frame() -> None:
     weight = plane * core
     assert (weight * x).sum() / weight.sum() == pytest.approx(200.3, abs=0.3)  # the cut core is 20 px wide
     assert (weight * y).sum() / weight.sum() == pytest.approx(150.8, abs=0.3)
-    far = make_context(512, sun=(900.0, 150.0))
+    far = make_context(512, sun_xy_px=(900.0, 150.0))
     assert make("straylight", glare=1, glare_radius=0.4).draw(far, rng())["glare"] is None
-    near = make_context(512, sun=(600.0, 150.0))
+    near = make_context(512, sun_xy_px=(600.0, 150.0))
     assert make("straylight", glare=1, glare_radius=0.4).draw(near, rng())["glare"]
 
 

@@ -31,7 +31,7 @@ SUN = (0.8 * SIZE, 0.35 * SIZE)
 
 
 def context(sun: tuple[float, float] | None = SUN, **more: Any) -> FaultContext:
-    made = make_context(SIZE, sun=sun, exposure_s=1e-3)
+    made = make_context(SIZE, sun_xy_px=sun, exposure_s=1e-3)
     return sunlit(made, spectra.band_nodes_nm(400.0, 700.0, 4), 3.0, **more)
 
 

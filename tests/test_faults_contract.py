@@ -301,7 +301,7 @@ def test_every_number_serves_at_both_ends_of_its_limits(
     name: str, model: str, required: dict[str, dict[str, Any]]
 ) -> None:
     """What is read is never refused sample by sample: ranges of keys are what the physics takes."""
-    small = make_context(32, sun=(10.0, 12.0), architecture="frame_transfer_ccd")
+    small = make_context(32, sun_xy_px=(10.0, 12.0), architecture="frame_transfer_ccd")
     beam = np.array([-0.1, -0.05, 1.0])
     context = dataclasses.replace(
         with_mosaic(small) if registry()[name][model].needs_mosaic else small,
@@ -353,7 +353,7 @@ OPTICAL_TEXTURES = ["straylight", "dust_on_optics", "optics_degradation", "vigne
 
 @pytest.mark.parametrize("name", OPTICAL_TEXTURES)
 def test_a_plane_of_no_light_past_the_rims_is_no_light(name: str) -> None:
-    context = make_context(64, sun=(50.0, 40.0))
+    context = make_context(64, sun_xy_px=(50.0, 40.0))
     fault: Fault = make(name)
     params, light = fault.draw(context, np.random.default_rng(1)), noisy_electrons(context)
     none = dataclasses.replace(light, past_rims=np.zeros_like(light.array)).scaled(1.0)

@@ -6,27 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from vbnfault import testing
 from vbnfault.core.quantities import RGBI, Electrons
 from vbnfault.faults import Fault, FaultContext, from_dict
+from vbnfault.testing import make_context as make_context
 from vbnfault.testing import random_quantity as noisy
 from vbnfault.testing import with_mosaic as with_mosaic
-
-FOV_DEG = 40.0
-
-
-def make_context(
-    width: int = 1024,
-    height: int | None = None,
-    sun: tuple[float, float] | None = None,
-    visible: float = 1.0,
-    fov_deg: float = FOV_DEG,
-    **camera: Any,
-) -> FaultContext:
-    """A context with a thin lens of `fov_deg` across the width; height as width unless given."""
-    return testing.make_context(
-        width, height, sun_xy_px=sun, sun_visible_fraction=visible, fov_deg=fov_deg, **camera
-    )
 
 
 def inside(fault: Fault, params: dict[str, Any], context: FaultContext) -> dict[str, Any]:

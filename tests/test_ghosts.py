@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import needs_llvm, render_threads
-from lens_kit import paraxial_ghosts
+from lens_kit import paraxial_ghosts, pixel_mm
 from test_lens import BACK, GLASS, STOP
 
 from vbnfault.core.spectra import Bands
@@ -33,11 +33,6 @@ LENSES = (
     "heliar_100_f3p5",
     "biotar_100_f1p4",
 )
-
-
-def pixel_mm(lens: Prescription) -> float:
-    """Of a camera of 1024 px and 65° across."""
-    return float(2 * paraxial_properties(lens).efl_mm * np.tan(np.radians(32.5)) / 1024)
 
 
 def bundle(route: int, box: tuple[float, float, float, float], direction: Any) -> Rays:

@@ -95,7 +95,7 @@ def test_every_optional_layer_is_built_verified_and_read_back(world: str, tmp_pa
 )
 def test_a_soft_layer_is_what_the_fault_does_to_light(name: str, model: str) -> None:
     """The oracle is `apply`: to even light it shows the factor, to darkness what it adds."""
-    context = make_context(96, 72, sun=(20.0, 30.0))
+    context = make_context(96, 72, sun_xy_px=(20.0, 30.0))
     if model != "gaussian":
         context = with_mosaic(context)
     fault = from_dict(name, {"model": model}, source="test")

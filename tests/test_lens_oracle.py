@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from conftest import needs_llvm
-from lens_kit import paraxial_ghosts
+from lens_kit import paraxial_ghosts, pixel_mm
 from test_lens import BACK, GLASS, STOP
 from test_zemax import TRIPLET
 
@@ -324,11 +324,6 @@ def test_small_ghosts_are_paraxial() -> None:
 
 
 # --- single precision -------------------------------------------------------------------------------------------
-
-
-def pixel_mm(lens: Prescription) -> float:
-    """Of a camera of 1024 px and 65° across."""
-    return float(2 * paraxial_properties(lens).efl_mm * np.tan(np.radians(32.5)) / 1024)
 
 
 # The rim cuts some 4 n cells of a grid of n² rays. If each counts wholly or not at all, at random, they leave

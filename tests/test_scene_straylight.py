@@ -499,7 +499,7 @@ def test_what_changes_a_response_changes_its_key(singlet: Prescription) -> None:
 
 def context(sun: tuple[float, float] | None, *, lit: bool = True, size: int = 64) -> FaultContext:
     """A frame with a lit disc in it, or a user's own image without a radiance."""
-    made = make_context(size, sun=sun, exposure_s=1e-3)
+    made = make_context(size, sun_xy_px=sun, exposure_s=1e-3)
     nodes = spectra.band_nodes_nm(400.0, 700.0, 2)
     lit_disc = np.repeat(disc((size, size), 0.6, 0.6, 0.25), 2, axis=0) * np.float32(10)
     radiance = Radiance(array=lit_disc, wavelength_nm=nodes) if lit else None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -26,12 +25,6 @@ from vbnfault.scene import config
 def data(described_store: Path) -> Any:
     """Return the store, which no test changes."""
     return st.open_store(described_store)
-
-
-@pytest.fixture
-def copy(described_store: Path, tmp_path: Path) -> Path:
-    """Return a copy of the store."""
-    return Path(shutil.copytree(described_store, tmp_path / "s.zarr"))
 
 
 def test_statistics_are_those_of_the_arrays(data: st.Store) -> None:
@@ -79,22 +72,22 @@ def test_statistics_of_a_store_whose_plan_is_unknown(finished_store: Path) -> No
     assert any("plan is not known" in line for line in numbers.lines())
 
 
-def test_a_card_changes_neither_digest_nor_check_and_xarray_reads_as_before(copy: Path) -> None:
-    before, found = st.digest(copy), st.examine(copy).problems
-    with st.open_dataset(copy) as dataset_before:
+def test_a_card_changes_neither_digest_nor_check_and_xarray_reads_as_before(copied: Path) -> None:
+    before, found = st.digest(copied), st.examine(copied).problems
+    with st.open_dataset(copied) as dataset_before:
         arrays = {name: dataset_before[name].values for name in ("image", "mask", "parameters")}
-    first = [path.read_bytes() for path in card.write_card(copy)]
-    assert [path.read_bytes() for path in card.write_card(copy)] == first  # no date, no order
-    assert st.digest(copy) == before
-    assert st.examine(copy).problems == found
+    first = [path.read_bytes() for path in card.write_card(copied)]
+    assert [path.read_bytes() for path in card.write_card(copied)] == first  # no date, no order
+    assert st.digest(copied) == before
+    assert st.examine(copied).problems == found
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        with st.open_dataset(copy) as after:
+        with st.open_dataset(copied) as after:
             for name, values in arrays.items():
                 assert np.array_equal(after[name].values, values)
-    store = st.recover(copy)
+    store = st.recover(copied)
     assert card.has_card(store)
-    text = (copy / "README.md").read_text()
+    text = (copied / "README.md").read_text()
     for part in ("CC0-1.0", "A test", "| `mask` | sample, fault, y, x | bool |", "| camera.width_px | 40 | set |"):
         assert part in text
 
@@ -117,16 +110,16 @@ def test_the_card_names_the_origin_of_every_value(tmp_path: Path) -> None:
     assert {key: origins[key] for key in wanted} == wanted
 
 
-def test_mlcroissant_accepts_the_description_of_a_store(copy: Path, data: st.Store) -> None:
+def test_mlcroissant_accepts_the_description_of_a_store(copied: Path, data: st.Store) -> None:
     croissant = pytest.importorskip("mlcroissant", reason="mlcroissant is in the extra `readers`")
-    card.write_card(copy)
-    described = croissant.Dataset(str(copy / "croissant.json"))
+    card.write_card(copied)
+    described = croissant.Dataset(str(copied / "croissant.json"))
     assert described.metadata.issues.errors == set()
     assert {row["arrays/name"] for row in described.records("arrays")} == set(data.spec.arrays)
     assert [row["fault_classes/name"] for row in described.records("fault_classes")] == list(data.spec.faults)
 
 
-def test_a_build_writes_the_card_once(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_build_writes_the_card_once(copied: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A build that makes nothing leaves a card alone; one that makes samples, or finds none, writes it."""
     made, written = [0], []
 
@@ -146,19 +139,23 @@ def test_a_build_writes_the_card_once(copy: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(card, "write_card", lambda path: written.append(write(path)))
     for built, cards in ((0, 1), (0, 1), (3, 2)):
         made[0] = built
-        dataset.build_scene("quickstart", copy, BuildOptions())
+        dataset.build_scene("quickstart", copied, BuildOptions())
         assert len(written) == cards
 
 
-def test_the_commands(copy: Path, call: Callable[..., Called]) -> None:
-    text = call("stats", copy).out
+def test_the_commands(copied: Path, call: Callable[..., Called]) -> None:
+    text = call("stats", copied).out
     for title in ("planned", "two classes occur together", "exposure_s", "drawn parameters", "samples by stratum"):
         assert title in text
-    assert json.loads(call("stats", copy, "--json").out)["samples"] == 6
-    assert call("card", copy).out.split() == [str(copy / "README.md"), str(copy / "croissant.json")]
-    out = copy.with_name("out")
+    assert json.loads(call("stats", copied, "--json").out)["samples"] == 6
+    assert call("card", copied).out.split() == [
+        str(copied / "README.md"),
+        str(copied / "croissant.json"),
+    ]
+    out = copied.with_name("out")
     assert (
-        call("export", copy, "--format", "yolo", "--out", out, "--workers", 1).out == f"{out}: 6 samples as yolo\n"
+        call("export", copied, "--format", "yolo", "--out", out, "--workers", 1).out
+        == f"{out}: 6 samples as yolo\n"
     )
-    refused = call("export", copy, "--format", "voc", "--out", out)
+    refused = call("export", copied, "--format", "voc", "--out", out)
     assert (refused.code, "format 'voc': there is no such format" in refused.said) == (2, True)

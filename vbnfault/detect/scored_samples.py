@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ..core.errors import InputError, VbnfaultError, shown
 from ..store import MASK_RULES, SPLITS, Store
 from ..train import Columns, SampleReader, Targets
+from .mask_folder import MaskFolder
 from .prediction import Detector, Prediction
 from .scores import binned
 
@@ -63,29 +64,6 @@ class ScoreOptions:
             )
 
 
-class Predictor(Protocol):
-    """Describe what is scored: a detector or a folder of masks."""
-
-    @property
-    def masks(self) -> str:
-        """Return which masks the predictions mean, "footprint" or "effect"."""
-        ...
-
-    @property
-    def classes(self) -> tuple[str, ...]:
-        """Return the classes of its predictions."""
-        ...
-
-    @property
-    def sha256(self) -> str:
-        """Return a digest of the files that it was made from (hex)."""
-        ...
-
-    def predicted(self, samples: Sequence[int], images: NDArray[np.uint8]) -> list[Prediction]:
-        """Return the predictions for samples with these images, uint8[sample, y, x, 4]."""
-        ...
-
-
 @dataclass(frozen=True)
 class OfImages:
     """Make a predictor of a detector, which sees only the images."""
@@ -134,7 +112,7 @@ class Samples:
         "footprint" or "effect": which masks of the store are the truth.
     """
 
-    def __init__(self, store: Store, predictor: Predictor, options: ScoreOptions, indices: I64) -> None:
+    def __init__(self, store: Store, predictor: OfImages | MaskFolder, options: ScoreOptions, indices: I64) -> None:
         self.masks = options.masks or predictor.masks
         self.store, self.predictor, self.options, self.indices = store, predictor, options, indices
         self.columns = Columns(store)
