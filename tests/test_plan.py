@@ -532,19 +532,6 @@ def test_every_number_is_keyed_by_its_sample() -> None:
     np.testing.assert_allclose(make().variables["height_m"], 100 * u, rtol=1e-15)
 
 
-@pytest.mark.parametrize(
-    "name", ["earth_observation", "interplanetary", "quickstart", "sssb_exploration", "navcam67p", "physical67p"]
-)
-def test_packaged_scenes_have_every_class_in_every_split(name: str) -> None:
-    s = config.load_scene(name)
-    p = planned(s, list(s.faults))
-    assert plan.shortcomings(s, p) == []
-    for code in range(len(plan.SPLITS)):
-        here = p.split == code
-        assert p.injected[here].any(axis=0).all()
-        assert {bool(v) for v in p.injected[here].any(axis=1)} == {True, False}  # and samples without a fault
-
-
 def test_the_plan_has_the_papers_variables(paper: plan.Plan) -> None:
     assert tuple(paper.variables) == redraw.VARIABLES == tuple(PAPER_BOUNDS)
     assert len(paper) == N

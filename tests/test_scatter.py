@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Callable
 from itertools import pairwise
 from typing import Any
@@ -219,15 +217,6 @@ def test_particles_grow_with_the_level_and_vanish_when_clean() -> None:
     for cleaner, dirtier in pairwise(levels):
         assert (dirtier > cleaner).all()
     np.testing.assert_array_equal(particle_bsdf(500.0, 550.0, [1.0, 1.7]), 0)
-
-
-def test_nothing_heavy_is_imported() -> None:
-    script = (
-        "import sys, vbnfault.lens.straylight.particles as s; s.scattered_intensity(3.0, 1.0); "
-        "assert not {'miepython', 'numba', 'matplotlib'} & set(sys.modules)"
-    )
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
 
 
 # --- a lens -----------------------------------------------------------------------------------------------------

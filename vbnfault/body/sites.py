@@ -77,17 +77,9 @@ def local_level(effective_gravity_m_s2: ArrayLike) -> Float64:
 
     The axis z points along gravity. The axis x, north, is T's +z (the pole) projected onto the horizontal plane;
     within 1e-6 rad of the pole, T's +x is projected instead. The axis y = z × x points east.
-
-    Raises
-    ------
-    ValueError
-        Gravity is zero.
     """
     gravity = np.asarray(effective_gravity_m_s2, dtype=np.float64)
-    length = np.sqrt(np.sum(gravity**2))
-    if not length > 0:
-        raise ValueError("no local-level frame where effective gravity is zero")
-    down = gravity / length
+    down = gravity / np.sqrt(np.sum(gravity**2))
     north = np.array([0.0, 0.0, 1.0]) - down[2] * down
     if np.sqrt(np.sum(north**2)) < _POLE_SIN:
         north = np.array([1.0, 0.0, 0.0]) - down[0] * down

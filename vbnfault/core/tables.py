@@ -15,6 +15,7 @@ import os
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import lru_cache, wraps
+from itertools import pairwise
 from typing import Annotated, Any, TypeVar, dataclass_transform
 
 import pydantic.dataclasses
@@ -90,6 +91,14 @@ def pair_within(lo: float, hi: float) -> Any:
     """Return the type of a pair of bounds within `lo` and `hi`, the lower one first."""
     value = Annotated[float, Field(ge=lo, le=hi)]
     return Annotated[tuple[value, value], AfterValidator(ordered)]
+
+
+def check_spectrum(wavelength_nm: Sequence[float], value: Sequence[float]) -> None:
+    """Raise ValueError unless there are as many wavelengths as values, and the wavelengths increase."""
+    if len(wavelength_nm) != len(value):
+        raise ValueError(f"{len(wavelength_nm)} wavelengths for {len(value)} values: must be as many")
+    if any(a >= b for a, b in pairwise(wavelength_nm)):
+        raise ValueError(f"wavelength_nm = {list(wavelength_nm)}: must increase")
 
 
 def each_once(values: tuple[T, ...]) -> tuple[T, ...]:

@@ -9,7 +9,7 @@ images of the user's own, which are injected in place of being rendered.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -191,11 +191,19 @@ def _manifest(benchmark: Benchmark, out: Path, built: Mapping[str, BuiltPart]) -
 
 def read_manifest(folder: Path) -> dict[str, Any]:
     """Return the manifest of a folder that `make_benchmark` wrote. Raises InputError."""
-    path = folder / MANIFEST
+    return read_record(
+        folder / MANIFEST,
+        lambda manifest: all(isinstance(part["store"], str) for part in manifest["parts"].values()),
+        "is no list of a benchmark's datasets; make it with vbnfault bench",
+    )
+
+
+def read_record(path: Path, is_sound: Callable[[Any], bool], otherwise: str) -> dict[str, Any]:
+    """Return a JSON file of a benchmark's folder. Raises InputError, with this sentence if it is not sound."""
     try:
-        manifest = json.loads(user_files.read_input(path, "benchmark"))
-        if all(isinstance(part["store"], str) for part in manifest["parts"].values()):
-            return dict(manifest)
+        record = json.loads(user_files.read_input(path, "benchmark"))
+        if is_sound(record):
+            return dict(record)
     except (ValueError, TypeError, KeyError, AttributeError):
         pass
-    raise InputError(f"{path}: is no list of a benchmark's datasets; make it with vbnfault bench")
+    raise InputError(f"{path}: {otherwise}")

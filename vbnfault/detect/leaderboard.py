@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 from ..core.errors import InputError
-from ..core.files import user_files
 from ..core.files.whole_files import write_json, writing
-from .benchmark import MANIFEST, read_manifest
+from .benchmark import MANIFEST, read_manifest, read_record
 from .monitor_log import is_log
 from .prediction import Detector
 from .scored_samples import ALL, ScoreOptions
@@ -81,10 +79,8 @@ def read_leaderboard(benchmark: Path) -> dict[str, Any]:
     path = benchmark / FILE
     if not path.exists():
         return {}
-    try:
-        table = json.loads(user_files.read_input(path, "benchmark"))
-        if all(isinstance(row["parts"], dict) for row in table.values()):
-            return dict(table)
-    except (ValueError, TypeError, KeyError, AttributeError):
-        pass
-    raise InputError(f"{path}: is no leaderboard; move it away, and score the models again")
+    return read_record(
+        path,
+        lambda table: all(isinstance(row["parts"], dict) for row in table.values()),
+        "is no leaderboard; move it away, and score the models again",
+    )

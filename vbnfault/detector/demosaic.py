@@ -166,9 +166,7 @@ def _bound(
     y, x = np.nonzero((span > HARD_NOISE * noise) & (span > ratio * (lowest - black)))
     if not y.size:
         return
-    least, greatest = (
-        _malvar(measured, pattern, filtered=extreme) for extreme in (_least_beside, _greatest_beside)
-    )
+    least, greatest = (_malvar(measured, pattern, extreme=extreme) for extreme in (cv2.erode, cv2.dilate))
     top, own = top[y, x], brightest[inner][y, x] - black
     for k in range(3):
         value, low, high = block[y, x, k], least[k][inner][y, x], greatest[k][inner][y, x]
@@ -371,11 +369,6 @@ def colour_sites(pattern: Pattern) -> tuple[tuple[int, int], tuple[int, int]]:
     return (red // 2, red % 2), (blue // 2, blue % 2)
 
 
-def _signed(raw: F32, kernel: F32) -> F32:
-    """Return the weighted sum that the method prescribes."""
-    return cv2.filter2D(raw, -1, kernel)
-
-
 def _beside(kernel: F32) -> NDArray[np.uint8]:
     """Return which pixels within one of the centre hold the colour that a kernel of Malvar's gives, uint8[3, 3]."""
     # the weights of the pixel's own colour are negative there: it counts by its differences
@@ -384,29 +377,27 @@ def _beside(kernel: F32) -> NDArray[np.uint8]:
     return near
 
 
-def _least_beside(raw: F32, kernel: F32) -> F32:
-    """Return the least value of the kernel's colour that is measured within one pixel."""
-    return cv2.erode(raw, _beside(kernel))
+def _malvar(raw: F32, pattern: Pattern, *, extreme: Callable[..., F32] | None = None) -> list[F32]:
+    """Return R, G, B at every pixel, each with the kernel that Malvar's method uses there.
 
+    With `extreme`, `cv2.erode` or `cv2.dilate`, they are not the method's weighted sums, but the least or greatest
+    values of the kernel's colour that are measured within one pixel.
+    """
 
-def _greatest_beside(raw: F32, kernel: F32) -> F32:
-    """Return the greatest value of the kernel's colour that is measured within one pixel."""
-    return cv2.dilate(raw, _beside(kernel))
+    def filtered(kernel: F32) -> F32:
+        return cv2.filter2D(raw, -1, kernel) if extreme is None else extreme(raw, _beside(kernel))
 
-
-def _malvar(raw: F32, pattern: Pattern, *, filtered: Callable[[F32, F32], F32] = _signed) -> list[F32]:
-    """Return R, G, B at every pixel, each from `filtered` with the kernel that Malvar's method uses there."""
     (ry, rx), (by, bx) = colour_sites(pattern)
     red_rows, red_columns = slice(ry, None, 2), slice(rx, None, 2)
     blue_rows, blue_columns = slice(by, None, 2), slice(bx, None, 2)
-    green = filtered(raw, MALVAR_GREEN)
+    green = filtered(MALVAR_GREEN)
     for rows, columns in ((red_rows, blue_columns), (blue_rows, red_columns)):
         green[rows, columns] = raw[rows, columns]
     # each plane starts with the values for the green pixels of one kind of row; then the three other kinds of
     # pixels are written into it
-    along_row = filtered(raw, MALVAR_ALONG_ROW)
-    along_column = filtered(raw, np.ascontiguousarray(MALVAR_ALONG_ROW.T))
-    across = filtered(raw, MALVAR_ACROSS)
+    along_row = filtered(MALVAR_ALONG_ROW)
+    along_column = filtered(np.ascontiguousarray(MALVAR_ALONG_ROW.T))
+    across = filtered(MALVAR_ACROSS)
     red, blue = along_row, along_column
     red_at_blue_row_green = along_column[blue_rows, red_columns].copy()
     blue[blue_rows, red_columns] = along_row[blue_rows, red_columns]

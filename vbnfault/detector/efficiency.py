@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Annotated
@@ -13,7 +12,7 @@ from pydantic import Field
 
 from ..core import spectra
 from ..core.errors import InputError
-from ..core.tables import Fraction, table_class
+from ..core.tables import Fraction, check_spectrum, table_class
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -35,12 +34,7 @@ class Curve:
 
     def __post_init__(self) -> None:
         """Raise ValueError unless there are as many wavelengths as values, and the wavelengths increase."""
-        if len(self.wavelength_nm) != len(self.value):
-            raise ValueError(
-                f"{len(self.wavelength_nm)} wavelengths for {len(self.value)} values: must be as many, at least 2"
-            )
-        if any(a >= b for a, b in itertools.pairwise(self.wavelength_nm)):
-            raise ValueError(f"wavelength_nm = {list(self.wavelength_nm)}: must increase")
+        check_spectrum(self.wavelength_nm, self.value)
 
 
 @dataclass(frozen=True, kw_only=True)

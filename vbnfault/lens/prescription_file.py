@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -20,7 +19,7 @@ from ..core import tables
 from ..core.errors import InputError, in_file
 from ..core.files import resources, toml_files
 from ..core.files.whole_files import write_whole
-from ..core.tables import Fraction, Table
+from ..core.tables import Fraction, Table, check_spectrum
 from .coating import Layer
 from .glass import (
     AIR,
@@ -62,10 +61,7 @@ class TransmittanceTable(Table):
 
     @model_validator(mode="after")
     def _paired(self) -> TransmittanceTable:
-        if len(self.wavelength_nm) != len(self.value):
-            raise ValueError(f"{len(self.wavelength_nm)} wavelengths for {len(self.value)} values: must be as many")
-        if any(a >= b for a, b in itertools.pairwise(self.wavelength_nm)):
-            raise ValueError(f"wavelength_nm = {list(self.wavelength_nm)}: must increase")
+        check_spectrum(self.wavelength_nm, self.value)
         return self
 
 

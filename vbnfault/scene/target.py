@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import itertools
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
 from ..core import spectra
-from ..core.tables import Table, pair_within
+from ..core.tables import Table, check_spectrum, pair_within
 from ..reflectance import AnyReflectance
 from ..reflectance.disc import Lambert
 from .bodies import named_body, packaged_bodies
@@ -35,10 +34,7 @@ class SpectrumTable(Table):
 
     @model_validator(mode="after")
     def _paired(self) -> SpectrumTable:
-        if len(self.wavelength_nm) != len(self.value):
-            raise ValueError(f"{len(self.wavelength_nm)} wavelengths for {len(self.value)} values: must be as many")
-        if any(a >= b for a, b in itertools.pairwise(self.wavelength_nm)):
-            raise ValueError(f"wavelength_nm = {list(self.wavelength_nm)}: must increase")
+        check_spectrum(self.wavelength_nm, self.value)
         return self
 
 

@@ -75,11 +75,11 @@ class Design:
             view=self.spec.scene.views[view],
             model=self.spec.model_names[model],
             role=self.roles[row],
-            values={key: _plain(column[row]) for key, column in zip(self.spec.keys, self.values, strict=True)},
+            values={key: plain_value(column[row]) for key, column in zip(self.spec.keys, self.values, strict=True)},
         )
 
 
-def _plain(value: Any) -> float | str:
+def plain_value(value: Any) -> float | str:
     """Return a value of a factor as a Python object."""
     return value if isinstance(value, str) else float(value)
 

@@ -409,16 +409,8 @@ def navigation_values(
         Names of metrics.
     clean
         Their clean twins, where several faults are compared on the same views.
-
-    Raises
-    ------
-    ValueError
-        The views are too few.
     """
-    needed = views_needed(names)
-    if len(frames) < needed:
-        raise ValueError(f"{len(frames)} views: these metrics need {needed}")
-    if not needed:
+    if not views_needed(names):
         return {}
     faulted = ViewedImages([frame.image for frame in frames], [frame.view for frame in frames])
     computed = _Frames(frames[0], faulted, clean or clean_twins(frames))

@@ -6,7 +6,6 @@ Both open without vbnfault: `table.parquet` with any reader of Parquet, `indices
 from __future__ import annotations
 
 import json
-import os
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -15,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..core.errors import InputError
-from ..core.files.whole_files import replacing
+from ..core.files.whole_files import replacing, write_whole
 from ..store import is_sealed, sealed
 from .designs import Design
 from .distributions import Categorical
@@ -171,12 +170,8 @@ def write_chunk(
 
     `seconds`: what they took, by stage.
     """
-    path = chunk_path(folder, chunk)
     record = {str(index): outcomes[index] for index in sorted(outcomes)} | {_SECONDS: dict(seconds)}
-    with replacing(path) as temporary, open(temporary, "w", encoding="utf-8") as file:
-        json.dump(sealed(record), file)
-        file.flush()
-        os.fsync(file.fileno())
+    write_whole(chunk_path(folder, chunk), json.dumps(sealed(record)))
 
 
 def read_chunk(folder: Path, chunk: int) -> tuple[dict[int, dict[str, Any]], dict[str, float]]:

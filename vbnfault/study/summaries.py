@@ -21,6 +21,8 @@ import pyarrow as pa
 import xarray as xr
 from numpy.typing import NDArray
 
+from .designs import plain_value
+
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
@@ -174,7 +176,7 @@ class DesignPoints:
         column = column[chosen]
         levels, level = np.unique(column, return_inverse=True)
         if len(levels) <= _MOST_LEVELS or column.dtype.kind in "OU":
-            return [(_plain(value), chosen[level == k]) for k, value in enumerate(levels)]
+            return [(plain_value(value), chosen[level == k]) for k, value in enumerate(levels)]
         order = np.argsort(column, kind="stable")
         split = np.array_split(order, parts or _bins(len(order)))
         return [(float(np.median(column[part])), chosen[part]) for part in split]
@@ -428,8 +430,3 @@ def _median_interval(
     middle = (reached >= reached[:, -1:] / 2).argmax(axis=1)
     low, high = np.quantile(sample[order][middle], _tails(confidence))
     return float(low), float(high)
-
-
-def _plain(value: Any) -> float | str:
-    """Return a value of a column as a plain number or text."""
-    return value if isinstance(value, str) else float(value)

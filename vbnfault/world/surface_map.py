@@ -84,9 +84,13 @@ def _factors(table: AlbedoMapTable) -> Float32:
 
         values = eotf_sRGB(values).astype(np.float32)
     if is_equal_area:
+        rows = columns // 2
+        if rows * columns * channels > _MOST_VALUES:
+            raise InputError(
+                f"body.albedo_map.file = {path!r}: has {columns} x {rows} pixels of {channels} channel(s); pixels "
+                f"times channels must be at most {_MOST_VALUES}"
+            )
         values = _with_equal_latitudes(values)
-        rows = len(values)
-        _check_values(path, rows, columns, channels)
     neutral = table.neutral
     if neutral == "mean":  # over the area, and over the channels, so that a map keeps its colour
         latitude = (0.5 - (np.arange(rows) + 0.5) / rows) * np.pi
@@ -112,15 +116,6 @@ def _with_equal_latitudes(values: Float32) -> Float32:
     at_borders = total[low] * (1 - part) + total[low + 1] * part
     means = np.diff(at_borders, axis=0) / np.diff(borders)[:, None]
     return means.reshape(columns // 2, columns, channels).astype(np.float32)
-
-
-def _check_values(path: str, rows: int, columns: int, channels: int) -> None:
-    """Raise InputError if a map has too many values."""
-    if rows * columns * channels > _MOST_VALUES:
-        raise InputError(
-            f"body.albedo_map.file = {path!r}: has {columns} x {rows} pixels of {channels} channel(s); pixels "
-            f"times channels must be at most {_MOST_VALUES}"
-        )
 
 
 def _prepared(table: AlbedoMapTable, factors: Float32) -> SurfaceMap:

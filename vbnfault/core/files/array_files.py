@@ -96,11 +96,6 @@ class ArrayFiles:
     kind: str
     content: str
 
-    def __post_init__(self) -> None:
-        """Refuse a kind whose files nothing would remove."""
-        if self.kind not in _KINDS:
-            raise ValueError(f"kind = {self.kind!r}: must be one of {', '.join(_KINDS)}")
-
     def path(self, key: str) -> Path:
         """Return the file of a key. Raises RuntimeError or OSError if there is no home folder."""
         return cache_folder() / f"{self.kind}-{key}.{self.kind}"
