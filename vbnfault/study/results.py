@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..core.errors import InputError
-from ..core.files.whole_files import replacing, write_whole
+from ..core.files.whole_files import replacing
 from ..store import is_sealed, sealed
 from .designs import Design
 from .distributions import Categorical
@@ -171,7 +171,8 @@ def write_chunk(
     `seconds`: what they took, by stage.
     """
     record = {str(index): outcomes[index] for index in sorted(outcomes)} | {_SECONDS: dict(seconds)}
-    write_whole(chunk_path(folder, chunk), json.dumps(sealed(record)))
+    with replacing(chunk_path(folder, chunk)) as temporary:  # a link of this name is replaced
+        temporary.write_text(json.dumps(sealed(record)), encoding="utf-8")
 
 
 def read_chunk(folder: Path, chunk: int) -> tuple[dict[int, dict[str, Any]], dict[str, float]]:
