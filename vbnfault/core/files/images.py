@@ -78,7 +78,7 @@ def png_numbers(data: bytes, most_values: int) -> NDArray[Any]:
 
 def _decoded_png(data: bytes, most_values: int, kinds: Set[bytes] = _NEEDED_CHUNKS) -> NDArray[Any]:
     """Return what OpenCV makes of some chunks of a PNG file, uint8 or uint16 [y, x, channel]. Raises InputError."""
-    if len(data) >= 26:
+    if len(data) >= 24:
         columns, rows = struct.unpack(">II", data[16:24])
         check_values(rows, columns, _PNG_CHANNELS.get(data[25:26], 1), most_values)
     chunks = _chunks(data, kinds)
