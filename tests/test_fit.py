@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,8 @@ from vbnfault.fit.exposures import (
     rounded_moments,
     variance_estimate,
 )
-from vbnfault.fit.sensor_fit import Bend, Darks, fit_sensor
+from vbnfault.fit.sensor_file import sensor_text
+from vbnfault.fit.sensor_fit import HOT_POWER, Bend, Darks, fit_sensor
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
@@ -189,6 +191,59 @@ def test_the_command_writes_a_sensor_that_loads_and_says_what_it_could_not_fit(t
     # the device that it makes has as many hot pixels, within the deviation of both counts
     counts = [len(Device(sensor, 3, shape=(256, 256)).individual.hot) for sensor in (made, hidden)]
     assert abs(counts[0] - counts[1]) < 5 * math.sqrt(sum(counts)) + 0.15 * counts[1]
+
+
+def test_the_dark_current_is_that_at_the_temperature_of_the_darks(taken: Any, tmp_path: Path) -> None:
+    _, frames, base = taken
+    for temperature_K, reference_K in ((223.0, 223.0), (None, load_sensor(base).temperature_K)):
+        cold = [replace(one, temperature_K=temperature_K) for one in frames]
+        fit = fit_sensor(cold, str(base))
+        (tmp_path / "fitted.toml").write_text(sensor_text(fit))
+        made = load_sensor(str(tmp_path / "fitted.toml")).individual
+        assert made.reference_K == reference_K
+        rate = fit.estimates["individual.dark_current_e_s"].value
+        assert made.dark_current_e_s * made.dark_factor(reference_K) == pytest.approx(rate, rel=1e-4)
+    mixed = [replace(one, temperature_K=280.0 + k) for k, one in enumerate(frames) if one.kind == "dark"]
+    with pytest.raises(InputError, match=r"temperature_K = .*: must be within 1 K"):
+        fit_sensor(mixed, str(base))
+
+
+def test_darks_without_repeats_assume_a_drift_of_the_bias() -> None:
+    """Of 20 means with a drift of 0.3 DN, one interval of 1 DN to either side misses with a chance of 2 %."""
+    rng = np.random.default_rng(6)
+    held = 0
+    for _ in range(20):
+        one = Darks.of(
+            [frame("dark", np.rint(50 + 0.3 * rng.standard_normal() + 3 * rng.standard_normal(SIZE)), 1.0)]
+        )
+        held += abs(one.bias_dn - 50) < 1.96 * one.bias_error_dn
+    assert held >= 19
+
+
+def test_patterns_below_the_steps_of_the_converter_are_not_fitted() -> None:
+    rng = np.random.default_rng(7)
+    darks = [np.rint(10.3 + 0.03 * rng.standard_normal(SIZE) + shift) for shift in (0.0, 0.1, 0.3, 0.0)]
+    frames = [frame("dark", one, 1.0, f"dark {k}") for k, one in enumerate(darks)]
+    flats = [frame("flat", rng.poisson(level, SIZE) + 10, level) for level in (400, 400, 600, 600, 1000, 1000)]
+    found = fit_sensor([*frames, *flats]).estimates
+    assert "readout.gain_dn_per_e" in found
+    assert not {"individual.dsnu_e", "readout.column_pattern_e_rms", "readout.bias_drift_dn_rms"} & found.keys()
+
+
+def test_hot_pixels_that_fill_the_well_count_by_a_shorter_exposure() -> None:
+    """Rates of a power law of 1 from 40 e/s, a well of 3,000 e far below the top: the likelihood of 400 is known to
+    5 %, three times that."""
+    rng = np.random.default_rng(8)
+    rates = np.zeros(SIZE)
+    rates.flat[rng.choice(rates.size, 400, replace=False)] = 40 / rng.random(400)
+    frames = [
+        frame(
+            "dark", np.rint(np.minimum(rng.poisson((2 + rates) * t), 3000) + 100 + 2 * rng.standard_normal(SIZE)), t
+        )
+        for t in (0.01, 0.01, 1.0, 1.0, 40.0, 40.0)
+    ]
+    found = fit_sensor([replace(one, name=f"dark {k}") for k, one in enumerate(frames)]).estimates
+    assert found[HOT_POWER].value == pytest.approx(1.0, rel=0.15)
 
 
 def test_options_name_the_kinds_of_frames(taken: Any, tmp_path: Path) -> None:

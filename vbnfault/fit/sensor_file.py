@@ -44,6 +44,12 @@ def sensor_text(fit: SensorFit) -> str:
             _put_hot_pixels(fit, put, one)
         elif key not in ("point spread", HOT_POWER):
             put(key, float(f"{one.value:.5g}"), one.text)
+    if "individual.dark_current_e_s" in fit.estimates:
+        stated, own_K = fit.dark_temperature_K, fit.sensor.temperature_K
+        text = f"assumed: temperature_K, {own_K:g}, as no dark says its own" if stated is None else "of the darks"
+        put("individual.reference_K", own_K if stated is None else stated, text)
+        if stated is not None and fit.is_assumed:
+            put("temperature_K", stated, text)
     parse_sensor(table, source="the fitted sensor")
     head = ["Fitted to frames by `vbnfault fit`; the table [sources] holds intervals of 95 % and methods."]
     if (spread := fit.estimates.get("point spread")) is not None:

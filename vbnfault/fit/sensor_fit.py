@@ -55,8 +55,12 @@ _SAME_LEVEL = 0.05  # largest relative difference of the means of two flats that
 # Relative scatter of light that is called constant, and the least variance over it: a few levels may scatter less
 _LAMP, _STEADIEST = 1e-3, 0.25
 _CLIPPED = 1e-4  # fraction of pixels at the largest number
+# Hot pixels that pile up within so many deviations of the brightest one, as it is where a well is full
+_PILED, _PILE = 4, 4.0
 _DEAD, _HOT = 0.5, 8.0  # response below which a pixel is dead; deviations above which one is hot
-_LEAST_DRIFT_DN = 0.02  # assumed where darks show none
+# Drift of the bias from frame to frame: assumed where darks show none, and where no exposure was repeated
+_LEAST_DRIFT_DN, _UNSEEN_DRIFT_DN = 0.02, 0.5
+_ONE_TEMPERATURE_K = 1.0  # largest range of what counts as one temperature
 HOT_POWER = "individual.hot_growth.iso_power"
 NEEDS = {
     "readout.gain_dn_per_e": "needs pairs of flats at two levels, darks of two exposures, or frames with light",
@@ -112,6 +116,7 @@ class SensorFit:
     is_assumed: bool  # nobody gave the base
     estimates: dict[str, Estimate] = field(default_factory=dict)
     hot_rate_e_s: tuple[float, float] = (0.0, 0.0)
+    dark_temperature_K: float | None = None  # that the darks say
     bend: Bend = Bend()
     transfer: Transfer | None = None
 
@@ -265,10 +270,20 @@ class Darks:
     rate_error_dn_s: float
     drift: Estimate | None
     good: Mask
+    temperature_K: float | None
 
     @classmethod
     def of(cls, frames: Sequence[Exposure]) -> Darks:
-        """Return what darks show. Frames without a known exposure count as having none."""
+        """Return what darks show. Frames without a known exposure count as having none.
+
+        Raises InputError if they were not taken at one temperature.
+        """
+        known = sorted((one.temperature_K, one.name) for one in frames if one.temperature_K is not None)
+        if known and known[-1][0] - known[0][0] > _ONE_TEMPERATURE_K:
+            raise InputError(
+                f"{known[-1][1]}: temperature_K = {known[-1][0]:g}, but {known[0][1]} has {known[0][0]:g}: must be "
+                f"within {_ONE_TEMPERATURE_K:g} K; fit the darks of each temperature alone"
+            )
         exposures = sorted({one.exposure_s or 0.0 for one in frames})
         by_exposure = [[one for one in frames if (one.exposure_s or 0.0) == s] for s in exposures]
         good = ordinary_pixels(np.mean([one.image for one in by_exposure[-1]], axis=0, dtype=np.float32))
@@ -281,8 +296,10 @@ class Darks:
         # what noise alone makes of the means
         formal = max((one.in_time / good.sum() for one in groups if one.row_noise), default=1e-6)
         formal += max((one.row_noise.value / len(good) for one in groups if one.row_noise), default=0.0)
-        scatter = float(((y - design @ best) ** 2).sum()) / degrees if degrees else 0.0
-        drifts = degrees > 0 and scatter * degrees > formal * stats.chi2.ppf(0.95, degrees)
+        scatter = float(((y - design @ best) ** 2).sum()) / degrees if degrees else _UNSEEN_DRIFT_DN**2
+        # where rounding hides the noise, it moves the means, too
+        rounded = all(one.in_time < LEAST_VARIANCE_DN2 for one in groups if one.row_noise)
+        drifts = degrees > 0 and not rounded and scatter * degrees > formal * stats.chi2.ppf(0.95, degrees)
         # the interval of few degrees of freedom, as that of a normal error
         wider = float(stats.t.ppf(0.975, degrees)) / TWO_SIDED if drifts else 1.0
         errors = wider * np.sqrt(np.diag(np.linalg.inv(design.T @ design)) * max(scatter, formal))
@@ -295,6 +312,7 @@ class Darks:
             rate_error_dn_s=float(errors[1]) if len(groups) > 1 else math.nan,
             drift=drift.root() if drift else None,
             good=good,
+            temperature_K=known[len(known) // 2][0] if known else None,
         )
 
     @property
@@ -344,7 +362,9 @@ def _fit_dark_patterns(fit: SensorFit, darks: Darks) -> None:
     per_e, relative = gain[0] * slope, math.hypot(gain[1] / gain[0], 4 * fit.bend.error_dn / range_dn)
     if len(darks.groups) > 1:
         _fit_dark_current(fit, darks, per_e, relative)
-    one = next((one for one in darks.groups if one.row_noise), None)
+    # patterns below the steps of the converter show in nothing
+    seen = (one for one in darks.groups if one.row_noise and one.in_time >= LEAST_VARIANCE_DN2)
+    one = next(seen, None)
     if one is None or one.row_noise is None:
         return
     uneven = fit.estimates.get("individual.dark_nonuniformity")
@@ -367,6 +387,7 @@ def _fit_dark_current(fit: SensorFit, darks: Darks, per_e: float, relative: floa
     means = f"darks of {first.exposure_s:g} to {last.exposure_s:g} s"
     rate = Estimate.normal(darks.rate_dn_s, darks.rate_error_dn_s, f"means of {means}")
     fit.add("individual.dark_current_e_s", rate.over(per_e, relative))
+    fit.dark_temperature_K = darks.temperature_K
     rises = rise_dn(first, last)
     if first.halves_dn and last.halves_dn and rate.low > 0:
         quiet = first.quiet & last.quiet
@@ -400,6 +421,11 @@ def _fit_hot_pixels(fit: SensorFit, darks: Darks, per_e: float, means: str) -> N
         off = (a + b) / 2
         least = max(1.4826 * float(np.median(np.abs(off))), float(np.percentile(np.abs(off), 68.27)), 0.05)
         bright = off > _HOT * least
+        # where several pixels are as bright as the brightest but for shot noise, the well has filled before the top
+        brightest = float(off.max())
+        near_dn = brightest - _PILE * (least + math.sqrt(per_e * max(brightest, 0.0)))
+        if (off >= near_dn).sum() >= _PILED and (off[bright] < near_dn).any():
+            saturated_dn = min(saturated_dn, near_dn)
         # pixels that saturate, and those beside, into which their charge may flow, count by a shorter exposure
         filled = cv2.dilate((off >= saturated_dn).astype(np.uint8), np.ones((3, 3))) > 0
         if group is later[-1]:
@@ -611,7 +637,8 @@ def _fit_flat_patterns(fit: SensorFit, flats: Flats, bend: Bend, darks: Darks) -
     offsets = planes_of(dark.map_dn, fit.tile)  # their noise is in both flats of a pair
     cool = [one > 0 for one in planes_of(darks.good, fit.tile)]  # light of hot pixels is no response
     last = {flats.points[k].plane: k for k in sorted(used, key=lambda k: flats.points[k].signal_dn)}
-    shared, dead, pixels = [], 0, 0
+    bent = replace(bend, quadratic_dn=bend.quadratic_dn + bend.error_dn)
+    shared, by_bend, dead, pixels = [], [], 0, 0
     for k in used:
         point = flats.points[k]
         pair = [one - offsets[point.plane] for one in flats.images[k]]
@@ -624,18 +651,23 @@ def _fit_flat_patterns(fit: SensorFit, flats: Flats, bend: Bend, darks: Darks) -
         shade = smooth_surface(local)  # of the light, which is no property of the pixels
         filled = [np.where(quiet, one, local).astype(np.float32) for one in pair]
         rough = [smoothed_pixels(one / shade)[inside(quiet)] for one in filled]
-        straight = float(bend.straight(point.signal_dn))
-        steeper = (
-            straight * float(bend.slope(straight)) / point.signal_dn
-        )  # what the arc makes of a relative pattern
+        steeper, other = _steeper(bend, point.signal_dn), _steeper(bent, point.signal_dn)
+        by_bend.append((steeper / other) ** 2 - 1)
         noise = dark.in_time / len(dark.means_dn) / point.signal_dn**2
         shared.append(covariance_estimate(rough).scaled(steeper**-2, noise / steeper**2))
-    errors = np.array([one.error for one in shared])
-    value = float(np.average([one.value for one in shared], weights=errors**-2.0))
+    weights = np.array([one.error for one in shared]) ** -2.0
+    value = float(np.average([one.value for one in shared], weights=weights))
     # all pairs show the same pixels; other devices have others
-    error = math.hypot(float((errors**-2.0).sum()) ** -0.5, value * math.sqrt(2 / pixels))
+    of_bend = value * float(np.average(by_bend, weights=weights))
+    error = math.hypot(float(weights.sum()) ** -0.5, value * math.sqrt(2 / pixels), of_bend)
     method = f"covariance of {len(used)} pairs of flats over their signals"
     fit.add("individual.prnu", Estimate.normal(value, error, method).root())
     # responses of dead pixels are uniform from 0 to 1
     method = f"{dead} of {pixels} pixels respond by less than {_DEAD:g} in the brightest pairs"
     fit.add("individual.dead_fraction", count_estimate(dead, pixels * _DEAD, method))
+
+
+def _steeper(bend: Bend, signal_dn: float) -> float:
+    """Return what the arc makes of a relative pattern at a signal."""
+    straight = float(bend.straight(signal_dn))
+    return straight * float(bend.slope(straight)) / signal_dn
