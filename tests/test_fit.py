@@ -313,6 +313,16 @@ def test_formats_hold_the_same_numbers(tmp_path: Path) -> None:
     assert frames[2].temperature_K == pytest.approx(263.15)
 
 
+@pytest.mark.parametrize("ending", [".png", ".tif"])
+def test_the_depth_is_that_of_the_file_and_steps_are_powers_of_two(ending: str, tmp_path: Path) -> None:
+    """A saturated flat holds only multiples of 257, darks of 100 DN only of 100, and these of 3."""
+    threes = 3 * np.random.default_rng(8).integers(0, 99, (70, 90))
+    for number, image in enumerate((np.full((70, 90), 65535), np.full((70, 90), 100), threes)):
+        path = tmp_path / f"{number}{ending}"
+        cv2.imwrite(str(path), image.astype(np.uint16))
+        np.testing.assert_array_equal(read_exposures({"flat": [path]})[0].image, image)
+
+
 @pytest.mark.parametrize(
     ("files", "sentence"),
     [

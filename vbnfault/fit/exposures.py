@@ -57,8 +57,8 @@ class Exposure:
 def read_exposures(paths: Mapping[Kind, Sequence[Path]]) -> list[Exposure]:
     """Return the frames of folders and files, by the kind that those have whose table does not say it.
 
-    Numbers that are all multiples of a step, such as 12 bits at the top of 16, are divided by it. Raises InputError
-    for a wrong file or table, without a frame, and for frames of different sizes.
+    Numbers that are all multiples of a power of two, such as 12 bits at the top of 16, are divided by it. Raises
+    InputError for a wrong file or table, without a frame, and for frames of different sizes.
     """
     found = [one for kind, given in paths.items() for path in given for one in _in_path(path, kind)]
     if not found:
@@ -68,8 +68,10 @@ def read_exposures(paths: Mapping[Kind, Sequence[Path]]) -> list[Exposure]:
         if one.image.shape != first.image.shape:
             size, other = (f"{image.shape[1]}x{image.shape[0]}" for image in (one.image, first.image))
             raise InputError(f"{one.name}: is {size} px, but {first.name} {other}; frames must have one size")
-    if all(one.image.dtype.kind == "u" for one in found):
+    # of frames of one number each, nothing tells the step
+    if all(one.image.dtype.kind == "u" for one in found) and any(np.ptp(one.image) for one in found):
         step = int(np.gcd.reduce([np.gcd.reduce(np.unique(one.image)) for one in found]))
+        step &= -step
         if step > 1:
             found = [replace(one, image=one.image // one.image.dtype.type(step)) for one in found]
     return found

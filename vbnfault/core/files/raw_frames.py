@@ -11,11 +11,13 @@ from numpy.typing import NDArray
 from ..errors import InputError, in_file
 from . import user_files
 from .images import decoded_image
-from .tiff import check_values
+from .tiff import HEADS as TIFF_HEADS
+from .tiff import check_values, tiff_white
 
 _FITS = (".fits", ".fit", ".fts")
 FRAME_TYPES = (".png", ".tif", ".tiff", *_FITS)
 _MOST_VALUES = 400_000_000
+_PNG_BITS = 24  # place of the bits of a number in the header
 _FITS_BLOCK, _FITS_CARD = 2880, 80
 _FITS_TYPES = {8: "u1", 16: ">i2", 32: ">i4", 64: ">i8", -32: ">f4", -64: ">f8"}
 
@@ -31,29 +33,33 @@ def read_frame(path: Path) -> tuple[NDArray[Any], dict[str, float]]:
         if path.suffix.lower() in _FITS:
             image, header = _fits(data)
         else:
-            image, header = _numbers(decoded_image(data, _MOST_VALUES)[0]), {}
+            image, header = _numbers(data), {}
         if not np.isfinite(image).all():
             y, x = np.argwhere(~np.isfinite(image))[0]
             raise InputError(f"holds {image[y, x]} at x = {x}, y = {y}; must hold finite numbers")
     return image, header
 
 
-def _numbers(values: NDArray[np.float32]) -> NDArray[Any]:
-    """Return the raw numbers of an image of one channel whose white is 1, uint8 or uint16[y, x].
+def _numbers(data: bytes) -> NDArray[Any]:
+    """Return the raw numbers of a PNG or TIFF file of one channel, [y, x].
 
     Floating-point images stay as they are. Raises InputError for an image with colours.
     """
+    values = decoded_image(data, _MOST_VALUES)[0]
     if values.shape[2] > 1 and (values != values[..., :1]).any():
         raise InputError("has colours; must hold the raw numbers of a mosaic, or grey ones")
     grey = values[..., 0]
-    if not (grey.min() >= 0 and grey.max() <= 1):  # DN as they are: floating-point numbers, such as means of frames
+    # the width, never the numbers: all numbers of a saturated frame of 16 bits are steps of 8 bits
+    if data.startswith(TIFF_HEADS):
+        white = tiff_white(data, _MOST_VALUES)
+    else:
+        white = 65535 if data[_PNG_BITS] == 16 else 255  # fewer bits are decoded to 8
+    if not white:
         return grey
-    for top, kind in ((255, np.uint8), (65535, np.uint16)):
-        whole = np.rint(grey * np.float32(top))
-        # sixteen bits lie off the steps of eight bits by 1/257 at least
-        if np.abs(grey * np.float32(top) - whole).max() < (1e-3 if top == 255 else 0.05):
-            return whole.astype(kind)
-    return grey
+    whole = np.rint(grey * np.float32(white))
+    if whole.min() >= 0 and whole.max() <= 65535:
+        return whole.astype(np.uint8 if white <= 255 else np.uint16)
+    return whole
 
 
 def _fits(data: bytes) -> tuple[NDArray[Any], dict[str, float]]:

@@ -65,6 +65,17 @@ def tiff_numbers(data: bytes, most_values: int) -> NDArray[Any]:
         return _samples(page, data, most_values)
 
 
+def tiff_white(data: bytes, most_values: int) -> int:
+    """Return the largest number of a TIFF file's width, which `tiff_pixels` makes 1, or 0 for floating-point ones.
+
+    A palette counts as one of 8 bits. Raises InputError as `tiff_pixels`.
+    """
+    with _usable_page(data, most_values) as page:
+        if page.photometric == _PALETTE:
+            return 255
+        return 0 if page.sampleformat == 3 else _largest(page)
+
+
 @contextmanager
 def _usable_page(data: bytes, most_values: int) -> Iterator[TiffPage]:
     """Open a file for a block that reads its only page. Raises InputError as `tiff_pixels`, also of the block."""
@@ -322,9 +333,13 @@ def _unpredicted(page: TiffPage, block: Bytes, wide: int, together: int) -> NDAr
     return values
 
 
+def _largest(page: TiffPage) -> int:
+    """Return the largest number of a page's width and kind; 1 for floating-point numbers."""
+    return {1: 2**page.bitspersample - 1, 2: 2 ** (page.bitspersample - 1) - 1, 3: 1}[page.sampleformat]
+
+
 def _colours(samples: NDArray[Any], page: TiffPage) -> tuple[F32, F32 | None]:
     """Return the colours of a page, float32[y, x, 1 or 3], and its alpha, from its numbers [y, x, sample]."""
-    largest = {1: 2**page.bitspersample - 1, 2: 2 ** (page.bitspersample - 1) - 1, 3: 1}[page.sampleformat]
     places = (page.tags.valueof(274, 1) - 1) % 8  # 0: the first row is the top and the first column the left
     if places >= 4:
         samples = samples.swapaxes(0, 1)
@@ -333,7 +348,7 @@ def _colours(samples: NDArray[Any], page: TiffPage) -> tuple[F32, F32 | None]:
         table = np.asarray(page.colormap)
         full = 255 if table.max() < 256 else 65535  # some programs write 8 bits, as libtiff notices too
         return (table[:, samples[..., 0]].transpose(1, 2, 0) / np.float32(full)).astype(np.float32), None
-    values = samples.astype(np.float32) / np.float32(largest)
+    values = samples.astype(np.float32) / np.float32(_largest(page))
     if page.photometric == _WHITE_IS_0:
         values[..., 0] = 1 - values[..., 0]
     count = _colour_count(page)
