@@ -303,14 +303,30 @@ def fits(image: np.ndarray, **more: float | str) -> bytes:
 def test_formats_hold_the_same_numbers(tmp_path: Path) -> None:
     image = np.random.default_rng(6).integers(0, 4096, (70, 90)).astype(np.uint16)
     cv2.imwrite(str(tmp_path / "a.png"), image * 16)  # twelve bits at the top of sixteen
-    cv2.imwrite(str(tmp_path / "b.tif"), image * 16)
-    (tmp_path / "c.fits").write_bytes(fits(image * 16, EXPTIME=0.25, **{"CCD-TEMP": -10.0}))
+    cv2.imwrite(str(tmp_path / "b.tif"), np.roll(image, 1, 0) * 16)
+    (tmp_path / "c.fits").write_bytes(fits(np.roll(image, 2, 0) * 16, EXPTIME=0.25, **{"CCD-TEMP": -10.0}))
     (tmp_path / "frames.csv").write_text("name,exposure_s\na,2.5\n")
     frames = read_exposures({"dark": [tmp_path]})
-    for one in frames:
-        np.testing.assert_array_equal(one.image, image)
+    for one, rows in zip(frames, range(3), strict=True):
+        np.testing.assert_array_equal(one.image, np.roll(image, rows, 0))
     assert [one.exposure_s for one in frames] == [2.5, None, 0.25]
     assert frames[2].temperature_K == pytest.approx(263.15)
+
+
+def test_a_frame_is_read_once_and_copies_are_refused(tmp_path: Path) -> None:
+    rng = np.random.default_rng(9)
+    images = [rng.integers(0, 4096, (70, 90)).astype(np.uint16) for _ in range(2)] + [np.full((70, 90), 4095)] * 2
+    for number, image in enumerate(images):
+        cv2.imwrite(str(tmp_path / f"{number}.png"), image.astype(np.uint16))
+    (tmp_path / "frames.csv").write_text("name,kind\n0,dark\n1,flat\n2,flat\n3,flat\n")
+    frames = read_exposures({"dark": [tmp_path], "flat": [tmp_path, tmp_path / "1.png"]})
+    assert [one.kind for one in frames] == ["dark", "flat", "flat", "flat"]
+    with pytest.raises(InputError, match=r"0\.png: is given twice, with another kind or exposure"):
+        read_exposures({"dark": [tmp_path], "flat": [tmp_path / "0.png"]})
+    (tmp_path / "frames.csv").unlink()
+    (tmp_path / "4.png").write_bytes((tmp_path / "1.png").read_bytes())
+    with pytest.raises(InputError, match=r"4\.png: has the pixels of .*1\.png; a copy is no frame"):
+        read_exposures({"flat": [tmp_path]})
 
 
 @pytest.mark.parametrize("ending", [".png", ".tif"])

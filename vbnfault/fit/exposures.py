@@ -23,7 +23,7 @@ from scipy.special import ndtr, ndtri
 
 from ..core.errors import InputError, shown, suggestion
 from ..core.files import user_files
-from ..core.files.path_checks import why_absent
+from ..core.files.path_checks import real, why_absent
 from ..core.files.raw_frames import FRAME_TYPES, read_frame
 
 Kind = Literal["dark", "flat", "star", "frame"]
@@ -58,9 +58,15 @@ def read_exposures(paths: Mapping[Kind, Sequence[Path]]) -> list[Exposure]:
     """Return the frames of folders and files, by the kind that those have whose table does not say it.
 
     Numbers that are all multiples of a power of two, such as 12 bits at the top of 16, are divided by it. Raises
-    InputError for a wrong file or table, without a frame, and for frames of different sizes.
+    InputError for a wrong file or table, without a frame, for frames of different sizes, and for copies.
     """
-    found = [one for kind, given in paths.items() for path in given for one in _in_path(path, kind)]
+    rows: dict[Path, tuple[Path, dict[str, Any]]] = {}
+    for kind, given in paths.items():
+        for file, row in (one for path in given for one in _in_path(path)):
+            row = {"kind": kind, **row}
+            if rows.setdefault(real(file), (file, row))[1] != row:
+                raise InputError(f"{file}: is given twice, with another kind or exposure; name it once")
+    found = [_read(file, row) for file, row in rows.values()]
     if not found:
         raise InputError("there is no frame; name folders or files of PNG, TIFF or FITS images")
     first = found[0]
@@ -68,6 +74,7 @@ def read_exposures(paths: Mapping[Kind, Sequence[Path]]) -> list[Exposure]:
         if one.image.shape != first.image.shape:
             size, other = (f"{image.shape[1]}x{image.shape[0]}" for image in (one.image, first.image))
             raise InputError(f"{one.name}: is {size} px, but {first.name} {other}; frames must have one size")
+    _check_copies(found)
     # of frames of one number each, nothing tells the step
     if all(one.image.dtype.kind == "u" for one in found) and any(np.ptp(one.image) for one in found):
         step = int(np.gcd.reduce([np.gcd.reduce(np.unique(one.image)) for one in found]))
@@ -77,18 +84,31 @@ def read_exposures(paths: Mapping[Kind, Sequence[Path]]) -> list[Exposure]:
     return found
 
 
-def _in_path(path: Path, kind: Kind) -> list[Exposure]:
-    """Return the frames of a folder, in the order of their names, or of one file. Raises InputError."""
+def _check_copies(frames: Sequence[Exposure]) -> None:
+    """Raise InputError for frames of equal pixels, which are not independent.
+
+    Pixels that are all at an end of the range, as of saturated flats, are equal by nature.
+    """
+    ends = [min(one.image.min() for one in frames), max(one.image.max() for one in frames)]
+    names: dict[str, str] = {}
+    for one in frames:
+        other = names.setdefault(user_files.sha256(one.image.astype(np.float32).tobytes()), one.name)
+        if other != one.name and not np.isin(one.image, ends).all():
+            raise InputError(f"{one.name}: has the pixels of {other}; a copy is no frame of its own, leave it out")
+
+
+def _in_path(path: Path) -> list[tuple[Path, dict[str, Any]]]:
+    """Return files and rows of a folder's frames, in the order of their names, or of one. Raises InputError."""
     if not path.is_dir():
         if not path.exists():
             raise InputError(f"{path}: {why_absent(path)}; must be a folder of frames, or one frame")
-        return [_read(path, kind, {})]
+        return [(path, {})]
     table = _read_table(path / TABLE) if (path / TABLE).is_file() else {}
     files = sorted(one for one in path.iterdir() if one.suffix.lower() in FRAME_TYPES)
     spare = sorted(set(table) - {key for file in files for key in (file.name, file.stem)})
     if spare:
         raise InputError(f"{path / TABLE}: name = {shown(spare[0])}: the folder has no such frame")
-    return [_read(file, kind, table.get(file.name) or table.get(file.stem) or {}) for file in files]
+    return [(file, table.get(file.name) or table.get(file.stem) or {}) for file in files]
 
 
 def _read_table(path: Path) -> dict[str, dict[str, Any]]:
@@ -117,7 +137,8 @@ def _read_table(path: Path) -> dict[str, dict[str, Any]]:
         }
         if "name" not in values or values["name"] in out:
             raise InputError(f"{where}: name = {shown(values.get('name', ''))}: must be a file's, once")
-        out[values["name"]] = values | numbers
+        name = values.pop("name")
+        out[name] = values | numbers
     return out
 
 
@@ -131,7 +152,7 @@ def _number(text: str, low: float, high: float, where: str) -> float:
     return value
 
 
-def _read(path: Path, kind: Kind, row: Mapping[str, Any]) -> Exposure:
+def _read(path: Path, row: Mapping[str, Any]) -> Exposure:
     """Return the frame of a file and of its row. Raises InputError."""
     image, header = read_frame(path)
     if min(image.shape) < _LEAST_PX:
@@ -139,7 +160,7 @@ def _read(path: Path, kind: Kind, row: Mapping[str, Any]) -> Exposure:
         raise InputError(f"{path}: is {size} px; must be at least {_LEAST_PX} px each way")
     return Exposure(
         name=str(path),
-        kind=row.get("kind", kind),
+        kind=row["kind"],
         image=image,
         exposure_s=row.get("exposure_s", header.get("exposure_s")),
         temperature_K=row.get("temperature_K", header.get("temperature_K")),
