@@ -304,7 +304,7 @@ def test_formats_hold_the_same_numbers(tmp_path: Path) -> None:
     image = np.random.default_rng(6).integers(0, 4096, (70, 90)).astype(np.uint16)
     cv2.imwrite(str(tmp_path / "a.png"), image * 16)  # twelve bits at the top of sixteen
     cv2.imwrite(str(tmp_path / "b.tif"), np.roll(image, 1, 0) * 16)
-    (tmp_path / "c.fits").write_bytes(fits(np.roll(image, 2, 0) * 16, EXPTIME=0.25, **{"CCD-TEMP": -10.0}))
+    (tmp_path / "c.fits").write_bytes(fits(np.roll(image, 2, 0) * 16, EXPTIME="2.5D-01", **{"CCD-TEMP": -10.0}))
     (tmp_path / "frames.csv").write_text("name,exposure_s\na,2.5\n")
     frames = read_exposures({"dark": [tmp_path]})
     for one, rows in zip(frames, range(3), strict=True):
@@ -347,6 +347,12 @@ def test_the_depth_is_that_of_the_file_and_steps_are_powers_of_two(ending: str, 
         ({"a.png": b"no image"}, r"a\.png: is not a PNG"),
         ({"a.fits": b"SIMPLE  = T".ljust(2880)}, r"a\.fits: is no FITS file with an image"),
         ({"a.fits": fits(np.zeros((70, 70)), EXPTIME="'2'")}, r"a\.fits: EXPTIME = '2': must be a number"),
+        ({"a.fits": fits(np.zeros((70, 70)), EXPTIME="nan")}, r"a\.fits: EXPTIME = nan: must be from 0 to 1e\+06"),
+        ({"a.fits": fits(np.zeros((70, 70)), EXPTIME="-5.0D+00")}, r"a\.fits: EXPTIME = -5: must be from 0 to"),
+        (
+            {"a.fits": fits(np.zeros((70, 70)), **{"CCD-TEMP": -400})},
+            r"a\.fits: CCD-TEMP = -400: must be from -223\.15 to 126\.85; correct it, or say temperature_K in",
+        ),
         ({"a.fits": fits(np.zeros((70, 70)), BITPIX=24)}, r"a\.fits: BITPIX = 24: must be one of 8, 16, 32, 64"),
         (
             {"a.png": (70, 70), "b.png": (70, 80)},

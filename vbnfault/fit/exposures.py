@@ -40,7 +40,8 @@ TWO_SIDED = float(ndtri(0.975))
 LEAST_VARIANCE_DN2 = 0.02  # below, rounding hides the noise
 _DITHERED_DN = 0.6
 _PIXELS, _LINE = 11, 31  # widths over which pixels and lines are compared with their neighbours
-_MOST_SECONDS, _KELVIN = 1e6, (50.0, 400.0)
+_LIMITS = {"exposure_s": (0.0, 1e6), "temperature_K": (50.0, 400.0)}
+_CARDS = {"exposure_s": ("EXPTIME", 0.0), "temperature_K": ("CCD-TEMP", 273.15)}  # of FITS, and what is added
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -132,7 +133,7 @@ def _read_table(path: Path) -> dict[str, dict[str, Any]]:
             raise InputError(f"{where}: kind = {shown(kind)}: must be one of {', '.join(get_args(Kind))}")
         numbers = {
             key: _number(values[key], *limits, f"{where}: {key}")
-            for key, limits in (("exposure_s", (0.0, _MOST_SECONDS)), ("temperature_K", _KELVIN))
+            for key, limits in _LIMITS.items()
             if key in values
         }
         if "name" not in values or values["name"] in out:
@@ -158,13 +159,16 @@ def _read(path: Path, row: Mapping[str, Any]) -> Exposure:
     if min(image.shape) < _LEAST_PX:
         size = f"{image.shape[1]}x{image.shape[0]}"
         raise InputError(f"{path}: is {size} px; must be at least {_LEAST_PX} px each way")
-    return Exposure(
-        name=str(path),
-        kind=row["kind"],
-        image=image,
-        exposure_s=row.get("exposure_s", header.get("exposure_s")),
-        temperature_K=row.get("temperature_K", header.get("temperature_K")),
-    )
+    for key, value in header.items():
+        card, zero = _CARDS[key]
+        low, high = _LIMITS[key]
+        if key not in row and not low <= value <= high:
+            raise InputError(
+                f"{path}: {card} = {value - zero:g}: must be from {low - zero:g} to {high - zero:g}; "
+                f"correct it, or say {key} in {TABLE}"
+            )
+    known = {key: row.get(key, header.get(key)) for key in _LIMITS}
+    return Exposure(name=str(path), kind=row["kind"], image=image, **known)
 
 
 # --- estimates and moments ----------------------------------------------------------------------------------------
