@@ -266,6 +266,26 @@ def test_options_name_the_kinds_of_frames(taken: Any, tmp_path: Path) -> None:
     assert refused.exit_code == 2
 
 
+def test_what_is_read_is_not_replaced(taken: Any, tmp_path: Path) -> None:
+    _, frames, base = taken
+    folder, sensor, link = tmp_path / "frames", tmp_path / "base.toml", tmp_path / "link.png"
+    folder.mkdir()
+    sensor.write_bytes(base.read_bytes())
+    for number, one in enumerate([one for one in frames if one.kind == "dark"]):
+        cv2.imwrite(str(folder / f"{number}.png"), one.image)
+    (folder / "frames.csv").write_text("name,kind\n0,dark\n")
+    link.symlink_to(folder / "0.png")
+    inputs = [*folder.iterdir(), sensor]
+    before = [path.read_bytes() for path in inputs]
+    command = ["fit", "--darks", str(folder), "--sensor", str(sensor)]
+    for path in (*inputs, link):
+        for more in (["--out", str(path)], ["--out", str(tmp_path / "out.toml"), "--plot", str(path)]):
+            result = CliRunner().invoke(cli.app, [*command, *more])
+            assert result.exit_code != 0
+            assert f"{more[-2]} {path}: is a file that the fit reads" in str(result.exception)
+    assert [path.read_bytes() for path in inputs] == before
+
+
 def test_without_flats_the_dark_current_gives_the_gain(taken: Any) -> None:
     one, frames, base = taken
     fit = fit_sensor([x for x in frames if x.kind == "dark"], str(base))

@@ -168,15 +168,27 @@ def fit(
     """Fit a sensor to a camera's own frames: gain, noise, dark current, patterns, defects and response, each with
     an interval of 95 %, and what could not be fitted. A folder may hold frames.csv with the frames' exposures.
     """
+    from ..core.files import resources
+    from ..core.files.path_checks import real
     from ..core.files.whole_files import write_whole, writing
-    from ..fit.exposures import read_exposures
+    from ..fit.exposures import TABLE, Kind, read_exposures
     from ..fit.sensor_file import draw_transfer, sensor_text
     from ..fit.sensor_fit import fit_sensor
 
     check_written("", {"--out": out, "--plot": plot})
-    exposures = read_exposures(
-        {"dark": darks or [], "flat": flats or [], "star": stars or [], "frame": frames or []}
-    )
+    given: dict[Kind, list[Path]] = {
+        "dark": darks or [],
+        "flat": flats or [],
+        "star": stars or [],
+        "frame": frames or [],
+    }
+    exposures = read_exposures(given)
+    read = {real(one.name) for one in exposures} | {real(path / TABLE) for some in given.values() for path in some}
+    if sensor is not None:
+        read.add(real(resources.find("scenes/detectors", sensor)))
+    for option, path in (("--out", out), ("--plot", plot)):
+        if path is not None and real(path) in read:
+            raise InputError(f"{option} {path}: is a file that the fit reads; choose another path")
     result = fit_sensor(exposures, sensor, stretch)
     text = sensor_text(result)
     if plot is not None:
