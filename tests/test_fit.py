@@ -306,6 +306,20 @@ def test_ordinary_frames_give_noise_and_patterns() -> None:
     assert "needs darks" in fit.missing["individual.dark_current_e_s"]
 
 
+def test_frames_without_sky_are_no_error() -> None:
+    """Frames of one number are wholly at the end of the range; trial values for a single dark saturate too."""
+    for number in (0, 100):
+        with pytest.raises(InputError, match="nothing can be fitted"):
+            fit_sensor([frame("frame", np.full(SIZE, number, np.uint16))] * 4)
+        both = [frame("dark", np.full(SIZE, number, np.uint16), 0.1)] * 2
+        both += [frame("frame", np.full(SIZE, number, np.uint16))] * 4
+        assert set(fit_sensor(both).estimates) <= {"readout.bias_dn", "readout.bias_drift_dn_rms"}
+    dark = np.rint(100.3 + 3 * np.random.default_rng(10).standard_normal((256, 256))).astype(np.uint16)
+    fit = fit_sensor([frame("frame", dark)])
+    assert "readout.gain_dn_per_e" in fit.missing
+    assert fit.estimates["readout.bias_dn"].value == pytest.approx(100.3, abs=0.5)
+
+
 # --- files ------------------------------------------------------------------------------------------------------
 
 

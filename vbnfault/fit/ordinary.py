@@ -35,6 +35,7 @@ _SMOOTH = 2.0  # blocks of up to so many times the variance of their level count
 _MODEL_ERROR = 0.01  # of a simulated variance: that of a quantile of its 256 blocks
 _PROCESSING_ERROR = 0.25  # of a simulated shared pattern: processed frames may share more than offsets of pixels
 _COLUMN_PX, _FEWEST_ROWS, _FEWEST_COLUMNS = 15, 32, 32
+_UNLIKE = 1e6  # errors by which a simulation without sky counts as off
 _FEWEST_STARS = 5
 _CORE_PX = (0.3, 4.0)
 _RESPONSE_ERROR = 0.005  # of the width of a star, for what a bent response and neighbours make of its shape
@@ -93,7 +94,8 @@ def sky_noise(blocks: Sequence[Blocks], black: float) -> SkyNoise:
     """Return noise and shared pattern of frames of different scenes."""
     heights = [np.where(np.isfinite(b.variance), np.sqrt(np.maximum(b.level - black, 0)), np.nan) for b in blocks]
     # where most blocks are, and over all levels
-    dense = np.nanpercentile(heights, (0.2, 3, 10, 25, 50, 75, 90, 97, 99.5))
+    is_lit = np.isfinite(heights).any()
+    dense = np.nanpercentile(heights, (0.2, 3, 10, 25, 50, 75, 90, 97, 99.5)) if is_lit else np.zeros(1)
     edges = np.unique(np.append(dense, np.linspace(float(dense[0]), float(dense[-1]), _LEVELS + 1)))
     place = [np.searchsorted(edges, one) - 1 for one in heights]  # NaN lies beyond the last
     smooth = [np.zeros(len(one), dtype=bool) for one in place]
@@ -216,6 +218,8 @@ def fit_ordinary(
     if black_dn is None:
         levels = [np.where(np.isfinite(b.variance), b.level, np.nan) for plane in blocks for b in plane]
         darkest = [float(np.nanpercentile(one, 1)) for one in levels if np.isfinite(one).any()]
+        if not darkest:  # all is black or saturated
+            return {}, None
         black_dn = float(np.min(darkest))
         method = f"darkest sky of {len(frames)} frames; its light counts as black"
         spread = _error_of_median(darkest)
@@ -261,14 +265,20 @@ def _fitted_noise(
 
     def expected(logs: F64) -> tuple[F64, F64]:
         x, noise, fixed = model(signals_dn, *np.exp(logs))
+        if not len(x):  # all that it simulates is black or saturated
+            return np.full_like(level, np.nan), np.full_like(level, np.nan)
         return np.interp(level, x, noise), np.interp(level, x, fixed)
 
     def off(logs: F64) -> F64:
         noise, fixed = expected(logs)
-        return np.concatenate([(noise - variance) / error, ((fixed - shared) / shared_error)[paired]])
+        out = np.concatenate([(noise - variance) / error, ((fixed - shared) / shared_error)[paired]])
+        return np.nan_to_num(out, nan=_UNLIKE)
 
     start = np.log([model.top_dn / 5e4, 5.0, 3.0])
     best = optimize.least_squares(off, start, diff_step=0.05, x_scale=0.3, loss="soft_l1", ftol=1e-3, xtol=1e-3)
+    simulated = expected(best.x)[0]
+    if np.isnan(simulated).any():
+        return {}, None
     degrees = max(len(best.fun) - 3, 1)
     scatter = max(2 * best.cost / degrees, 1.0)
     errors = np.sqrt(np.diag(np.linalg.pinv(best.jac.T @ best.jac)) * scatter)
@@ -281,8 +291,7 @@ def _fitted_noise(
         low, high = (math.exp(log + sign * min(TWO_SIDED * wide, 5.0)) for sign in (-1, 1))
         out[key] = Estimate(value=math.exp(log), low=low if wide < 0.5 else 0.0, high=high, method=method)
     order = np.argsort(level)
-    noise = expected(best.x)[0]
-    points = {"level_dn": level, "variance_dn2": variance, "error_dn2": error, "fitted_dn2": noise}
+    points = {"level_dn": level, "variance_dn2": variance, "error_dn2": error, "fitted_dn2": simulated}
     return out, Transfer(**{name: values[order] for name, values in points.items()})
 
 
