@@ -139,6 +139,17 @@ def test_wrong_frames_are_refused_before_anything_is_rendered(frames: Path, tmp_
         assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("folder", ["", "../", "deeper/", "..\\"])
+def test_names_that_lead_out_of_the_folder_are_refused(frames: Path, tmp_path: Path, folder: str) -> None:
+    """Pairs have the names of their frames, and would be written beside them."""
+    name = f"{folder or f'{frames}/'}frame_0"
+    table = (frames / "poses.csv").read_text(encoding="utf-8").replace("frame_0", name)
+    (tmp_path / "poses.csv").write_text(table, encoding="utf-8")
+    with pytest.raises(InputError, match=r"poses\.csv: row 1: name = '.*frame_0': must be a name without a folder"):
+        fit_passport.passport(frames, "rosetta67p", tmp_path / "out", overrides=SMALL, poses=tmp_path / "poses.csv")
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_colour_camera_and_a_camera_without_a_sensor_file_are_refused(frames: Path, tmp_path: Path) -> None:
     for scene, values, sentence in (
         ("rosetta67p", SMALL | {"camera.detector": "cmv4000"}, "must be monochrome to compare grey frames"),

@@ -14,7 +14,7 @@ import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import Any, Literal
 
 import cv2
@@ -186,6 +186,9 @@ def passport(
         Wrong scene, table or frame.
     """
     table = load_trajectory(str((poses or frames / "poses.csv").resolve()))
+    for row, name in enumerate(table.name, 1):
+        if name == ".." or PureWindowsPath(name).name != name:  # it knows both kinds of slashes
+            raise InputError(f"{table.source}: row {row}: name = {shown(name)}: must be a name without a folder")
     rows = _chosen(table.name, options)
     if not rows:
         raise InputError(f"{frames}: has no frame in the part {options.part}; of {len(table)} rows none is left")
