@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -137,6 +138,31 @@ def test_wrong_frames_are_refused_before_anything_is_rendered(frames: Path, tmp_
         with pytest.raises(InputError, match=sentence):
             fit_passport.passport(folder, "rosetta67p", tmp_path / "out", options, overrides=SMALL)
         assert not (tmp_path / "out").exists()
+
+
+def test_a_pair_that_is_damaged_or_gone_is_rendered_again(
+    frames: Path, tmp_path: Path, result: tuple[dict[str, Any], Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Four of eight pairs have lost something each; the other four are kept."""
+    found, out = result
+    shutil.copytree(out / "pairs", tmp_path / "pairs")
+    (tmp_path / "pairs/frame_0_rendered.png").unlink()
+    real = tmp_path / "pairs/frame_1_real.png"
+    real.write_bytes(real.read_bytes()[:2000])
+    for name, part in (("frame_2", "figures"), ("frame_3", "settings")):
+        path = tmp_path / f"pairs/{name}.json"
+        path.write_text(json.dumps({**json.loads(path.read_text()), part: None}))
+    rendered, pair = [], Replay.pair
+
+    def counted(self: Replay, row: int, frame: Any) -> Any:
+        rendered.append(row)
+        return pair(self, row, frame)
+
+    monkeypatch.setattr(Replay, "pair", counted)
+    options = fit_passport.PassportOptions(part="all", mendings=0, draws=1)
+    again = fit_passport.passport(frames, "rosetta67p", tmp_path, options, overrides=SMALL)
+    assert rendered == [0, 1, 2, 3]
+    assert json.dumps(again["statistics"]) == json.dumps(found["statistics"])  # NaN differs from itself
 
 
 @pytest.mark.parametrize("folder", ["", "../", "deeper/", "..\\"])

@@ -220,7 +220,7 @@ def passport(
             __version__,
         ]
         identity = hashlib.sha256("\n".join(key).encode()).hexdigest()
-        kept = _kept(out / PAIRS / f"{name}.json", identity)
+        kept = _kept(out, name, identity)
         if kept is None:
             pair = replay.pair(row, images[row])
             kept = {"identity": identity, "figures": pair.figures, "settings": pair.settings}
@@ -302,13 +302,17 @@ def _chosen(names: Sequence[str], options: PassportOptions) -> list[int]:
     ]
 
 
-def _kept(path: Path, identity: str) -> dict[str, Any] | None:
-    """Return what an earlier run left of a frame, or None if there is nothing or it was of something else."""
+def _kept(out: Path, name: str, identity: str) -> dict[str, Any] | None:
+    """Return what an earlier run left of a frame, or None if it was of something else, or if a part is no more."""
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        found = json.loads((out / PAIRS / f"{name}.json").read_text(encoding="utf-8"))
+        for which in ("real", "rendered"):
+            _written(out, name, which)
+    except (OSError, ValueError, InputError):
         return None
     if not isinstance(found, dict) or found.get("identity") != identity:
+        return None
+    if not all(isinstance(found.get(part), dict) for part in ("figures", "settings")):
         return None
     figures = {name: math.nan if value is None else value for name, value in found["figures"].items()}
     return {**found, "figures": figures}
