@@ -79,6 +79,7 @@ def test_frames_of_the_scene_itself_agree_with_it(result: tuple[dict[str, Any], 
     assert json.loads((out / "passport.json").read_text())["scene"] == "rosetta67p"
     page = (out / "passport.html").read_text(encoding="utf-8")
     assert "What may be concluded" in page
+    assert all(text in page for texts in found["conclusions"].values() for text in texts)
     assert page.count("<img") >= FRAMES
     assert "://" not in page  # nothing from elsewhere; pictures in base 64 have no colon
 
@@ -195,6 +196,30 @@ def test_distances_are_those_of_shifted_values() -> None:
     none = fit_passport.Statistic.of("sky", np.full(5, np.nan), np.arange(5.0))
     assert none.frames == 0
     assert np.isnan(none.distance)
+    same = fit_passport.Statistic.of("sky", np.full(5, 3.0), np.arange(5.0))
+    assert same.real_median == 3
+    assert np.isnan([same.distance, same.low, same.high]).all()
+
+
+@pytest.mark.parametrize(
+    ("distance", "high", "frames", "part", "sentence"),
+    [
+        (0.4, 0.5, 4, "may", "rendered as in the frames, W1/IQR 0.4; holds for thresholds on the sky"),
+        (0.4, 0.6, 4, "undecided", "too few frames to tell, W1/IQR 0.4, up to 0.6 within the interval"),
+        (0.6, 0.7, 4, "may_not", "7 in place of 5, W1/IQR 0.6; nothing that rests on thresholds on the sky"),
+        (0.1, 0.2, 3, "may_not", "nothing, since too few frames show it"),
+        (np.nan, np.nan, 9, "may_not", "nothing, since the frames do not differ"),
+    ],
+)
+def test_what_may_be_concluded_follows_from_the_whole_interval(
+    distance: float, high: float, frames: int, part: str, sentence: str
+) -> None:
+    one = fit_passport.Statistic(
+        name="sky", real_median=5, rendered_median=7, distance=distance, low=0.1, high=high, frames=frames
+    )
+    found = fit_passport.conclusions({"statistics": [vars(one)], "classifiers": {}, "part": "kept_back"})
+    assert [name for name, texts in found.items() if texts] == [part]
+    assert sentence in found[part][0]
 
 
 @pytest.mark.parametrize("f_number", [1.5, 1.0])

@@ -68,6 +68,8 @@ def passport(
         result = compare(frames, scene, out, options, overrides=overrides(settings), poses=poses, advance=advance)
     for text in result["conclusions"]["may"]:
         typer.echo(f"may: {text}")
+    for text in result["conclusions"]["undecided"]:
+        typer.echo(f"undecided: {text}")
     for text in result["conclusions"]["may_not"]:
         typer.echo(f"may not: {text}")
     typer.echo(f"page: {out / PAGE}")

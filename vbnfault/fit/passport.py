@@ -87,7 +87,10 @@ class Statistic:
 
     @classmethod
     def of(cls, name: str, real: NDArray[np.float64], rendered: NDArray[np.float64]) -> Statistic:
-        """Return the comparison of two values of each frame; the interval of 95 % is a bootstrap over frames."""
+        """Return the comparison of two values of each frame; the interval of 95 % is a bootstrap over frames.
+
+        Distance and interval are NaN where the middle half of the real values has no spread.
+        """
         known = np.isfinite(real) & np.isfinite(rendered)
         real, rendered = real[known], rendered[known]
         count = len(real)
@@ -101,23 +104,21 @@ class Statistic:
                 high=math.nan,
                 frames=count,
             )
-        drawn = np.random.default_rng(count).integers(0, count, (_RESAMPLES, count))
-        spread = _spread(real)
-        low, high = np.percentile([_distance(real[k], rendered[k], spread) for k in drawn], (2.5, 97.5))
+        distance = low = high = math.nan
+        spread = float(np.subtract(*np.percentile(real, (75, 25))))
+        if spread > 0:
+            drawn = np.random.default_rng(count).integers(0, count, (_RESAMPLES, count))
+            distance = _distance(real, rendered, spread)
+            low, high = np.percentile([_distance(real[k], rendered[k], spread) for k in drawn], (2.5, 97.5))
         return cls(
             name=name,
             real_median=float(np.median(real)),
             rendered_median=float(np.median(rendered)),
-            distance=_distance(real, rendered, spread),
+            distance=distance,
             low=float(low),
             high=float(high),
             frames=count,
         )
-
-
-def _spread(values: NDArray[np.float64]) -> float:
-    low, high = np.percentile(values, (25, 75))
-    return max(float(high - low), 1e-12)
 
 
 def _distance(real: NDArray[np.float64], rendered: NDArray[np.float64], spread: float) -> float:
@@ -262,16 +263,23 @@ def statistics(figures: Sequence[Mapping[str, float]]) -> list[Statistic]:
 
 
 def conclusions(result: Mapping[str, Any]) -> dict[str, list[str]]:
-    """Return sentences on what may and what may not be concluded from such images for this camera."""
+    """Return sentences on what may be concluded from such images, what is undecided, and what may not."""
     may: list[str] = []
     not_: list[str] = []
+    undecided: list[str] = []
     for one in result["statistics"]:
         what, _, rests = STATISTICS[one["name"]]
-        if not math.isfinite(one["distance"]):
+        if one["frames"] < FEWEST_FRAMES:
             not_.append(f"{what}: nothing, since too few frames show it")
-        elif one["high"] <= GOOD or one["distance"] <= GOOD:
-            sure = "" if one["high"] <= GOOD else f" (up to {one['high']:.2g} within the interval)"
-            may.append(f"{what}: rendered as in the frames, W1/IQR {one['distance']:.2g}{sure}; holds for {rests}")
+        elif not math.isfinite(one["distance"]):
+            not_.append(f"{what}: nothing, since the frames do not differ")
+        elif one["high"] <= GOOD:
+            may.append(f"{what}: rendered as in the frames, W1/IQR {one['distance']:.2g}; holds for {rests}")
+        elif one["distance"] <= GOOD:
+            undecided.append(
+                f"{what}: too few frames to tell, W1/IQR {one['distance']:.2g}, up to {one['high']:.2g} within the "
+                f"interval; would hold for {rests}"
+            )
         else:
             not_.append(
                 f"{what}: {number_text(one['rendered_median'])} in place of {number_text(one['real_median'])}, "
@@ -288,7 +296,7 @@ def conclusions(result: Mapping[str, Any]) -> dict[str, list[str]]:
             )
     if result["part"] != "kept_back":
         not_.append("frames on which settings were chosen flatter the scene; judge by the part kept_back")
-    return {"may": may, "may_not": not_}
+    return {"may": may, "undecided": undecided, "may_not": not_}
 
 
 def _chosen(names: Sequence[str], options: PassportOptions) -> list[int]:
