@@ -35,7 +35,7 @@ from ..core.errors import InputError
 from ..pipeline import Session
 from ..scene.config import Scene
 from ..scene.trajectory import FlownPose, Trajectory
-from .frames import F32, Look, compare, look, shift_between, shifted, similarity_between
+from .frames import F32, FEWEST_PX, Look, compare, look, shift_between, shifted, similarity_between
 
 _SEARCH_PX = 16  # largest shift, for frames of 512 px
 # A pixel of a halved frame also holds these fractions of the light of its neighbours: the first of each above and
@@ -50,6 +50,9 @@ _FEW_DARK = 0.25
 # search stops at the second, a relative error; it changes the light by the third at most, and renders at most the
 # fourth times.
 _SMEARED, _SAME_SMEAR, _MOST_LIGHT, _MOST_TRIES = 2.0, 0.02, 20.0, 8
+# A body is brighter than the darkest part by this many deviations of the noise. Medians of 25 pixels of noise alone
+# span three; those of Rosetta's frames span 29 and more.
+_LEAST_CONTRAST = 5.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -254,7 +257,9 @@ class Replay:
     def check(self, frame: F32) -> None:
         """Raise InputError for a frame of another size or without a lit body."""
         self.reduction(frame)
-        if not look(frame).lit.any():
+        smooth = ndimage.median_filter(frame, 5)  # tracks and stars are no body
+        faint = np.ptp(smooth) <= _LEAST_CONTRAST * np.std(frame - smooth)
+        if faint or look(frame).lit.sum() < FEWEST_PX:
             raise InputError("the frame shows no lit body")
 
     def reduction(self, frame: F32) -> int:
