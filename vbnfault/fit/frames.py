@@ -57,7 +57,7 @@ _SMEAR = 0.1  # of the brightness: columns whose sky differs by more are smeared
 _ALIGNED_SIGMA_PX = 1.5  # blur before the similarity is searched: finer texture is random
 _MOST_TURN_RAD, _MOST_SCALE = 0.035, 0.02  # errors of pose that are mended
 # These limits hold for the statistics of the body. Half of Rosetta's frames have ten pixels or fewer below 0.03
-FEWEST_PX, _DARK, _CLOSED_PX, _PROFILE_PX = 200, 0.05, 12, 8
+_FEWEST_PX, _DARK, _CLOSED_PX, _PROFILE_PX = 200, 0.05, 12, 8
 _PLATE_PX = 4.0
 _CLIPPED = 0.5  # of the sky at 0: such a frame tells nothing of its background
 
@@ -262,7 +262,7 @@ def body_figures(one: Look, sun_xy: NDArray[np.float64]) -> dict[str, float]:
     """Return the statistics of an image that are of the lit body, see the module."""
     lit, level = one.lit, one.level
     inside = ndimage.binary_erosion(lit, iterations=3)
-    if inside.sum() < FEWEST_PX:
+    if inside.sum() < _FEWEST_PX:
         names = ("noise_lit", "floor", "stretch", "spikes", "limb_rise", "edge_rise")
         return dict.fromkeys(names, float("nan"))
     fine = level - ndimage.uniform_filter(level, 3)
@@ -286,7 +286,7 @@ def _limb_rise_px(one: Look, sun_xy: NDArray[np.float64]) -> float:
     """Return over how many pixels the mean profile across the bright limb rises from 10 to 90 % of its plateau."""
     whole = ndimage.binary_fill_holes(one.lit)
     edge = _bright_limb(whole, sun_xy)
-    if edge.sum() < FEWEST_PX / 4:
+    if edge.sum() < _FEWEST_PX / 4:
         return float("nan")
     # pixels by their distance from the outline, negative outside, whose nearest outline is bright limb
     outer, nearest = ndimage.distance_transform_edt(
@@ -335,7 +335,7 @@ def compare(
 
 def _rank(a: NDArray[Any], b: NDArray[Any]) -> float:
     """Return Spearman's correlation, or NaN of too few pixels."""
-    return float(stats.spearmanr(a, b).statistic) if len(a) >= FEWEST_PX else float("nan")
+    return float(stats.spearmanr(a, b).statistic) if len(a) >= _FEWEST_PX else float("nan")
 
 
 def read_frame(folder: Path, name: str) -> F32:

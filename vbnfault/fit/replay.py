@@ -35,7 +35,7 @@ from ..core.errors import InputError
 from ..pipeline import Session
 from ..scene.config import Scene
 from ..scene.trajectory import FlownPose, Trajectory
-from .frames import F32, FEWEST_PX, Look, compare, look, shift_between, shifted, similarity_between
+from .frames import F32, Look, compare, look, shift_between, shifted, similarity_between
 
 _SEARCH_PX = 16  # largest shift, for frames of 512 px
 # A pixel of a halved frame also holds these fractions of the light of its neighbours: the first of each above and
@@ -259,7 +259,7 @@ class Replay:
         self.reduction(frame)
         smooth = ndimage.median_filter(frame, 5)  # tracks and stars are no body
         faint = np.ptp(smooth) <= _LEAST_CONTRAST * np.std(frame - smooth)
-        if faint or look(frame).lit.sum() < FEWEST_PX:
+        if faint or not look(frame).lit.any():
             raise InputError("the frame shows no lit body")
 
     def reduction(self, frame: F32) -> int:
