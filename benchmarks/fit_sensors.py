@@ -268,7 +268,8 @@ def compared(folder: Path, name: str, stretch: float) -> str:
             shown = look(display.developed(raw, factor))
             values = [sky_figures(one, real.lit) | body_figures(one, np.array([1.0, 0.0])) for one in (real, shown)]
             for key in ("noise", "column", "noise_lit"):
-                ratios[which][key].append(values[1][key] / values[0][key])
+                # columns of a frame whose levels are coarse may show nothing
+                ratios[which][key].append(values[1][key] / (values[0][key] or math.nan))
             away = ndimage.distance_transform_edt(~real.lit)
             for low, high in ((4, 6), (6, 8), (8, 10), (10, 14)):
                 part = (away > 5) & (smooth >= low) & (smooth < high)
