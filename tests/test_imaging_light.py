@@ -93,6 +93,8 @@ def test_a_uniform_field_shows_the_relative_illumination() -> None:
         np.testing.assert_allclose(image.array[band], expected, rtol=5e-4)
     assert image.array[1].min() < 0.5 * image.array[1].max()
     np.testing.assert_allclose(lens.on_frame(field).array, 3.0, rtol=1e-6)
+    with pytest.raises(ValueError, match="guard band"):
+        lens.image(Radiance(array=np.ones((3, 64, 96), np.float32), wavelength_nm=nodes))
 
 
 def test_a_stop_with_blades_counts_by_its_area() -> None:

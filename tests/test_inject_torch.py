@@ -36,7 +36,8 @@ def test_batches_of_a_training_loop_have_the_draws_of_their_numbers() -> None:
     with pytest.raises(InputError, match="must be uint8 or float32"):
         transform(batch[0], [0])
     assert transform(batch[:0], [])[1].shape == (0, 3, 48, 64)
-    with pytest.raises(InputError, match=r"5 images: numbers of shape \[2\] and 5 Suns; must be one"):
+    sentence = r"5 images: numbers of shape \[2\] and 5 Suns; must be one for each image"
+    with pytest.raises(InputError, match=sentence):
         transform(batch, [0, 1])
     with pytest.raises(InputError, match=r"^Inject: camera\.fov_degrees: unknown key \(did you mean fov_deg"):
         Inject(faults, camera={"fov_degrees": 3})

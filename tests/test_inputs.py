@@ -153,11 +153,19 @@ def test_odd_toml_is_refused_in_one_short_sentence(kind: str, text: str, tmp_pat
 
 
 OTHER_KINDS: dict[str, tuple[bytes, str]] = {
-    "a.SEQ": (b'RDM\nLEN NEW\nTITLE "x"\nS 50 3 N-BK7_SCHOTT\nGO\n', "a CODE V sequence file"),
-    "a.len": (b"\0\1binary\xff", "an OSLO or CODE V lens file"),
-    "a.zos": (b"PK\3\4", "an OpticStudio lens file"),
+    "a.seq": (b'RDM\nLEN NEW\nTITLE "x"\nS 50 3 N-BK7_SCHOTT\nGO\n', "a CODE V sequence file"),
+    "b.seq": (b'! from CODE V\nRDM;LEN "VERSION: 10"\n', "a CODE V sequence file"),
+    "no_suffix": (b'rdm; len "VERSION: 10"\n', "a CODE V sequence file"),
+    "a.len": (b'// OSLO 6.1\nLEN NEW "x" 50 4\nEBR 5\n', "an OSLO lens file"),
+    "b.len": (b"\0\1binary\xff", "an OSLO or CODE V lens file"),
+    "a.zar": (b"\xea\0\0\0", "a Zemax archive"),
+    "a.zos": (b"PK\3\4", "a ZIP archive"),
+    "a.otx": (b"BEGIN OPTIX\n", "an OpTaliX lens file"),
     "a.csv": (b"a,b\n1,2\n", "a CSV table"),
+    "named.toml": (b'{"a": 1}', "a JSON file"),
     "a.yml": (b"a: 1\n", "a YAML file"),
+    "a.txt": ("VERS 1 2\nMODE SEQ\n".encode("utf-16"), "a Zemax lens file"),
+    "a.tif": (b"II+\0", "an image"),
 }
 
 

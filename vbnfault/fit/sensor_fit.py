@@ -55,10 +55,10 @@ _SAME_LEVEL = 0.05  # largest relative difference of the means of two flats that
 # Relative scatter of light that is called constant, and the least variance over it: a few levels may scatter less
 _LAMP, _STEADIEST = 1e-3, 0.25
 _CLIPPED = 1e-4  # fraction of pixels at the largest number
-# Hot pixels that pile up within so many deviations of the brightest one, as it is where a well is full
+# A well counts as full where so many hot pixels lie within so many deviations of the brightest one
 _PILED, _PILE = 4, 4.0
 _DEAD, _HOT = 0.5, 8.0  # response below which a pixel is dead; deviations above which one is hot
-# Drift of the bias from frame to frame: assumed where darks show none, and where no exposure was repeated
+# The bias is taken to drift by so much from frame to frame where darks show none, and where no exposure is repeated
 _LEAST_DRIFT_DN, _UNSEEN_DRIFT_DN = 0.02, 0.5
 _ONE_TEMPERATURE_K = 1.0  # largest range of what counts as one temperature
 HOT_POWER = "individual.hot_growth.iso_power"

@@ -38,7 +38,7 @@ F32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 _LEAST_PX = 16
-# Keys of a device that make its pixels differ
+# These keys of a device make its pixels differ
 _PATTERNS = (
     *("prnu", "prnu_row", "prnu_column", "prnu_low", "dsnu_e", "dsnu_row_e", "dsnu_column_e", "dark_nonuniformity"),
     *("dose_TeV_g", "dead_fraction", "dead_fraction_yr", "stuck_fraction", "stuck_fraction_yr"),
@@ -254,11 +254,10 @@ class Injector:
         camera, assumed = self._camera(shape, camera, grey=grey)
         drawing = _Drawing(faults=self.faults, seed=self.scene.dataset.seed, index=index, state=state)
         picture = None
-        if isinstance(given, np.ndarray):
-            camera = _without_pattern(camera)
         if isinstance(given, Electrons | Radiance):
             light = given if isinstance(given, Electrons) else camera.expose(given, camera.exposure_s)
         else:
+            camera = _without_pattern(camera)
             as_raw = bool(self.scene.image and self.scene.image.raw) if raw is None else raw
             picture = self._picture(given, camera, drawing, raw=as_raw)
             assumed += picture.assumptions

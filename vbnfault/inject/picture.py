@@ -25,7 +25,8 @@ from .response import Response, read_table
 F32 = NDArray[np.float32]
 
 _COLOURS = ("R", "G", "B")
-# Steps towards the light that an image shows, and change of the last one, over white
+# The search for the light that an image shows takes so many steps at most, and ends with one that changes it by
+# less than this over white
 _STEPS, _NEAR = 8, 1e-4
 
 

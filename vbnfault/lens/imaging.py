@@ -455,6 +455,7 @@ class RealLens:
         Light whose position within pixels is known is imaged itself, as the Sun's disc is: resampling the pixels of
         a render changes the power of a point by up to 26 %.
         """
+        self._check(radiance)
         bands = tuple(radiance.wavelength_nm.tolist())
         tables, spreads = _tables(self, bands), _spreads(self, bands)
         array = np.empty((len(radiance.array), self.height_px, self.width_px), dtype=np.float32)
@@ -506,6 +507,7 @@ class RealLens:
 
         Only distortion and lateral colour act: no light is lost and nothing is blurred.
         """
+        self._check(radiance)
         bands, disc = tuple(radiance.wavelength_nm.tolist()), radiance.disc
         tables = _tables(self, bands)
         source, fine = radiance.array, radiance.fine
@@ -527,6 +529,13 @@ class RealLens:
         with ThreadPoolExecutor(2) as pool:
             array = np.stack(list(pool.map(frame_band, range(len(radiance.array)))))
         return replace(radiance, array=array, sun=None, disc=None, fine=None)
+
+    def _check(self, radiance: Radiance) -> None:
+        """Raise ValueError unless the radiance has the pixels of the frame and the guard band."""
+        gx, gy = self.guard_px
+        wanted = self.height_px + 2 * gy, self.width_px + 2 * gx
+        if radiance.array.shape[1:] != wanted:
+            raise ValueError(f"radiance of {radiance.array.shape[1:]} pixels: with its guard band it has {wanted}")
 
     @property
     def _most_px(self) -> float:

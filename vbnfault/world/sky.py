@@ -58,7 +58,7 @@ REACH_SIGMA = 5.0
 # Sirius, the brightest star, has V = -1.44. A limiting magnitude below this value shows no star.
 BRIGHTEST_V = -1.5
 
-# Colour of the star for which `limiting_magnitude` is computed: nearly that of the Sun, 0.65.
+# The star for which `limiting_magnitude` is computed has this colour, nearly that of the Sun, 0.65.
 LIMIT_BV = 0.6
 
 

@@ -109,7 +109,7 @@ def _colmap(text: str, camera: str) -> Calibration:
 
 
 def _yaml(text: str, camera: str) -> Calibration:
-    """Return the calibration of the first document of a YAML file, which tells by its keys whose it is."""
+    """Return the calibration of the first document of a YAML file, whose keys tell which program wrote it."""
     import yaml
 
     try:

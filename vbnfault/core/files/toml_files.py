@@ -17,8 +17,20 @@ from .user_files import read_input
 _DEEPEST_TABLE = 24
 # Half of a pair of UTF-16, which has no encoding in UTF-8.
 _NO_UNICODE = re.compile("[\ud800-\udfff]")
-# Kinds of files that users have in place of a TOML file.
-_OTHER_KINDS = {
+# Kinds of files that users have in place of a TOML file, by how they start and by suffix.
+_STARTS = {
+    r"(!.*\n\s*)*(RDM|LEN)\b(?! NEW \")": "a CODE V sequence file",
+    r"(//.*\n\s*)*LEN NEW \"": "an OSLO lens file",
+    r"VERS \d": "a Zemax lens file",
+    r"[{]": "a JSON file",
+    r"<": "an XML or HTML file",
+    r"(---|%YAML)\s": "a YAML file",
+    r"PK\x03\x04": "a ZIP archive",
+    r"\x1f\x8b": "a gzip archive",
+    r"\x89PNG|II\*\0|MM\0\*|II\+\0|MM\0\+|\xff\xd8\xff": "an image",
+    r"%PDF": "a PDF file",
+}
+_SUFFIXES = {
     ".seq": "a CODE V sequence file",
     ".len": "an OSLO or CODE V lens file",
     ".osl": "an OSLO lens file",
@@ -42,12 +54,19 @@ def read_toml(path: Path, what: str = "scene") -> dict[str, Any]:
     try:
         return parse_toml(data.decode("utf-8-sig"), str(path))
     except (UnicodeDecodeError, InputError) as error:
-        if kind := _OTHER_KINDS.get(path.suffix.lower()):
+        if kind := _other_kind(path, data):
             takes = "a TOML file or a Zemax lens file (.zmx)" if what == "lens" else "a TOML file"
             raise InputError(f"{path}: is {kind}, which is not read; a {what} is {takes}") from None
         if isinstance(error, UnicodeDecodeError):
             raise InputError(f"{path}: not a TOML file: {error.reason} at byte {error.start}") from None
         raise
+
+
+def _other_kind(path: Path, data: bytes) -> str | None:
+    """Return what a file that is no TOML is, by its first bytes or else by its suffix; None if neither says."""
+    start = data[:512].decode("utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "latin-1", "ignore").lstrip()
+    by_start = (kind for pattern, kind in _STARTS.items() if re.match(pattern, start, re.IGNORECASE))
+    return next(by_start, None) or _SUFFIXES.get(path.suffix.lower())
 
 
 def parse_toml(text: str, source: str) -> dict[str, Any]:
