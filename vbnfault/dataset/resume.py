@@ -91,13 +91,13 @@ def check_same_scene(
     if differing:
         raise InputError(
             f"{store.path}: holds another dataset: {_named(differing, 'in the store', 'now')}; "
-            f"choose another --out, or --overwrite to replace it"
+            "choose another --out, or delete it (`vbnfault build --overwrite` does)"
         )
     blocks_of_store = blocks_of(store)
     if blocks[: len(blocks_of_store)] != blocks_of_store:
         raise InputError(
             f"{store.path}: holds blocks of {_sum_text(blocks_of_store)} samples, not {_sum_text(blocks)}; "
-            f"choose another --out, or --overwrite to replace it"
+            "choose another --out, or delete it (`vbnfault build --overwrite` does)"
         )
 
 
