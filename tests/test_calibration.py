@@ -13,6 +13,7 @@ from calibrations_kit import SIX, opencv_pixels
 from vbnfault.core.calibration import EXACT, Calibration
 from vbnfault.core.errors import InputError
 from vbnfault.core.sundisc import Pinhole
+from vbnfault.lens.thin import natural_falloff
 
 FRAME = {"width_px": 1024, "height_px": 768}
 PLAIN: dict[str, Any] = {**FRAME, "fx": 900.0, "fy": 905.0, "cx": 520.3, "cy": 371.2}
@@ -129,6 +130,29 @@ def test_the_named_radius_is_where_the_polynomial_turns() -> None:
     turn_px = 900 * 2 / 3 * np.sqrt(1 / 1.8)
     with pytest.raises(InputError, match=f"folds back {turn_px:.0f}"):
         calibration.checked()
+
+
+def test_a_frame_that_ends_before_the_fold_on_each_side_is_taken() -> None:
+    """Tangential terms move the fold away on one side, and the farthest corner lies there."""
+    fields: dict[str, Any] = {"width_px": 128, "height_px": 96, "cx": 64, "cy": 60}
+    fields["coefficients"] = (-0.3, 0, -0.004, 0.002)
+    calibration = Calibration(**fields, fx=126, fy=126).checked()
+    xy = np.array([[0.0, 0.0], [128, 0], [0, 96], [128, 96]])
+    np.testing.assert_allclose(opencv_pixels(calibration, calibration.directions_of(xy)), xy, atol=1e-6)
+    with pytest.raises(InputError, match="folds back"):
+        Calibration(**fields, fx=124, fy=124).checked()
+
+
+def test_beyond_an_image_circle_each_pixel_still_has_a_direction() -> None:
+    """A rational polynomial, beyond whose pole no slope lies in many pixels; the circle is far within."""
+    coefficients = (0.5, 0.1, 1e-3, -7e-4, 0.002, 0.85, 0.2, 0.01)
+    circle = Calibration(
+        width_px=96, height_px=80, fx=20, fy=20, cx=48, cy=40, coefficients=coefficients, circle_deg=120
+    ).checked()
+    seen = circle.directions_at(np.arange(96) + 0.5, np.arange(80) + 0.5)
+    assert np.isfinite(seen).all()
+    assert np.isfinite(natural_falloff(circle, (80, 96), 20.0)).all()
+    assert circle.field_deg == pytest.approx(60)
 
 
 @pytest.mark.parametrize(
@@ -342,6 +366,11 @@ KNOWN = "must be a camera_info YAML of ROS"
         (COLMAP, {"camera": "4"}, "camera 4: model 'FOV': must be one of SIMPLE_PINHOLE"),
         (COLMAP.replace(" -0.0007", ""), {"camera": "1"}, "the parameters of OPENCV: has 7; must be 8 numbers"),
         (YAML_1_0.replace("camera_matrix", "matrix"), {}, "has no camera_matrix; it has: image_width"),
+        (
+            YAML_1_0.replace("distortion_coefficients", "lens_terms"),
+            {},
+            "has no distortion_coefficients; it has: image_width, image_height, camera_matrix, lens_terms",
+        ),
         ("%YAML:1.0\n---\na: [1,", {}, f"cannot be read as a FileStorage of OpenCV; {KNOWN}"),
         ("<?xml version='1.0'?><opencv_storage><K>5</K></opencv_storage>", {}, "K: must be a matrix of numbers"),
         ("<?xml version='1.0'?><svg/>", {}, f"cannot be read as a FileStorage of OpenCV; {KNOWN}"),

@@ -274,6 +274,8 @@ class Calibration:
             return np.concatenate([across, np.cos(theta)[..., None]], axis=-1)
         p = _by(np.linalg.inv(self._tilt), p)
         slopes = self._curve.value(p) if self.model == "undistorting" else self._curve.inverse(p)
+        if self.circle_deg is not None:  # beyond an image circle, any direction does
+            slopes = np.where(np.isfinite(slopes), slopes, _FARTHEST_SLOPE)
         vectors = np.concatenate([slopes, np.ones_like(slopes[..., :1])], axis=-1)
         return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
 
@@ -337,7 +339,7 @@ class Calibration:
     def checked(self) -> Calibration:
         """Return the calibration itself. Raises InputError if its polynomial folds back inside the lit frame."""
         border, reached = self._border_px(), self._reached
-        height, end = self._heights(border), "its corner"
+        edge, end = border, "its corner"
         if self.circle_deg is not None:
             turn = np.linspace(0, 2 * np.pi, 4 * _BORDER)
             angle = np.full(len(turn), np.radians(self.circle_deg / 2))
@@ -345,16 +347,16 @@ class Calibration:
             around = self.pixel_of(rim)
             if not np.isfinite(around).all():
                 raise InputError(f"circle_deg = {self.circle_deg:g}: must be below 180 for the model {self.model}")
-            if self._heights(around).max() < height.max():
+            if self._heights(around).max() < self._heights(border).max():
                 inside = ((around >= 0) & (around <= (self.width_px, self.height_px))).all(axis=-1)
-                border, height, end = around[inside], self._heights(around), "the rim of its image circle"
-        if height.max() >= reached:
+                border, edge, end = around[inside], around, "the rim of its image circle"
+        if not self._holds_at(edge).all():
             turns = "reaches 180 deg from the boresight" if self._holds_to_deg >= 180 else "folds back"
             raise InputError(
                 f"the {self.model} polynomial {turns} {reached * self.focal_length_px:.1f} px from the "
                 f"principal point, which is inside the frame: {end} lies "
-                f"{height.max() * self.focal_length_px:.1f} px away; give a calibration that holds up to there, or "
-                "circle_deg, beyond which the frame is dark"
+                f"{self._heights(edge).max() * self.focal_length_px:.1f} px away; give a calibration that holds "
+                "up to there, or circle_deg, beyond which the frame is dark"
             )
         if not len(border):
             return self
@@ -379,6 +381,16 @@ class Calibration:
         p = self._on_plane(xy)
         p = p if self.model == "fisheye" else _by(np.linalg.inv(self._tilt), p)
         return np.hypot(p[..., 0], p[..., 1])
+
+    def _holds_at(self, xy: F64) -> NDArray[np.bool_]:
+        """Return whether the polynomial holds at positions float64[n, 2], bool[n].
+
+        With tangential terms it folds at another distance on each side of the principal point.
+        """
+        if self.model != "opencv":
+            return np.asarray(self._heights(xy) < self._reached)
+        q = self._curve.inverse(_by(np.linalg.inv(self._tilt), self._on_plane(xy)))
+        return np.asarray(np.hypot(q[..., 0], q[..., 1]) < self._curve.end)
 
     @cached_property
     def _reached(self) -> float:

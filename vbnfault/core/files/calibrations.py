@@ -40,8 +40,18 @@ _COLMAP: dict[str, tuple[str, tuple[str, ...]]] = {
     "OPENCV_FISHEYE": ("fisheye", (*_DOUBLE, *COEFFICIENTS["fisheye"])),
 }
 # Names that programs give to what an OpenCV file holds, without case and underscores.
-_MATRIX = ("cameramatrix", "k", "m", "intrinsics", "intrinsicmatrix", "cammatrix")
-_DISTORTION = ("distortioncoefficients", "distcoeffs", "distcoeff", "d", "distortion", "dist")
+_MATRIX = ("cameramatrix", "k", "m", "intrinsics", "intrinsicmatrix", "cammatrix", "mtx")
+_DISTORTION = (
+    "distortioncoefficients",
+    "distortioncoeffs",
+    "distcoefficients",
+    "distcoeffs",
+    "distcoeff",
+    "distcoefs",
+    "d",
+    "distortion",
+    "dist",
+)
 _OPENCV_LENGTHS = (0, 4, 5, 8, 12, 14)
 
 
@@ -193,18 +203,16 @@ def _opencv(text: str, camera: str, model: str, size_px: tuple[int, int] | None)
     except (cv2.error, SystemError, UnicodeDecodeError):
         raise InputError(f"cannot be read as a FileStorage of OpenCV; must be {KINDS}") from None
 
-    def named(names: Sequence[str]) -> tuple[str, Any] | None:
-        return next((nodes[n + camera.lower()] for n in names if n + camera.lower() in nodes), None)
-
-    found = named(_MATRIX)
-    if found is None:
+    def named(names: Sequence[str], key: str) -> tuple[str, NDArray[np.float64]]:
+        for name in names:
+            if name + camera.lower() in nodes:
+                return nodes[name + camera.lower()][0], _mat(*nodes[name + camera.lower()])
         more = f" of camera {camera!r}" if camera else ""
-        raise InputError(
-            f"has no camera_matrix{more}; it has: {', '.join(n for n, _ in nodes.values()) or 'nothing'}"
-        )
-    values = _of_matrix(_mat(*found), found[0])
-    found = named(_DISTORTION)
-    coefficients = () if found is None else tuple(_mat(*found).ravel().tolist())
+        raise InputError(f"has no {key}{more}; it has: {', '.join(n for n, _ in nodes.values()) or 'nothing'}")
+
+    key, matrix = named(_MATRIX, "camera_matrix")
+    values = _of_matrix(matrix, key)
+    coefficients = tuple(named(_DISTORTION, "distortion_coefficients")[1].ravel().tolist())
     size: Any = _opencv_size(nodes) if size_px is None else size_px
     flag = nodes.get("fisheyemodel")
     stated = "" if flag is None else ("fisheye" if flag[1].real() else "opencv")
