@@ -445,6 +445,11 @@ def test_a_preview_with_fewer_pixels_sees_the_same_field(tmp_path: Path) -> None
         ({"sense": "undistorting"}, {}, "sense = 'undistorting': must be distorting or undistorting with model"),
         ({"camera": "cam0"}, {}, "camera = 'cam0': chooses a camera of a file; needs file"),
         ({"file": "camera.yaml"}, {}, "fx: comes from the file; leave it or file out"),
+        (
+            {"file": "camera.yaml", "origin": "pixel_corner"},
+            {},
+            "origin: comes from the file; leave it or file out",
+        ),
     ],
 )
 def test_a_wrong_table_is_refused_in_one_sentence(

@@ -284,7 +284,14 @@ def test_files_of_four_programs_give_the_same_rays(tmp_path: Path) -> None:
     fisheye = Calibration(
         **{**PLAIN, "cx": 520.8, "cy": 371.7}, model="fisheye", coefficients=(0.02, -4e-3, 1e-3, -2e-4)
     )
-    for name, text, camera in (("i.yaml", ROS_MESSAGE, ""), ("k.yaml", KALIBR, "cam1"), ("c.txt", COLMAP, "3")):
+    whole_roi = ROS_MESSAGE.replace("height: 0, width: 0", "height: 768, width: 1024")
+    assert whole_roi != ROS_MESSAGE
+    for name, text, camera in (
+        ("i.yaml", ROS_MESSAGE, ""),
+        ("r.yaml", whole_roi, ""),
+        ("k.yaml", KALIBR, "cam1"),
+        ("c.txt", COLMAP, "3"),
+    ):
         assert Calibration.read(written(tmp_path, name, text), camera=camera) == fisheye, name
     assert Calibration.read(tmp_path / "cameras.txt", camera="2") == Calibration(
         **FRAME, fx=900, fy=900, cx=512, cy=384, coefficients=(-0.1,)
@@ -359,6 +366,7 @@ KNOWN = "must be a camera_info YAML of ROS"
         (ROS, {"size_px": (9, 9)}, "only an OpenCV file may leave them out"),
         (ROS_MESSAGE.replace("binning_x: 0", "binning_x: 2"), {}, "binning_x = 2: must be 0 or 1"),
         (ROS_MESSAGE.replace("x_offset: 0", "x_offset: 8"), {}, "roi: must be empty"),
+        (ROS, {"camera": "cam1"}, "camera = 'cam1': is not in the file; name one of navcam as camera"),
         (KALIBR, {}, "holds 2 cameras; name one of cam0, cam1 as camera"),
         (KALIBR, {"camera": "cam7"}, "camera = 'cam7': is not in the file; name one of cam0, cam1"),
         (KALIBR.replace("pinhole", "omni"), {"camera": "cam0"}, "camera_model = 'omni': must be pinhole"),

@@ -81,7 +81,7 @@ class CalibrationTable(Table):
     def _whole(self) -> CalibrationTable:
         given = self.model_fields_set
         if self.file:
-            for key in ("sense", *_POINT, "skew", *COEFFICIENTS["opencv"]):
+            for key in ("sense", "origin", *_POINT, "skew", *COEFFICIENTS["opencv"]):
                 if key in given and getattr(self, key) != type(self).model_fields[key].default:
                     raise ValueError(f"{key}: comes from the file; leave it or file out")
             if (self.width_px is None) != (self.height_px is None):

@@ -137,7 +137,7 @@ def _yaml(text: str, camera: str) -> Calibration:
     if cameras:
         return _kalibr(_chosen(cameras, camera))
     if {"camera_matrix", "k", "K"} & set(table):
-        return _ros(table)
+        return _ros(_chosen({str(table.get("camera_name", "camera")): table}, camera))
     raise InputError(f"is no calibration of a camera; must be {KINDS}")
 
 
@@ -172,14 +172,15 @@ def _ros(table: Mapping[str, Any]) -> Calibration:
     for name in ("binning_x", "binning_y"):
         if table.get(name, 0) not in (0, 1):
             raise InputError(f"{name} = {shown(table[name])}: must be 0 or 1, the size that was calibrated")
-    region = table.get("roi")
-    if isinstance(region, Mapping) and any(region.get(k) for k in ("x_offset", "y_offset", "width", "height")):
-        raise InputError("roi: must be empty, the whole image that was calibrated")
     key, kind = named("distortion_model")
     if kind not in tuple(_ROS):  # a tuple, since YAML may give a list, which has no hash
         raise InputError(f"{key} = {shown(kind)}: must be one of {', '.join(_ROS)}")
     model, counts = _ROS[kind]
     width, height = (named(f"image_{side}", side)[1] for side in ("width", "height"))
+    whole = {"x_offset": (0,), "y_offset": (0,), "width": (0, width), "height": (0, height)}
+    region = table.get("roi")
+    if isinstance(region, Mapping) and any(region.get(k, 0) not in sizes for k, sizes in whole.items()):
+        raise InputError("roi: must be empty, the whole image that was calibrated")
     key, matrix = named("camera_matrix", "k", "K")
     values = _of_matrix(np.array(_numbers(matrix, key, (9,))).reshape(3, 3), key)
     key, coefficients = named("distortion_coefficients", "d", "D")
