@@ -6,6 +6,7 @@ import re
 import tomllib
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -28,11 +29,14 @@ from vbnfault.core.calibration import Calibration
 from vbnfault.core.errors import InputError
 from vbnfault.core.quantities import BODY, SUN, Electrons, SunInView
 from vbnfault.core.sundisc import axes, pixel_sums, sunflower
+from vbnfault.detect.navigation_scores import view_of
+from vbnfault.detect.severity_labels import severity_level
 from vbnfault.detector import ThreeColourDetector
-from vbnfault.faults import FaultContext
+from vbnfault.faults import FaultContext, Levels, from_dict
 from vbnfault.faults.straylight import TextureStraylight, flare_centres_px
 from vbnfault.faults.straylight_lens import TracedStraylight
 from vbnfault.lens import Halo, RealLens, ThinLens, load_lens, scaled_to_field
+from vbnfault.output.sample_files import annotated
 from vbnfault.pipeline import simulate
 from vbnfault.render.description import View
 from vbnfault.scene import config
@@ -223,6 +227,21 @@ def test_flares_lie_on_the_line_from_the_sun_to_the_principal_point() -> None:
     np.testing.assert_allclose(centres[1], (60.0, 33.0))
 
 
+def test_the_annotated_line_passes_the_principal_point() -> None:
+    where = context(replace(SIX["brown"], cx=70.5, cy=30.5), (20.5, 60.5))
+    flares = {"flares": [{"index": 1, "position": 9.0, "radius": 0.01}], "centre_xy_px": [70.5, 30.5]}
+    black = np.zeros((*where.shape, 3), np.uint8)
+    frame: Any = SimpleNamespace(
+        spec=SimpleNamespace(faults=("straylight",)),
+        images=SimpleNamespace(image=SimpleNamespace(array=black)),
+        labels=SimpleNamespace(masks=[black[..., 0] > 0]),
+        drawn={"straylight": flares},
+        context=where,
+        camera=where.camera,
+    )
+    assert annotated(frame, "straylight")[30, 70].min() > 200
+
+
 def test_traced_straylight_turns_about_the_principal_point() -> None:
     """The same lens with its axis elsewhere in the frame makes the same light, moved with the axis."""
     middle = Calibration(width_px=96, height_px=80, fx=90.0, fy=90.0, cx=48.0, cy=40.0)
@@ -248,6 +267,25 @@ def test_traced_straylight_turns_about_the_principal_point() -> None:
     inner = light[0][7:, :86], light[1][:73, 10:96]
     # the rays that draw a ghost depend on the size of the frame, and so does the noise of its bright edges
     assert (np.abs(inner[1] - inner[0]) < 0.02 * inner[0]).mean() > 0.9
+
+
+def test_the_severity_of_vignetting_is_that_of_the_frame() -> None:
+    """A level sets the mean over the frame, and the drawn parameters give that level again."""
+    where, table = context(SIX["fisheye of 180"], (20.0, 60.0)), Levels().table
+    fault = from_dict("vignetting", {"model": "cos4", "severity": 4}, source="test")
+    params = {"model": "cos4", **fault.draw(where, np.random.default_rng(0))}
+    focal_px = where.camera.focal_length_px
+    assert severity_level("vignetting", params, where.shape, focal_px, table) == pytest.approx(4)
+
+
+def test_a_stored_skew_counts_where_navigation_projects() -> None:
+    calibration = SIX["fisheye"]
+    spec = SimpleNamespace(distortion_model="fisheye", distortion_valid_to_deg=None, skew_px=calibration.skew)
+    scalars = {"intrinsics": calibration.intrinsics, "distortion": np.array(calibration.coefficients)}
+    scalars |= {"camera_from_T": np.array([1.0, 0, 0, 0]), "camera_position_T_m": np.zeros(3)}
+    view = view_of(spec, {name: value[None] for name, value in scalars.items()}, 0, None)  # type: ignore[arg-type]
+    point = np.array([[0.3, 0.5, 1.0]])
+    np.testing.assert_allclose(view.project(point), opencv_pixels(calibration, point), atol=1e-9)
 
 
 def test_the_thin_lens_still_blurs(room: render.TerrainMesh) -> None:

@@ -116,6 +116,7 @@ def view_of(spec: StoreSpec, scalars: Mapping[str, NDArray[Any]], k: int, depth_
         distortion=scalars["distortion"][k],
         model=spec.distortion_model or "opencv",
         valid_to_deg=spec.distortion_valid_to_deg,
+        skew_px=spec.skew_px,
         camera_from_T=scalars["camera_from_T"][k],
         camera_position_T_m=scalars["camera_position_T_m"][k],
         depth_m=None if depth_m is None else np.where(np.isfinite(depth_m), depth_m, np.inf),

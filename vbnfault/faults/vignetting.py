@@ -48,7 +48,7 @@ class Cos4Vignetting(Fault):
         low=255.0,
         high=2.0,
         drawn=lambda params, shape, focal_length_px: (
-            params["on_axis_illuminance_dn"] * _mean_falloff(shape, focal_length_px)
+            params["on_axis_illuminance_dn"] * (params.get("mean_falloff") or _mean_falloff(shape, focal_length_px))
         ),
     )
     localised = False
@@ -67,15 +67,12 @@ class Cos4Vignetting(Fault):
     mask_loss: float = number(0.1, limits=(0, 1), doc="the mask holds the pixels that lose at least this fraction")
 
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
-        """Return E0, and the least loss of the pixels in the mask."""
+        """Return E0, the least loss of the pixels in the mask, and a calibrated frame's mean falloff."""
         e0 = self.on_axis_illuminance_dn.uniform(rng)
         if self.frame_illuminance_dn is not None:
-            mean = float(_falloff(context).mean(dtype=np.float64))
-            e0 = min(self.frame_illuminance_dn / mean, 255.0)
-        return {
-            "on_axis_illuminance_dn": e0,
-            "mask_loss": float(self.mask_loss),
-        }
+            e0 = min(self.frame_illuminance_dn / _mean(context), 255.0)
+        of_calibration = {} if context.camera.lens.calibration is None else {"mean_falloff": _mean(context)}
+        return {"on_axis_illuminance_dn": e0, "mask_loss": float(self.mask_loss), **of_calibration}
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
         """Return the expected electrons times the factor of each pixel."""
@@ -102,6 +99,11 @@ def _falloff(context: FaultContext) -> NDArray[np.float32]:
     """Return the falloff of the sample's thin lens, cos⁴θ without a calibration, float32[y, x]."""
     camera = context.camera
     return natural_falloff(camera.lens.calibration, context.shape, camera.focal_length_px)
+
+
+def _mean(context: FaultContext) -> float:
+    """Return the mean over the frame of the falloff of the sample's thin lens."""
+    return float(_falloff(context).mean(dtype=np.float64))
 
 
 @lru_cache(maxsize=2)

@@ -70,7 +70,7 @@ def write_frame(frame: Frame, folder: Path) -> list[Path]:
 def annotated(frame: Frame, fault: str) -> NDArray[np.uint8]:
     """Return the image with one fault class marked by the outline of its mask, uint8[y, x, 3] R, G, B.
 
-    For straylight, also draw the line from the Sun through the image centre, and the centre and radius of every
+    For straylight, also draw the line from the Sun through the principal point, and the centre and radius of every
     flare or bright ghost.
     """
     names = list(frame.spec.faults)
@@ -80,7 +80,7 @@ def annotated(frame: Frame, fault: str) -> NDArray[np.uint8]:
     params, sun = frame.drawn[fault], frame.context.sun_xy_px
     marks = _marks(params, sun, frame.camera.width_px, frame.camera.height_px)
     if marks and sun is not None:
-        centre = np.array([frame.camera.width_px / 2, frame.camera.height_px / 2])
+        centre = frame.camera.intrinsics[2:]
 
         def pixel(point: NDArray[np.float64]) -> tuple[int, int]:
             # pixel centres lie at +0.5 here and at 0 in OpenCV, which counts in 1/16 px with shift = 4

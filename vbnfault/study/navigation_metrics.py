@@ -175,10 +175,12 @@ def navigation_frame(
 
 def _view(camera: Camera, pose: Pose, truth: Truth) -> navigation.CameraView:
     """Return the camera model and the true pose. The ground's frame is L."""
+    calibration = camera.lens.calibration
     return navigation.CameraView(
         intrinsics=camera.intrinsics,
         distortion=camera.lens.distortion,
-        model="opencv" if camera.lens.calibration is None else camera.lens.calibration.model,
+        model="opencv" if calibration is None else calibration.model,
+        skew_px=0.0 if calibration is None else calibration.skew,
         valid_to_deg=camera.lens.distortion_valid_to_deg,
         camera_from_T=pose.L_from_C.T,
         camera_position_T_m=pose.position_L_m,
