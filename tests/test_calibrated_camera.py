@@ -641,14 +641,19 @@ def test_opencv_undistorts_the_image_to_that_of_the_plain_camera() -> None:
             assert np.hypot(*shift) < 0.03 if is_undone else np.hypot(*shift) > 0.5
 
 
-def test_a_body_smaller_than_a_pixel_is_where_opencv_projects_it() -> None:
-    """Its light and its class; the light is that of the same body before a rectilinear camera."""
-    calibration = SIX["fisheye"]
-    direction = calibration.directions_of([28.4, 55.7])
+@pytest.mark.parametrize(("name", "xy"), [("fisheye", (28.4, 55.7)), ("fisheye", (93.2, 71.4))])
+def test_a_body_smaller_than_a_pixel_is_where_opencv_projects_it(name: str, xy: tuple[float, float]) -> None:
+    """Its light and its class; the light is that of the same body before a rectilinear camera.
+
+    In the corner of the frame, the rectilinear camera would have it outside of a frame of this size.
+    """
+    calibration = SIX[name]
+    direction = calibration.directions_of(xy)
     far = ball(5.0, subdivisions=4, centre=POSITION_M + 3000 * L_FROM_C @ direction)
     light = sun(-L_FROM_C @ direction + 0.3 * L_FROM_C[:, 0])
     view = seen_by(calibration)
-    pinhole = replace(view, projection=None)
+    wide = np.array([0, 0, 300.0, 300.0]) + calibration.intrinsics
+    pinhole = replace(view, projection=None, intrinsics=wide, width_px=696, height_px=680)
     images = [render.radiance(far, scene(v, light)) for v in (view, pinhole)]
     assert images[0].fine is not None
     sums = [image.array[4].astype(float).sum() for image in images]

@@ -150,7 +150,11 @@ def close_up(surface: TerrainMesh, view: View, margin_m: float = 0.0) -> CloseUp
     image = np.stack([x / z * fx + cx, y / z * fy + cy])
     low, high = image.min(axis=1), image.max(axis=1)
     size = float((high - low).max())
-    if size > widest or (high < 0).any() or (low > (view.width_px, view.height_px)).any():
+    if size > widest:
+        return None
+    in_frame = view.pixel_map.pixel_of(np.stack([x, y, z], axis=-1))
+    least, most = in_frame.min(axis=0), in_frame.max(axis=0)
+    if (most < 0).any() or (least > (view.width_px, view.height_px)).any():
         return None
     per_px = int(2 ** np.floor(np.log2((_ACROSS - 2) / size)))
     first = (
@@ -175,7 +179,7 @@ def close_up(surface: TerrainMesh, view: View, margin_m: float = 0.0) -> CloseUp
         vehicle=surface,
         per_px=per_px,
         first=first,
-        size_px=size,
+        size_px=float((most - least).max()),
     )
 
 
