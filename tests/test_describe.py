@@ -31,6 +31,15 @@ def test_describe_counts_what_is_planned_by_class_stratum_and_split() -> None:
     assert not [line for line in lines if line.startswith("warning")]
 
 
+def test_a_pixel_of_a_fisheye_is_that_of_its_focal_length(tmp_path: Path) -> None:
+    path = tmp_path / "fisheye.toml"
+    path.write_text(
+        'title = "fisheye"\n[geometry]\nheight_m = [10, 100]\n[camera]\nwidth_px = 512\nheight_px = 512\n'
+        '[camera.calibration]\nmodel = "fisheye"\nfx = 160\ncx = 255.5\ncy = 255.5\n'
+    )
+    assert "straight down: 0.0625 to 0.625 m a pixel" in "\n".join(described(scene=str(path)))
+
+
 def test_describe_says_what_the_frame_shows() -> None:
     text = "\n".join(described("geometry.height_m=[10, 100]", "camera.fov_deg=90", "sun.distance_au=2"))
     # 90 degrees across: twice the height, over 512 pixels

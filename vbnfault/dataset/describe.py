@@ -143,12 +143,12 @@ def _geometry(session: Session) -> list[str]:
         return _aims(session, table.aim)
     low, high = geometry.height_m
     above = "the ground below the camera" if geometry.height_reference == "local_ground" else "the site"
-    across = 2 * np.tan(np.radians(camera.fov_deg) / 2)
+    across, pixel = 2 * np.tan(np.radians(camera.fov_deg) / 2), ground.pixel_rad(scene)
     # a pose is refused if a surface is closer than the clearance, so no camera is lower than the clearance
     nearest = max(low, min(geometry.clearance_m, high))
     lines = [
         f"heights: {low:g} to {high:g} m above {above}, x {_bounds(geometry.x_m)} m, y {_bounds(geometry.y_m)} m",
-        f"straight down: {_span(across * nearest / camera.width_px, across * high / camera.width_px)} m a pixel, "
+        f"straight down: {_span(pixel * nearest, pixel * high)} m a pixel, "
         f"footprint {_span(across * nearest, across * high)} m across",
         f"{sun}, date {scene.sun.julian_date:.1f} TDB",
     ]
