@@ -387,10 +387,12 @@ class Calibration:
 
         With tangential terms it folds at another distance on each side of the principal point.
         """
+        near = np.asarray(self._heights(xy) < self._reached)
         if self.model != "opencv":
-            return np.asarray(self._heights(xy) < self._reached)
+            return near
         q = self._curve.inverse(_by(np.linalg.inv(self._tilt), self._on_plane(xy)))
-        return np.asarray(np.hypot(q[..., 0], q[..., 1]) < self._curve.end)
+        radius = np.hypot(q[..., 0], q[..., 1])
+        return np.where(np.isnan(radius), near, radius < self._curve.end)
 
     @cached_property
     def _reached(self) -> float:
