@@ -31,14 +31,14 @@ def binned(sensor: Sensor, pixels: int) -> Sensor:
     The sum holds n² times the electrons, where n is `pixels`. A CCD adds charge before the output node, so read
     noise is that of one readout; a CMOS sensor adds numbers, so it is n times as large. Offsets that pixels have
     for themselves add in quadrature, and their relative gains average. A binned pixel is defective if one of its n²
-    pixels is. Rows and columns of the pattern and of the noise are averaged over n of them. The whole sensor has
-    1/n of the columns and rows. The converter's range is that of the sum; a gain that the file gives is divided by
-    n².
+    pixels is. Where numbers are added, patterns and noise of rows and columns are averaged over n of them. The
+    whole sensor has 1/n of the columns and rows. The converter's range is that of the sum; a gain that the file
+    gives is divided by n². Effects act on binned pixels as they say (`Effect.binned`).
     """
     if pixels == 1:
         return sensor
-    n, area = pixels, pixels**2
-    readouts = n if sensor.architecture == "cmos" else 1
+    n, tile = pixels, np.shape(sensor.pattern.tile)
+    adds_numbers = sensor.architecture == "cmos"
     return replace(
         sensor,
         name=f"{sensor.name}, {n} × {n} binned",
@@ -46,9 +46,10 @@ def binned(sensor: Sensor, pixels: int) -> Sensor:
         height_px=sensor.height_px // n,
         pixel_pitch_um=sensor.pixel_pitch_um * n,
         individual=_individual(sensor.individual, n),
-        readout=_readout(sensor.readout, area, readouts),
-        transfer=_transfer(sensor.transfer, n),
-        measured=sensor.measured and sensor.measured.binned(n, np.shape(sensor.pattern.tile)),
+        readout=_readout(sensor.readout, n, adds_numbers),
+        transfer=_transfer(sensor.transfer, n, adds_numbers),
+        effects=tuple(effect.binned(n, tile) for effect in sensor.effects),
+        measured=sensor.measured and sensor.measured.binned(n, tile),
     )
 
 
@@ -82,25 +83,26 @@ def _individual(spec: IndividualSpec, n: int) -> IndividualSpec:
     )
 
 
-def _readout(spec: ReadoutSpec, area: int, readouts: int) -> ReadoutSpec:
-    """Return the signal chain of the sum of `area` pixels, read `readouts`² times."""
-    in_electrons = (
-        "read_noise_e_rms",
-        "reset_noise_e_rms",
-        "row_pattern_e_rms",
-        "column_pattern_e_rms",
-        "row_noise_e_rms",
-        "banding_amplitude_e",
-    )
+def _readout(spec: ReadoutSpec, n: int, adds_numbers: bool) -> ReadoutSpec:
+    """Return the signal chain of the sum of n² pixels, read once or, where numbers are added, each for itself."""
+    factors = {
+        "read_noise_e_rms": n,
+        "reset_noise_e_rms": n,
+        # n lines, each n times
+        "row_pattern_e_rms": n**1.5,
+        "column_pattern_e_rms": n**1.5,
+        "row_noise_e_rms": n**1.5,
+        "banding_amplitude_e": n**2,
+    }
     return replace(
         spec,
-        full_well_e=spec.full_well_e * area,
-        gain_dn_per_e=None if spec.gain_dn_per_e is None else spec.gain_dn_per_e / area,
-        **{key: getattr(spec, key) * readouts for key in in_electrons},
+        full_well_e=spec.full_well_e * n**2,
+        gain_dn_per_e=None if spec.gain_dn_per_e is None else spec.gain_dn_per_e / n**2,
+        **{key: getattr(spec, key) * factor for key, factor in factors.items() if adds_numbers},
     )
 
 
-def _transfer(transfer: Transfer, n: int) -> Transfer:
+def _transfer(transfer: Transfer, n: int, adds_numbers: bool) -> Transfer:
     """Return the transfer of binned charge: n shifts, and n times the traps, for each binned pixel."""
 
     def traps(species: tuple[TrapSpecies, ...]) -> tuple[TrapSpecies, ...]:
@@ -114,6 +116,7 @@ def _transfer(transfer: Transfer, n: int) -> Transfer:
         row_transfer_s=transfer.row_transfer_s * n,
         row_clear_s=transfer.row_clear_s * n,
         pixel_transfer_s=transfer.pixel_transfer_s * n,
+        row_readout_s=transfer.row_readout_s * (n if adds_numbers else 1),
         parallel_traps=traps(transfer.parallel_traps),
         serial_traps=traps(transfer.serial_traps),
         cloud=cloud,

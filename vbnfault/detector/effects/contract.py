@@ -34,7 +34,7 @@ import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -167,6 +167,10 @@ class Effect(Table):
 
     def check(self, sensor: Sensor) -> None:
         """Raise ValueError with one sentence if the effect does not fit the sensor."""
+
+    def binned(self, pixels: int, tile: tuple[int, ...]) -> Self:
+        """Return the effect on pixels of which each adds `pixels`² neighbours of one colour of a mosaic's tile."""
+        return self
 
     @abstractmethod
     def apply(self, signal: Any, exposure: Exposure) -> Any:

@@ -10,6 +10,7 @@ electron that is taken from this variance is too low.
 from __future__ import annotations
 
 from abc import ABC
+from typing import Self
 
 import cv2
 import numpy as np
@@ -29,6 +30,14 @@ class _Sharing(Effect, ABC):
     corner_fraction: float = Field(
         0.0, ge=0, le=0.12, description="fraction that each of the four pixels at the corners gets"
     )
+
+    def binned(self, pixels: int, tile: tuple[int, ...]) -> Self:
+        """Return what blocks of pixels share across their edges. With a mosaic, blocks of colours interlace."""
+        if max(tile) > 1:
+            return self
+        beside = pixels * self.beside_fraction + 2 * (pixels - 1) * self.corner_fraction
+        fractions = {"beside_fraction": beside, "corner_fraction": self.corner_fraction}
+        return self.model_copy(update={key: value / pixels**2 for key, value in fractions.items()})
 
     def apply(self, signal: F32, exposure: Exposure) -> F32:
         """Return the electrons that each pixel collects or shows."""

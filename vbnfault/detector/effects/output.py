@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
-from typing import Annotated
+from typing import Annotated, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,6 +52,10 @@ class Nonlinearity(Effect):
             if not (after[0] > before[0] and after[1] > before[1]):
                 raise ValueError(f"pair {k}, {list(after)}, must be above the pair before, {list(before)}")
         return table
+
+    def binned(self, pixels: int, tile: tuple[int, ...]) -> Self:
+        """Return the table of the sum of pixels that each respond by this one."""
+        return self.model_copy(update={"table": tuple((a * pixels**2, b * pixels**2) for a, b in self.table)})
 
     def apply(self, signal: F32, exposure: Exposure) -> F32:
         """Return the electrons as which the charge reads."""
