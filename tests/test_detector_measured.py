@@ -138,6 +138,22 @@ def test_a_dark_frame_alone_is_taken_again_at_its_exposure(tmp_path: Path) -> No
     assert Device(sensor(tmp_path, defects=table), 1).raw(LIGHT, 0.1)[6, 5] == dark[6, 5]
 
 
+def test_noise_of_a_cool_sensor_makes_no_dark_current(tmp_path: Path) -> None:
+    """A mean dark signal far below the noise stays, and noise makes no hot pixel.
+
+    The mean of 3072 differences of two frames has a standard error of 0.1 DN, of which four are the tolerance.
+    """
+    rng = np.random.default_rng(4)
+    bias, dark = (rng.normal(mean, 4.0, SHAPE).astype(np.float32) for mean in (100.0, 100.5))
+    table = {"dark": write(tmp_path / "dark.tif", dark), "bias": write(tmp_path / "bias.tif", bias)}
+    made = sensor(tmp_path, defects=table | {"dark_exposure_s": DARK_S})
+    device = Device(made, 1)
+    mean_dn = device.dark_rate_e_s.mean() * DARK_S * made.readout.system_gain_dn_per_e
+    assert mean_dn == pytest.approx(0.5, abs=0.4)
+    assert device.dark_rate_e_s.min() >= 0
+    assert len(device.individual.hot) == 0
+
+
 def test_frames_may_be_of_another_gain(tmp_path: Path, frames: dict[str, Any]) -> None:
     """Twice the DN per electron: half of the electrons, half of the offsets and currents, the same responses."""
     own, other = (

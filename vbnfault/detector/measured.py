@@ -318,16 +318,22 @@ def _dark(signal_e: F32, offset_e: F32 | None, files: DefectFiles, least_e: floa
     """Return dark currents at the frame's temperature, those without the excess of hot pixels, and offsets.
 
     A pixel is hot if it is far above its neighbours, as a glow is not. Without a bias frame, all that a pixel shows
-    above black is dark current, and what it lacks is its offset. `least_e` is the least standard deviation, that of
+    above black is dark current, and what it lacks is its offset. With one, noise makes differences below 0, which
+    are no currents; the others are scaled to the mean of all. `least_e` is the least standard deviation, that of
     rounding.
     """
-    if offset_e is None:
-        offset_e = np.minimum(signal_e, 0)
     assert files.dark_exposure_s is not None
-    rate = np.maximum(signal_e - offset_e, 0) / np.float32(files.dark_exposure_s)
+    rate = (signal_e if offset_e is None else signal_e - offset_e) / np.float32(files.dark_exposure_s)
     around = cv2.medianBlur(rate, _AROUND_PX)
     spread = max(1.4826 * float(np.median(np.abs(rate - around))), least_e / files.dark_exposure_s)
-    return rate, np.where(rate - around > _OUTLIER * spread, around, rate), offset_e
+    hot = rate - around > _OUTLIER * spread
+    usual = np.where(hot, around, rate)
+    above = np.maximum(usual, 0)
+    if offset_e is None:
+        offset_e = np.minimum(signal_e, 0)
+    elif above.any():
+        above *= max(usual.mean(dtype=np.float64) / above.mean(dtype=np.float64), 0)
+    return np.where(hot, rate, above), above, offset_e
 
 
 def _responses(signal_e: F32, files: DefectFiles, sensor: Sensor) -> tuple[F32, NDArray[np.bool_]]:
