@@ -403,6 +403,19 @@ def test_tables_and_frames_that_do_not_fit_are_refused_in_a_sentence(
         Device(sensor(tmp_path, defects=table(origin_px=[60, 4])), 1, shape=(16, 20))
 
 
+@pytest.mark.parametrize(("nodes", "origin_px"), [(2, [8, 4]), (4, [22, 4])])
+def test_other_nodes_than_those_of_the_frames_read_no_window(
+    tmp_path: Path, frames: dict[str, Any], nodes: int, origin_px: list[int]
+) -> None:
+    """Two nodes halve columns alone."""
+    made = sensor(tmp_path, defects=frames | {"origin_px": origin_px}, readout={"nodes": nodes})
+    with pytest.raises(InputError, match=r"defects.origin_px = .*: readout.nodes = . halve a window of 20x16 px"):
+        MosaicDetector(sensor=made, width_px=20, height_px=16)
+    table = frames | {"origin_px": [22, 4 if nodes == 2 else 16]}
+    middle = sensor(tmp_path, defects=table, readout={"nodes": nodes})
+    MosaicDetector(sensor=middle, width_px=20, height_px=16)
+
+
 def minimal() -> dict[str, Any]:
     from sensor_file import completed
 

@@ -176,8 +176,12 @@ class Measured:
         at = self.origin_px and tuple(k // (n * t) * t for k, t in zip(self.origin_px, tile[::-1], strict=True))
         return self.changed(blocks, origin_px=at, description={**self.description, "binning": n})
 
-    def corner(self, shape: tuple[int, int], tile: tuple[int, ...]) -> tuple[int, int]:
-        """Return the column and row at which a window begins. Raises InputError where it is not on the sensor."""
+    def corner(self, shape: tuple[int, int], sensor: Sensor) -> tuple[int, int]:
+        """Return the column and row at which a window begins.
+
+        Raises InputError where it is not on the sensor, or other output nodes would read its pixels.
+        """
+        tile, nodes = np.shape(sensor.pattern.tile), sensor.readout.nodes
         height, width = self.kinds.shape
         x, y = self.origin_px or (
             (width - shape[1]) // 2 // tile[1] * tile[1],
@@ -188,11 +192,18 @@ class Measured:
                 f"defects.origin_px = {[x, y]}: a window of {shape[1]}x{shape[0]} px from there reaches beyond the "
                 f"{width}x{height} px that were measured"
             )
+        part = slice(y, y + shape[0]), slice(x, x + shape[1])
+        if (node_of((height, width), nodes)[part] != node_of(shape, nodes)).any():
+            raise InputError(
+                f"defects.origin_px = {[x, y]}: readout.nodes = {nodes} halve a window of {shape[1]}x{shape[0]} px "
+                f"from there at other pixels than the sensor of {width}x{height} px; it must lie in the middle "
+                f"and be less wide by a multiple of {2 * tile[1]} px and less high by one of {2 * tile[0]} px"
+            )
         return x, y
 
-    def window(self, shape: tuple[int, int], tile: tuple[int, ...]) -> Measured:
-        """Return what the pixels of a window show. Raises InputError where it reaches beyond the sensor."""
-        x, y = self.corner(shape, tile)
+    def window(self, shape: tuple[int, int], sensor: Sensor) -> Measured:
+        """Return what the pixels of a window show. Raises InputError as `corner` does."""
+        x, y = self.corner(shape, sensor)
         part = slice(y, y + shape[0]), slice(x, x + shape[1])
         return self.changed(lambda _, array: np.ascontiguousarray(array[part]))
 
@@ -432,7 +443,7 @@ def as_measured(drawn: Individual, sensor: Sensor) -> Individual:
     """Return a drawn device with what was measured in place of what was drawn, and with the listed bad pixels."""
     if sensor.measured is None:
         return drawn
-    maps = sensor.measured.window(drawn.shape, np.shape(sensor.pattern.tile))
+    maps = sensor.measured.window(drawn.shape, sensor)
     at: dict[str, dict[str, Any]] = {}
     for kind, bit in _BITS.items():
         row, column = (k.astype(np.int32) for k in np.nonzero(maps.kinds & bit))

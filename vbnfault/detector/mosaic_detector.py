@@ -52,7 +52,7 @@ class MosaicDetector(Detector):
                     f"{key} = {getattr(self, key)}: {sensor.name} has {getattr(sensor, key)}; must be at most that"
                 )
         if sensor.measured is not None:
-            sensor.measured.corner((self.height_px, self.width_px), np.shape(sensor.pattern.tile))
+            sensor.measured.corner((self.height_px, self.width_px), sensor)
 
     @property
     def name(self) -> str:
