@@ -416,6 +416,15 @@ def test_other_nodes_than_those_of_the_frames_read_no_window(
     MosaicDetector(sensor=middle, width_px=20, height_px=16)
 
 
+@pytest.mark.parametrize(("factor", "dn"), [(16, 500), (16, 484), (4, 2001)])
+def test_numbers_at_the_top_of_sixteen_bits_lose_powers_of_two_alone(tmp_path: Path, factor: int, dn: int) -> None:
+    """A frame of one number keeps it: 8000 of 16 bits are 500 of 12 bits, and not 1."""
+    frame = write(tmp_path / "bias.png", np.full(SHAPE, factor * dn, np.uint16))
+    made = sensor(tmp_path, defects={"bias": frame})
+    assert made.measured is not None
+    np.testing.assert_array_equal(made.measured.level, np.float32(dn) / np.float32(4095))
+
+
 def minimal() -> dict[str, Any]:
     from sensor_file import completed
 

@@ -308,7 +308,9 @@ def _frame(path: str, name: str, sensor: Sensor) -> tuple[F32, dict[str, float]]
     _check_size(image, where, (sensor.height_px, sensor.width_px))
     top_dn = sensor.readout.top_dn
     if image.dtype.kind == "u" and image.max() > top_dn:
-        image = image // max(int(np.gcd.reduce(np.unique(image))), 1)  # such as 12 bits at the top of 16
+        # such as 12 bits at the top of 16: a common factor of a few numbers is more than their step
+        factor = int(np.gcd.reduce(np.unique(image)))
+        image = image // min(factor & -factor, 2**16 // (top_dn + 1))
     if not 0 <= image.min() <= image.max() <= top_dn:
         raise InputError(
             f"{where}: holds numbers from {image.min():g} to {image.max():g}; must be from 0 to {top_dn}, the top "
