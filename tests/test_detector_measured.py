@@ -388,6 +388,7 @@ def test_tables_and_frames_that_do_not_fit_are_refused_in_a_sentence(
         (lists("x,y\nnan,2\n", "f.csv"), "row 1: x = 'nan': must be a whole number"),
         (lists("x,y\n3\n", "g.csv"), "row 1: y = '': must be a whole number"),
         (lists("x,y,kind\n1,2,ded\n", "h.csv"), r"row 1: kind = 'ded': must be one of dead, hot, stuck, rts \(did"),
+        (lists("x,y\n1,2,hot\n", "j.csv"), "row 1: has more values than the columns x, y"),
         ({"bad_pixels": tall}, "defects.bad_pixels = .*: is 48x64 px; must be 64x48"),
         (lists("x,y\n1,2\n", "i.csv") | {"bad_kind": "warm"}, "defects.bad_kind = 'warm': must be .*dead"),
     ]

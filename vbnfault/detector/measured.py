@@ -419,6 +419,8 @@ def _rows(path: str, shape: tuple[int, int]) -> list[tuple[int, int, str]]:
         raise InputError(f"has the columns {shown(list(names))}; must be x, y and, if any, kind")
     out = []
     for number, row in enumerate(table, 1):
+        if None in row:
+            raise InputError(f"row {number}: has more values than the columns {', '.join(names)}")
         at = [_pixel(row, number, key, size) for key, size in (("x", shape[1]), ("y", shape[0]))]
         kind = (row.get("kind") or "").strip()
         if kind not in ("", *_BITS):
