@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from vbnfault.core.quantities import READOUT_DIRECTIONS
-from vbnfault.detector import charge
+from vbnfault.detector import charge, load_sensor
+from vbnfault.detector.chain import Device
 from vbnfault.detector.charge import (
     ChargeCloud,
     TrapSpecies,
@@ -438,3 +440,17 @@ def test_waiting_charge_gathers_light() -> None:
     upside_down = parasitic_light(signal, 4e-3, sensitivity=1.0, row_period_s=1.0, direction="down")
     np.testing.assert_array_equal(upside_down[-1], signal[-1])
     assert (upside_down[0] > signal[0]).all()
+
+
+def test_four_nodes_read_a_global_shutter_from_both_ends() -> None:
+    """The last row that a node reads waits for half of the rows, as its other effects have it."""
+    sensor = load_sensor("generic_cmos")
+    sensor = replace(
+        sensor,
+        individual=replace(sensor.individual, prnu=0.0, dead_fraction=0.0),
+        readout=replace(sensor.readout, nodes=4),
+        transfer=replace(sensor.transfer, leak=1e-3, row_readout_s=1e-3),
+    )
+    light = Device(sensor, 1, shape=(8, 8)).light_e(np.full((8, 8), 1000, np.float32), 0.01)
+    waits_s = 1e-3 * np.array([0, 1, 2, 3, 3, 2, 1, 0])
+    np.testing.assert_allclose(light[:, 0], 1000 * (1 + 1e-3 * waits_s / 0.01), rtol=1e-6)

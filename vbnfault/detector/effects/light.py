@@ -53,15 +53,13 @@ class Smear(Effect):
                 partial(smear_interline, row_transfer_s=move.row_transfer_s, leak=move.leak),
             ),
             # only a global shutter stores charge; a rolling shutter reads each row at once
-            "cmos": (move.row_readout_s * move.leak * (sensor.shutter == "global"), None),
+            "cmos": (
+                move.row_readout_s * move.leak * (sensor.shutter == "global"),
+                partial(parasitic_light, sensitivity=move.leak, row_period_s=move.row_readout_s),
+            ),
         }
         weight, step = steps[sensor.architecture]
         if not weight or exposure_s <= 0:
             return signal
-        direction = exposure.device.direction
-        if step is None:
-            return parasitic_light(
-                signal, exposure_s, sensitivity=move.leak, row_period_s=move.row_readout_s, direction=direction
-            )
-        rate = signal * np.float32(1 / exposure_s)
-        return along_columns(sensor, direction, partial(step, exposure_s=exposure_s), rate)
+        light = signal if sensor.architecture == "cmos" else signal * np.float32(1 / exposure_s)
+        return along_columns(sensor, exposure.device.direction, partial(step, exposure_s=exposure_s), light)
