@@ -83,6 +83,13 @@ def test_a_perfect_monitor_has_no_delay_and_no_alarm() -> None:
     assert (found["false_alarms_per_hour"]["value"], found["flicker"]["value"]) == (0.0, 0.0)
 
 
+def test_the_median_of_all_classes_is_over_events_also_where_two_begin_in_one_frame() -> None:
+    """Delays of 0, 10, 0 and 2 s, of which two begin in the first frame of each sequence."""
+    said = [[1] * 12, [0, 0, 0, 0, 0, 1, 0, 1, 1, 1, 1, 1]]
+    found = time_figures(frames(said, [[1] * 12, [1] * 12]), CLASSES, 0)["all"]
+    assert (found["events"], found["delay_s_largest"], found["delay_s_median"]["value"]) == (4, 10.0, 1.0)
+
+
 def test_intervals_are_over_sequences() -> None:
     """One of two sequences has the event that is missed: resamples hold none, one or two of it."""
     injected = [[1] * 12, [0] * 12]

@@ -226,13 +226,14 @@ class Bootstrap:
         return Estimate(float(out[0]), np.asarray(out[1:]))
 
     def median(self, values: NDArray[Any]) -> Estimate:
-        """Return the median of the finite values, float[sample] with nan where a sample has none."""
+        """Return the median of the finite values, float[sample, ...], where nan stands for no value."""
         known = np.isfinite(values)
         if not known.any():
             return Estimate(float("nan"), np.full(RESAMPLES, np.nan))
         order = np.argsort(values[known], kind="stable")
         sorted_values = np.asarray(values[known][order], dtype=np.float64)
-        weight = np.concatenate([np.ones((1, len(order))), self._drawn[:, self.view[known][order]]])
+        view = self.view[np.nonzero(known)[0][order]]
+        weight = np.concatenate([np.ones((1, len(order))), self._drawn[:, view]])
         total = weight.cumsum(axis=1)
         # the mean of the lower and the upper median, which are one for an odd number
         low = np.argmax(total >= total[:, -1:] / 2, axis=1)

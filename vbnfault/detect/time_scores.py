@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..store import event_of
-from .scores import Bootstrap, Estimate, ratio
+from .scores import Bootstrap, Estimate
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -172,13 +172,10 @@ def _figures(counts: _Counts, hours: F64, bootstrap: Bootstrap) -> dict[str, Any
         return bootstrap.fraction(above.sum(axis=1), below.sum(axis=1) if below.ndim == 2 else below)
 
     known = counts.delay_s[counts.events & ~counts.missed]
-    # a sample has one value in a median over samples: of several events that begin in it, their mean
-    number = np.isfinite(counts.delay_s).sum(axis=1)
-    of_frame = ratio(np.nansum(counts.delay_s, axis=1), number)
     return {
         "events": int(counts.events.sum()),
         "missed_fraction": fraction(counts.missed, counts.events).plain(),
-        "delay_s_median": bootstrap.median(of_frame).plain(),
+        "delay_s_median": bootstrap.median(counts.delay_s).plain(),
         "delay_s_largest": float(known.max()) if len(known) else None,
         "false_alarms_per_hour": fraction(counts.alarms, hours).plain(),
         "flicker": fraction(counts.flips, counts.pairs).plain(),
