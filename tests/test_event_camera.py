@@ -340,6 +340,14 @@ def test_renders_are_as_far_apart_as_the_ground_moves(scene: Path) -> None:
         assert {10.0, 11.0, 12.0} <= set(flight.times_s.tolist())
 
 
+def test_rounded_times_do_not_lead_past_the_last_frame(tmp_path: Path) -> None:
+    """Of 25 Hz: 0.16 + 0.999 · (0.2 - 0.16) + 0.001 · (0.2 - 0.16) is more than 0.2."""
+    (tmp_path / "scene.toml").write_text(SCENE)
+    write_poses(tmp_path / "poses.csv", time_s=[0.0, 0.04, 0.12, 0.16, 0.2])
+    scene = vbnfault.load_scene(tmp_path / "scene.toml", {"event_camera.step_px": 16.0})
+    assert EventFlight(vbnfault.Session(scene), 1).times_s[-1] == 0.2
+
+
 def test_a_grey_camera_sends_events(scene: Path) -> None:
     changes = {"camera.detector": "rosetta_navcam", "event_camera.step_px": 8.0}
     flight = EventFlight(vbnfault.Session(vbnfault.load_scene(scene, changes)), 1)

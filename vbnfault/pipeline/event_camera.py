@@ -190,7 +190,8 @@ class EventFlight:
         towards = spec.camera.seen_directions[every, every]
         depth_m = render.truth(spec.terrain.surface, scene.view, scene.sun, directions=towards).depth_m
         ground = np.isfinite(depth_m)
-        here, later = self.course.pose(time_s), self.course.pose(time_s + step_s)
+        # rounding may lead past the last frame, where there is no attitude
+        here, later = (self.course.pose(min(t, self.course.time_s[-1])) for t in (time_s, time_s + step_s))
         approach_T_m = later.camera_position_T_m - here.camera_position_T_m
         if ground.any():
             towards = towards[ground]
