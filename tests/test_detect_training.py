@@ -404,6 +404,26 @@ def test_stores_are_mixed_evenly_and_resumed_anywhere(path: str, other: str) -> 
             assert all(torch.equal(ours[name].nan_to_num(), theirs[name].nan_to_num()) for name in theirs)
 
 
+def test_pixels_weigh_by_their_mean_fraction_also_of_full_masks_and_of_stores_without_any(tmp_path: Path) -> None:
+    """One store marks all pixels with the first class and a quarter with the second, one neither in any pixel."""
+    stores = []
+    for name, first, second in (("full", True, np.arange(SIZE + 8) < (SIZE + 8) // 4), ("none", False, False)):
+        stores.append(made(tmp_path / name, samples=6))
+        spec = st.open_store(stores[-1]).spec
+        samples = [fake_sample(spec, i) for i in range(6)]
+        for sample in samples:
+            sample.layers["mask"][:] = 0
+            sample.layers["mask"][0], sample.layers["mask"][1] = first, second
+        shutil.rmtree(stores[-1])
+        st.write_samples(st.create(stores[-1], spec, 6), samples)
+    classes = FAULTS[:2]
+    alone, both = (
+        TrainingData(of, classes, "footprint", None, 2, 0).pixel_weights() for of in (stores[:1], stores)
+    )
+    assert alone.tolist() == pytest.approx([1, math.sqrt(3)])
+    assert both.tolist() == pytest.approx([1, math.sqrt(7)])
+
+
 def test_the_loss_is_its_formula(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two classes in one image of four pixels, by hand; the second class is absent, so it has no Dice term."""
     p = np.array([[0.8, 0.6, 0.3, 0.1], [0.2, 0.2, 0.2, 0.2]])

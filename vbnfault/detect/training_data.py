@@ -253,11 +253,10 @@ class TrainingData:
         The square root lies between no balance, with which thin lines are not marked for long, and the whole ratio,
         with which neighbourhoods are marked. All stores count by their images.
         """
-        odds = torch.stack([1 / data.pixel_weights(_COUNTED) for data in self.train])
-        inside = (odds / (1 + odds) * torch.tensor([len(data) for data in self.train])[:, None]).sum(
-            0
-        ) / self.images
-        return ((1 - inside) / inside.clamp(min=1e-9)).sqrt().clamp(1, _MOST_WEIGHT)
+        counted = [inside / total for inside, total in (data.mask_pixels(_COUNTED) for data in self.train)]
+        inside = np.average(counted, axis=0, weights=[len(data) for data in self.train])
+        weight = np.sqrt((1 - inside) / np.maximum(inside, 1e-9)).clip(1, _MOST_WEIGHT)
+        return torch.from_numpy(weight.astype(np.float32))
 
     def identity(self) -> list[dict[str, Any]]:
         """Return for each store what it is called, what it is, and how many images of it are used.

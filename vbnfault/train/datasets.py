@@ -164,6 +164,11 @@ class SampleDataset(Dataset[Batch]):
         This is the `pos_weight` for the target `masks`, after `[:, None, None]`. `most`: number of samples that are
         read, evenly spaced over the chosen ones.
         """
+        inside, total = self.mask_pixels(most)
+        return _weights(inside, total - inside)
+
+    def mask_pixels(self, most: int) -> tuple[NDArray[np.int64], int]:
+        """Return pixels inside the masks of each class, int64[class], and all pixels, of `most` samples."""
         if type(most) is not int or most < 1:
             raise InputError(f"most = {shown(most)}: must be a whole number of at least 1")
         layer = next((t for t in ("mask", "mask_effect") if t in self.targets.layers), "")
@@ -177,7 +182,7 @@ class SampleDataset(Dataset[Batch]):
             masks = layers[layer].numpy()[0, self._class_indices()]
             inside += masks.sum(axis=(1, 2))
             total += masks[0].size
-        return _weights(inside, total - inside)
+        return inside, total
 
     def close(self) -> None:
         """End the threads that read; the next access starts them again."""
