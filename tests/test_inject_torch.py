@@ -35,6 +35,8 @@ def test_batches_of_a_training_loop_have_the_draws_of_their_numbers() -> None:
     assert (floats * 255 - images.float()).abs().max() <= 0.5 + 2 * 255 / CAMERA["full_well_e"]
     with pytest.raises(InputError, match="must be uint8 or float32"):
         transform(batch[0], [0])
+    with pytest.raises(InputError, match=r"on meta: must be uint8 or float32 .*, on the CPU"):
+        transform(batch.to("meta"), range(5))
     assert transform(batch[:0], [])[1].shape == (0, 3, 48, 64)
     sentence = r"5 images: numbers of shape \[2\] and 5 Suns; must be one for each image"
     with pytest.raises(InputError, match=sentence):
@@ -90,7 +92,12 @@ def test_a_batch_whose_images_show_no_sun_goes_on_without() -> None:
 
 @pytest.mark.parametrize(
     ("keys", "numbers", "sentence"),
-    [({"probability": "a"}, range(2), "probability = 'a'"), ({}, 5, "2 images: numbers of shape []")],
+    [
+        ({"probability": "a"}, range(2), "probability = 'a'"),
+        ({}, 5, "2 images: numbers of shape []"),
+        ({}, torch.tensor([0.1, 0.2]), "numbers: "),
+        ({}, [0.1, 0.2], "numbers: [0.1, 0.2]: must be whole numbers"),
+    ],
 )
 def test_mistakes_of_a_training_loop_are_named(keys: dict[str, Any], numbers: Any, sentence: str) -> None:
     with pytest.raises(InputError, match=re.escape(sentence)):

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch.utils.data import get_worker_info
 
-from ..core.errors import InputError
+from ..core.errors import InputError, shown
 from ..core.process import llvm
 from ..scene import keyed_random
 from ..scene.config import parse_scene
@@ -105,25 +105,29 @@ class Inject:
         Raises
         ------
         InputError
-            The tensor has another shape or data type, or the numbers are not one for each image.
+            The tensor has another shape, data type or device, or the numbers are not a whole one for each image.
         """
-        if images.ndim != 4 or images.shape[1] not in (1, 3) or images.dtype not in (torch.uint8, torch.float32):
+        known = images.dtype in (torch.uint8, torch.float32) and images.device.type == "cpu"
+        if images.ndim != 4 or images.shape[1] not in (1, 3) or not known:
             raise InputError(
-                f"images: {images.dtype} of shape {list(images.shape)}: must be uint8 or float32 of "
-                "[image, channel, y, x] with 1 or 3 channels"
+                f"images: {images.dtype} of shape {list(images.shape)} on {images.device}: must be uint8 or "
+                "float32 of [image, channel, y, x] with 1 or 3 channels, on the CPU"
             )
         if get_worker_info() is not None:
             llvm.use_one_thread()
         given = images.detach().contiguous().numpy()
         changed, masks = np.empty_like(given), np.empty((len(given), len(self.classes), *given.shape[2:]), bool)
         places = [self._sun] * len(given) if suns is None else [self._sun if s is None else s for s in suns]
-        if not np.shape(numbers) == (len(given),) == (len(places),):
+        keys = np.asarray(numbers.cpu() if isinstance(numbers, torch.Tensor) else numbers)
+        if not keys.shape == (len(given),) == (len(places),):
             raise InputError(
-                f"{len(given)} images: numbers of shape {list(np.shape(numbers))} and {len(places)} Suns; must be "
-                "one for each image"
+                f"{len(given)} images: numbers of shape {list(keys.shape)} and {len(places)} Suns; must be one for "
+                "each image"
             )
+        if keys.size and keys.dtype.kind not in "iuO":  # times of 0.1 s and 0.2 s would get one draw
+            raise InputError(f"numbers: {shown(keys.tolist())}: must be whole numbers")
         self.left_out = {}
-        for planes, out, mask, number, sun in zip(given, changed, masks, numbers, places, strict=True):
+        for planes, out, mask, number, sun in zip(given, changed, masks, keys, places, strict=True):
             result = self._injected(cv2.merge(list(planes)), int(number), sun)
             cv2.split(result.image, list(out))
             if given.dtype.kind == "f":
