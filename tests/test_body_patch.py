@@ -10,7 +10,18 @@ import pytest
 import trimesh
 from scipy import stats
 
-from vbnfault.body import Body, Patch, PatchSpec, Site, boulders, build_patch, choose_sites, load_body, refine
+from vbnfault.body import (
+    Body,
+    Patch,
+    PatchSpec,
+    Site,
+    boulders,
+    build_patch,
+    choose_sites,
+    load_body,
+    refine,
+    relief,
+)
 from vbnfault.body.boulders import PER_KM2, SizeLaw, scatter, smallest_at
 from vbnfault.body.shape import check_mesh
 from vbnfault.core.errors import InputError
@@ -123,6 +134,21 @@ def test_slope_and_elevation_all_over_the_body_are_those_of_its_gravity(body: Bo
     error = np.abs(airfall[chosen] - expected)
     assert np.median(error) < 6 / 30 + 9 / 300
     assert np.quantile(error, 0.95) < 2.5 * (6 / 30 + 9 / 300)
+
+
+def test_the_vertical_all_over_a_small_body_is_that_of_its_gravity() -> None:
+    ball = trimesh.creation.icosphere(subdivisions=4)
+    axes_m = np.array([267.0, 147.0, 104.0])
+    small = Body(name="s", vertices_m=ball.vertices * axes_m, faces=ball.faces, rotation_period_s=40_000.0)
+    near = choose_sites(small, 1, seed=5)[0]
+    points = small.vertices_m[::13]
+    up, elevation_m = relief._vertical(small, near, points - near.position_T_m)
+    gravity = small.effective_gravity(points)
+    sine = np.linalg.norm(np.cross(up, gravity), axis=1) / np.linalg.norm(gravity, axis=1)
+    assert np.degrees(np.arcsin(sine)).max() < 0.5
+    potential = small.gravity.evaluate(points).potential_m2_s2
+    potential += 0.5 * small.omega_rad_s**2 * np.sum(points[:, :2] ** 2, axis=1)
+    assert np.abs(elevation_m + potential / small.mean_gravity_m_s2).max() < 0.1
 
 
 def _smallest_angles(patch: Patch, radius_m: float) -> np.ndarray:

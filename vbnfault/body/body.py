@@ -123,13 +123,12 @@ class Body:
         """
         key = self.content_hash, self.density_kg_m3, self.rotation_period_s
         if key not in _places:
-            _places[key] = self._sampled()
+            chosen = np.unique(np.linspace(0, len(self.vertices_m) - 1, _PLACES).astype(int))
+            _places[key] = self.sampled(self.vertices_m[chosen])
         return _places[key]
 
-    def _sampled(self) -> Places:
-        """Return `places`, which takes a second or two."""
-        chosen = np.unique(np.linspace(0, len(self.vertices_m) - 1, _PLACES).astype(int))
-        position = self.vertices_m[chosen]
+    def sampled(self, position: Float64) -> Places:
+        """Return what `places` holds, of the given positions; 400 of them take a second or two."""
         field = self.gravity.evaluate(position)
         centrifugal = self.omega_rad_s**2 * position * np.array([1.0, 1.0, 0.0])
         potential = field.potential_m2_s2 + 0.5 * np.einsum("ni,ni->n", centrifugal, position)

@@ -56,10 +56,8 @@ _STRATA_M = ((9.0, 1.3), (3.1, 0.55), (1.1, 0.20))  # thickness of a layer, and 
 _DUST_LEAVES_DEG = (27.0, 40.0)  # dust lies on slopes below the first, and has slid off slopes above the second
 _BARE_DEG = (30.0, 44.0)  # slopes below the first are loose ground, slopes above the second consolidated
 _CLIFF_DEG = (38.0, 52.0)
-_GRAVITY_STEP_M = 250.0  # step of the differences that give the gradient of gravity
-# Gravity is linear up to half of this distance from the site and interpolated beyond it
-_GRAVITY_REACH_M, _GRAVITY_REACH = 1500.0, 0.33  # the smaller one counts; the second in mean radii of the body
 _GRAVITY_PLACES = 6  # nearest ones from which gravity is interpolated, with the one that has no weight
+_GRADIENT_PLACES = 9  # nearest ones, with the place itself, to which the gradient of gravity is fitted
 
 _STEEPEST = 1.5  # tangent of the relief's largest slope against the model
 _SLUMPS, _SLUMP_STEPS = 4, 25
@@ -243,46 +241,41 @@ def _unevenness(body: Body, noise: Octaves, slope_deg: Float32, strength: float)
 def _vertical(body: Body, site: Site, points: Float64) -> tuple[Float64, Float64]:
     """Return the unit vertical float64[n, 3] (T axes) and the elevation float64[n] in metres.
 
-    Near the site, gravity is linear: it follows from gravity and its gradient there. Far from it, gravity at places
-    all over the body is interpolated. Elevation is the effective potential divided by the body's mean gravity. It
-    hardly depends on the site, nor do the strata that follow it.
+    Gravity at `body.places`, all over the body, and at the site is interpolated. It is extrapolated by its gradient
+    at each of the nearest places, and potentials by both. The weights (Franke & Little in Franke 1982, Math. Comp.
+    38, 181) vanish for the place beyond them, so that nothing jumps. Elevation is the effective potential over the
+    body's mean gravity. It hardly depends on the site, nor do the strata that follow it.
     """
-    centre = site.position_T_m
-    steps = _GRAVITY_STEP_M * np.concatenate([np.eye(3), -np.eye(3)])
-    gravity = body.effective_gravity(np.concatenate([centre[None], centre + steps]))
-    gradient = (gravity[1:4] - gravity[4:7]) / (2 * _GRAVITY_STEP_M)
-    bend = np.einsum("ni,ij->nj", points, gradient)
-    at_site = float(body.gravity.evaluate(centre).potential_m2_s2[0])
-    at_site += 0.5 * body.omega_rad_s**2 * float(centre[0] ** 2 + centre[1] ** 2)
-    potential = at_site + np.einsum("ni,ni->n", points, gravity[0] + 0.5 * bend)
-    pull, elevation = gravity[0] + bend, -potential / body.mean_gravity_m_s2
-    reach_m = min(_GRAVITY_REACH_M, _GRAVITY_REACH * (body.volume_m3 / (4 / 3 * np.pi)) ** (1 / 3))
-    distance = np.sqrt(np.einsum("ni,ni->n", points, points))
-    far = distance > 0.5 * reach_m
-    there, height = _interpolated(body, points[far] + centre)
-    weight = smooth_step(0.5 * reach_m, reach_m, distance[far])
-    pull[far] += weight[:, None] * (there - pull[far])
-    elevation[far] += weight * (height - elevation[far])
-    return -pull / np.maximum(np.sqrt(np.einsum("ni,ni->n", pull, pull)), 1e-30)[:, None], elevation
-
-
-def _interpolated(body: Body, points_T_m: Float64) -> tuple[Float64, Float64]:
-    """Return gravity float64[n, 3] in m/s² and elevation float64[n] in m, interpolated from `body.places`.
-
-    Potentials are extrapolated by the gravity at each of the nearest places. The weights (Franke & Little in Franke
-    1982, Math. Comp. 38, 181) vanish for the place beyond them, so that nothing jumps.
-    """
-    place, gravity, level = body.places
+    place, gravity, level = (
+        np.concatenate(both) for both in zip(body.places, body.sampled(site.position_T_m[None]), strict=True)
+    )
+    gradient = _gradients(place, gravity)
+    points_T_m = points + site.position_T_m
     distance, near = cKDTree(place).query(points_T_m, k=min(_GRAVITY_PLACES, len(place)))
     distance = np.maximum(distance, 1e-3)
     weight = (1 / distance[:, :-1] - 1 / distance[:, -1:]) ** 2 + 1e-12 / distance[:, :-1] ** 2
     weight /= weight.sum(axis=1)[:, None]
-    pull, elevation = np.zeros_like(points_T_m), np.zeros(len(points_T_m))
+    pull, elevation = np.zeros_like(points), np.zeros(len(points))
     for k in range(weight.shape[1]):
         g, off = gravity[near[:, k]], points_T_m - place[near[:, k]]
-        pull += weight[:, k, None] * g
-        elevation += weight[:, k] * (level[near[:, k]] - np.einsum("ni,ni->n", g, off) / body.mean_gravity_m_s2)
-    return pull, elevation
+        bend = np.einsum("ni,nij->nj", off, gradient[near[:, k]])
+        rise = -np.einsum("ni,ni->n", g + 0.5 * bend, off) / body.mean_gravity_m_s2
+        pull += weight[:, k, None] * (g + bend)
+        elevation += weight[:, k] * (level[near[:, k]] + rise)
+    return -pull / np.maximum(np.sqrt(np.einsum("ni,ni->n", pull, pull)), 1e-30)[:, None], elevation
+
+
+def _gradients(place_m: Float64, gravity: Float64) -> Float64:
+    """Return the gradient of gravity at places of a surface, float64[n, 3, 3], in 1/s²: rows are directions.
+
+    It is fitted to the nearest places. They hardly tell the gradient across the surface, which a small term keeps
+    near 0.
+    """
+    distance, near = cKDTree(place_m).query(place_m, k=min(_GRADIENT_PLACES, len(place_m)))
+    off = (place_m[near] - place_m[:, None]) / distance[:, -1:, None]
+    change = (gravity[near] - gravity[:, None]) / distance[:, -1:, None]
+    square = np.einsum("nki,nkj->nij", off, off) + 1e-3 * np.eye(3)
+    return np.asarray(np.linalg.solve(square, np.einsum("nki,nkj->nij", off, change)))
 
 
 def _slope_deg(points: Float64, normals: Float64, faces: Int32, up: Float64) -> Float32:
