@@ -190,6 +190,23 @@ def test_boulders_lie_all_around_a_small_body_and_have_two_albedos() -> None:
     assert np.abs(patch.dust).max() <= 1.5
 
 
+def test_boulders_are_as_long_as_their_diameters() -> None:
+    """What counts of boulders measure is their largest extent; 42 directions tell it within 6 %."""
+    body = small_body()
+    spec = PatchSpec(
+        seed=3, facet_m=8.0, radius_m=600.0, min_boulder_m=12.0, boulder_near_m=600.0, boulders_per_km2=720.0
+    )
+    patch = build_patch(body, choose_sites(body, 1, seed=3)[0], spec)
+    faces = patch.faces[patch.face_is_boulder]
+    label = trimesh.graph.connected_component_labels(trimesh.graph.face_adjacency(faces), node_count=len(faces))
+    order = np.unique(label, return_index=True)[1].argsort()
+    assert len(order) > 20
+    for number, diameter_m in zip(order, patch.boulder_diameter_m, strict=True):
+        corners = patch.vertices_L_m[np.unique(faces[label == number])]
+        longest_m = np.linalg.norm(corners[:, None] - corners, axis=2).max()
+        assert 0.99 * diameter_m < longest_m < 1.06 * diameter_m
+
+
 # --- presets ----------------------------------------------------------------------------------------------------
 
 

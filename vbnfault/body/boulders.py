@@ -36,6 +36,7 @@ _CLOSE_M, _CLOSEST = 50.0, 0.45
 # coarse ones are better than none.
 _COARSER, _COARSEST = (1.0, 1.2, 1.45, 1.75, 2.1), (2.6, 3.2, 4.0, 5.0)
 _FLAT_LEVELS = 2  # up to this level, triangles are the rock's fracture planes and are shaded flat
+_WIDTHS_LEVEL = 1  # sphere whose vertices are the directions in which a rock is measured, to 2 % of its width
 _RING = 12  # directions in which the ground around a rock is sampled
 _LOWEST_CORNERS = 8
 _CORNERS_AT_ONCE = 1 << 14  # of rocks that a thread cuts; the temporaries then fit the processor's cache
@@ -361,6 +362,7 @@ def _rocks(
         * np.column_stack([np.ones(count), rng.uniform(0.65, 0.95, count), rng.uniform(0.45, 0.80, count)])
     )
     rock = radius[:, :, None] * sphere * semi[:, None, :]
+    rock *= (diameter / _widest(rock))[:, None, None]
     normal = _ground_normal(position, normal, 0.5 * diameter, ground, tree)
     # The third axis, usually the shortest, lies near the ground's normal, so that rocks rest on their broad side.
     # The heading is random.
@@ -403,6 +405,15 @@ def _cut(sphere: Float64, planes: Float64, depth: Float64) -> Float64:
     with ThreadPoolExecutor(backend().dr.thread_count()) as pool:
         list(pool.map(cut, range(0, len(planes), step)))
     return radius
+
+
+def _widest(rock: Float64) -> Float64:
+    """Return the largest width of rocks float64[k, v, 3] about the origin, float64[k]."""
+    axes = _icosphere(_WIDTHS_LEVEL)[0]
+    width = np.zeros(len(rock))
+    for axis in axes[axes @ (1.0, 1e-3, 1e-6) > 0]:  # one of each two opposite ones
+        np.maximum(width, np.ptp(np.einsum("nvi,i->nv", rock, axis), axis=1), out=width)
+    return width
 
 
 def _nearest(ground: Float64, tree: cKDTree, position: Float64) -> Float64:
