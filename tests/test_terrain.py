@@ -14,6 +14,7 @@ from ground_kit import deviation_over_law, ground_of, raised_from_two_sites
 from vbnfault.body import Body, Patch, PatchSpec, Site, build_patch, choose_sites, load_body, relief
 from vbnfault.body.fields import GRADIENT_STD, Points
 from vbnfault.body.geometry import mean_edge_m, vertex_normals
+from vbnfault.body.noise import fractal_noise
 from vbnfault.body.roughness import Roughness, deviogram, model_roughness
 
 FINE = {"seed": 7, "facet_m": 0.5, "radius_m": 40.0, "min_boulder_m": 0.8, "max_triangles": 400_000}
@@ -103,6 +104,19 @@ def test_model_law_is_anchored_on_the_model(body: Body) -> None:
     assert law.deviation_m == pytest.approx(at, rel=1e-9)
     assert body.roughness == law
     assert float(Roughness(deviation_m=2.0, baseline_m=8.0, hurst=0.5).deviation_at(2.0)) == pytest.approx(1.0)
+
+
+def test_a_coarse_model_is_as_rough_as_the_body_that_it_samples() -> None:
+    """Roundness of a smooth ball is no roughness; 320 plates of a rough one tell that of 20,480 within a third."""
+    metres, law = np.array([1.0, 10.0, 100.0]), {}
+    wavelengths_m = 250.0 * 1.2 / 2.0 ** np.arange(6)
+    for level in (2, 5):
+        ball = trimesh.creation.icosphere(subdivisions=level)
+        smooth, normals = 250.0 * np.asarray(ball.vertices), np.asarray(ball.vertices)
+        assert model_roughness(smooth, ball.faces).deviation_at(1.0) < 1e-3
+        height = fractal_noise(smooth + 100.0, 7, wavelengths_m, 24.0 * (wavelengths_m / 300.0) ** 0.8)
+        law[level] = model_roughness(smooth + height[:, None] * normals, ball.faces).deviation_at(metres)
+    np.testing.assert_allclose(law[2], law[5], rtol=0.35)
 
 
 def test_terrain_continues_the_models_spectrum(body: Body, patches: list[Patch]) -> None:

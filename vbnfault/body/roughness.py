@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.sparse import linalg
 from scipy.spatial import cKDTree
 
-from .geometry import Float64, Int32, mean_edge_m, vertex_normals
+from .geometry import Float64, Int32, mean_edge_m, signed_volume, vertex_normals
 
 _FINE_M = 5.0
 _WINDOWS = 120  # neighbourhoods, spread evenly over the points
@@ -29,6 +29,11 @@ _FIT_EDGES = (1.3, 1.7, 2.2, 2.9, 3.8)
 # Natural surfaces have exponents of 0.3 to 1 (Shepard et al. 2001). Heights against a quadric can show exponents up
 # to 2: near the facets of a smoothed shape model, the measured exponent exceeds 1.
 _HURST_RANGE = (0.5, 1.0)
+# In models of larger edges, over the radius of a sphere of their volume, the quadric leaves some of their roundness
+_COARSE = 0.04
+# Of coarse models: longest baseline that tells the exponent, over the same radius, for deviations grow no more on
+# longer ones; and the exponent if fewer than two tell it
+_LONGEST_RADII, _ASSUMED_HURST = 0.35, 0.8
 # Least cosine between the normals of a vertex and of the window's centre; steeper vertices belong to another side.
 _FACING = 0.5
 
@@ -114,20 +119,39 @@ def model_roughness(vertices_m: Float64, faces: Int32) -> Roughness:
     """Return the law that continues a shape model below its facets.
 
     The law has the measured deviation at 1.3 mean edges. Its exponent is fitted over 1.3 to 3.8 mean edges and kept
-    within 0.5 to 1. The measurement takes about a second for 36,000 faces.
+    within 0.5 to 1. The measurement takes about a second for 36,000 faces. Of a coarse model, the deviation of an
+    ellipsoid with its axes and its vertices is taken away, squared: it is roundness and not roughness.
     """
-    baselines = mean_edge_m(vertices_m, faces) * np.array(_FIT_EDGES)
+    edge_m = mean_edge_m(vertices_m, faces)
+    baselines = edge_m * np.array(_FIT_EDGES)
     deviation = deviogram(vertices_m, vertex_normals(vertices_m, faces), baselines)
+    radius_m = np.cbrt(3 * signed_volume(vertices_m, faces) / (4 * np.pi))
+    coarse = edge_m > _COARSE * radius_m
+    if coarse:
+        round_m = _on_ellipsoid(vertices_m)
+        smooth = deviogram(round_m, vertex_normals(round_m, faces), baselines)
+        deviation = np.sqrt(np.maximum(deviation**2 - np.nan_to_num(smooth) ** 2, 0))
     used = np.isfinite(deviation) & (deviation > 0)
     if used.sum() < 2:
         return Roughness(deviation_m=0.0, baseline_m=float(baselines[0]), hurst=_HURST_RANGE[1])
     log_l, log_v = np.log(baselines[used]), np.log(deviation[used])
-    slope = float(np.sum((log_l - log_l.mean()) * log_v) / np.sum((log_l - log_l.mean()) ** 2))
+    slope, told = _ASSUMED_HURST, np.count_nonzero(baselines[used] < _LONGEST_RADII * radius_m)
+    if told > 1 or not coarse:
+        x, y = (of[:told] if coarse else of for of in (log_l, log_v))
+        slope = float(np.sum((x - x.mean()) * y) / np.sum((x - x.mean()) ** 2))
     return Roughness(
         deviation_m=float(np.exp(log_v[0])),
         baseline_m=float(np.exp(log_l[0])),
         hurst=float(np.clip(slope, *_HURST_RANGE)),
     )
+
+
+def _on_ellipsoid(vertices_m: Float64) -> Float64:
+    """Return the vertices moved along their radii to the ellipsoid of their covariance, float64[n, 3]."""
+    centre = vertices_m.mean(axis=0)
+    out = vertices_m - centre
+    radii = np.sqrt(np.einsum("ni,ij,nj->n", out, np.linalg.pinv(np.einsum("ni,nj->ij", out, out)), out))
+    return np.asarray(centre + out * (np.median(radii) / np.maximum(radii, 1e-9))[:, None])
 
 
 # --- models smoother than natural ground ------------------------------------------------------------------------
