@@ -257,6 +257,20 @@ def test_a_preset_refines_a_users_own_shape(tmp_path: Path) -> None:
     assert np.all(contrast == scene.patch.regolith.albedo_contrast)
 
 
+def test_craters_of_a_large_body_do_not_swallow_a_small_one() -> None:
+    """Craters of the Moon are up to 100 km wide: one of those turned this body inside out."""
+    tables = {
+        "title": "t",
+        "dataset": {"samples": 1, "sites": 1, "seed": 3},
+        "body": {"name": "mine", "shape": "ellipsoid", "semi_axes_m": [250.0, 240.0, 230.0], "relief_m": 4.0},
+        "patch": {"preset": "moon", "facet_m": 12.0, "radius_m": 1e3, "boulders": False, "max_triangles": 200_000},
+    }
+    _, patch = patch_of(config.parse_scene(tables, source="t.toml"))
+    centre = -patch.site.position_T_m @ patch.site.T_from_L
+    radius_m = np.linalg.norm(patch.vertices_L_m - centre, axis=1)
+    assert 150.0 < radius_m.min() < radius_m.max() < 300.0
+
+
 def test_many_craters_need_regolith() -> None:
     with pytest.raises(InputError, match=r"craters_per_km2 = 800: must be at most 600 without \[patch.regolith\]"):
         config.parse_scene({"title": "t", "patch": {"craters_per_km2": 800.0}}, source="t.toml")

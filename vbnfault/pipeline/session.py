@@ -319,12 +319,13 @@ class Session:
             near_m.append(table.radius_m)
         if table.regolith is not None:
             regolith = Regolith(**table.regolith.model_dump())
+            # none is wider than the mean radius: it would swallow the body
+            crater_m = boulder_m = float(np.cbrt(3 * self.body.volume_m3 / (4 * np.pi)))
             if self.scene.body.shape != "ellipsoid":  # larger ones are in the shape
                 edge_m = mean_edge_m(self.body.vertices_m, self.body.faces)
-                regolith = replace(
-                    regolith, largest_crater_m=min(regolith.largest_crater_m, _CRATER_EDGES * edge_m)
-                )
-                keys["largest_boulder_m"] = min(table.largest_boulder_m, _BOULDER_EDGES * edge_m)
+                crater_m, boulder_m = min(crater_m, _CRATER_EDGES * edge_m), min(boulder_m, _BOULDER_EDGES * edge_m)
+            regolith = replace(regolith, largest_crater_m=min(regolith.largest_crater_m, crater_m))
+            keys["largest_boulder_m"] = min(table.largest_boulder_m, boulder_m)
             keys["regolith"] = regolith
             near_m.append(table.radius_m)
         if detail is not None:

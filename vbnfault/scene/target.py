@@ -211,7 +211,7 @@ class RegolithTable(Table):
         300.0,
         ge=1,
         le=1e6,
-        description="larger ones belong to the shape; a shape file holds those of two of its edges or more",
+        description="larger ones belong to the shape: those beyond its mean radius, or two edges of a shape file",
     )
     simple_crater_m: float = Field(
         1e9, ge=1, le=1e9, description="larger craters are complex: shallower, with level floors and central peaks"
