@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import trimesh
 from conftest import small_scene
 from scipy import stats
 
@@ -112,3 +113,18 @@ def test_redrawn_samples_follow_the_conditional_distribution(resolved: tuple[Ses
     np.testing.assert_allclose(got_height - got_ground, planned, atol=1e-3)
     # and it is no longer the uniform law: low Suns are hidden
     assert stats.kstest(got_elevation, stats.uniform(-30, 60).cdf).pvalue < 1e-6
+
+
+def test_a_boulder_above_does_not_hide_that_a_ray_begins_below_the_ground() -> None:
+    ground = trimesh.creation.box((100.0, 100.0, 40.0))
+    boulder = trimesh.creation.box((4.0, 4.0, 4.0))
+    boulder.apply_translation([0.0, 0.0, -20.0])  # half-buried: z is down
+    both = trimesh.util.concatenate([ground, boulder])
+    faces = np.asarray(both.faces, dtype=np.int32)
+    surface = render.TerrainMesh(both.vertices.astype(np.float32), faces, np.ones(len(faces), dtype=bool))
+    up = np.array([0.0, 0.0, -1.0])
+    for height_m, first_m, is_outside in ((-10.0, 8.0, False), (-1.0, 1.0, False), (5.0, np.inf, True)):
+        distance_m, outside = render.first_ground(surface, np.array([0.3, 0.7, -20.0 - height_m]), up)
+        assert distance_m == pytest.approx(first_m, abs=1e-4)
+        assert outside is is_outside
+    assert render.first_ground(surface, np.array([0.3, 0.7, -30.0]), -up) == (pytest.approx(8.0, abs=1e-4), True)

@@ -19,6 +19,7 @@ F64 = NDArray[np.float64]
 _SUN_SAMPLES = 1024  # gives the area on one side of a straight edge within 0.3 % of the disc's area
 _FACETS = 1 << 16  # facets whose distance is computed at a time, to bound memory
 _GROUND_HITS = 4
+_MOST_CROSSINGS = 64  # of surfaces that a ray leaves or enters
 
 
 def ground_height_m(surface: TerrainMesh, x_m: F64, y_m: F64, start_height_m: float) -> F64:
@@ -83,7 +84,9 @@ def _distance_m(corners: F64) -> F64:
 
 
 def first_ground(surface: TerrainMesh, position_L_m: F64, direction_L: F64) -> tuple[float, bool]:
-    """Return the distance of the first surface on a ray, and whether the ray meets it from outside.
+    """Return the distance of the first surface on a ray, and whether the ray begins outside of all surfaces.
+
+    All surfaces on the ray count: from below the ground, the first may be the underside of a half-buried boulder.
 
     Parameters
     ----------
@@ -97,16 +100,23 @@ def first_ground(surface: TerrainMesh, position_L_m: F64, direction_L: F64) -> t
     tuple[float, bool]
         The distance in m, infinite without a surface, and False only if the ray begins below the ground.
     """
-    rays = mi.Ray3f(mi.Point3f(*columns(position_L_m[None])), mi.Vector3f(*columns(direction_L[None])))
-    (met,) = surface.trace(rays)
-    distance, facet, valid = met.t, met.prim_index, met.is_valid()
-    dr.eval(distance, facet, valid)
-    if not valid.numpy()[0]:
-        return float("inf"), True
-    # the facet's own normal: the interpolated one may face away where the ray grazes the ground
-    (corners,) = surface.corners_m(facet.numpy().astype(np.intp))
-    outward = np.cross(corners[1] - corners[0], corners[2] - corners[0])
-    return float(distance.numpy()[0]), bool(outward @ direction_L < 0)
+    first_m, travelled_m, left = float("inf"), 0.0, 0
+    for _ in range(_MOST_CROSSINGS):
+        origin = position_L_m + travelled_m * direction_L
+        rays = mi.Ray3f(mi.Point3f(*columns(origin[None])), mi.Vector3f(*columns(direction_L[None])))
+        (met,) = surface.trace(rays)
+        distance, facet, valid = met.t, met.prim_index, met.is_valid()
+        dr.eval(distance, facet, valid)
+        if not valid.numpy()[0]:
+            break
+        # the facet's own normal: the interpolated one may face away where the ray grazes the ground
+        (corners,) = surface.corners_m(facet.numpy().astype(np.intp))
+        outward = np.cross(corners[1] - corners[0], corners[2] - corners[0])
+        left += 1 if outward @ direction_L >= 0 else -1
+        travelled_m += float(distance.numpy()[0])
+        first_m = min(first_m, travelled_m)
+        travelled_m += max(1e-3, 1e-6 * float(np.abs(origin).max() + travelled_m))  # beyond float32's rounding
+    return first_m, left <= 0
 
 
 def first_hit_m(surface: TerrainMesh, origin_m: F64, direction: F64) -> F64:
