@@ -124,6 +124,11 @@ def test_a_polynomial_that_folds_inside_the_frame_names_its_radius(fields: Any, 
         Calibration(**{**PLAIN, **fields}).checked()
 
 
+def test_a_file_with_a_matrix_alone_is_of_a_rectified_camera(tmp_path: Path) -> None:
+    file = written(tmp_path, "rectified.yml", YAML_1_0.split("distortion_coefficients")[0])
+    assert not any(Calibration.read(file).coefficients)
+
+
 def test_the_named_radius_is_where_the_polynomial_turns() -> None:
     """x (1 + k1 x²) is greatest at x² = -1 / 3 k1, where it is 2x / 3. The map ends 1e-4 before."""
     calibration = Calibration(**{**PLAIN, "fy": 900.0}, coefficients=(-0.6,))

@@ -213,7 +213,9 @@ def _opencv(text: str, camera: str, model: str, size_px: tuple[int, int] | None)
 
     key, matrix = named(_MATRIX, "camera_matrix")
     values = _of_matrix(matrix, key)
-    coefficients = tuple(named(_DISTORTION, "distortion_coefficients")[1].ravel().tolist())
+    # a rectified camera has a matrix alone, but coefficients under a name of one's own must not be lost
+    alone = all(node.size() < 3 for name, node in nodes.values() if name != key)
+    coefficients = () if alone else tuple(named(_DISTORTION, "distortion_coefficients")[1].ravel().tolist())
     size: Any = _opencv_size(nodes) if size_px is None else size_px
     flag = nodes.get("fisheyemodel")
     stated = "" if flag is None else ("fisheye" if flag[1].real() else "opencv")
