@@ -295,7 +295,7 @@ _DIMENSIONLESS = """
     max_triangles max_tries max_views metering_delay_frames metering_level min_lit_fraction missing_codes n nadir
     nd neutral
     node_gains noise_fraction of_sunlight optical_depth ponds porosity_factor prnu prnu_column prnu_low prnu_row
-    quantum_efficiency_peak random random_jet_strength random_jets reflectance relief rts_per_interaction
+    quantum_efficiency_peak random random_jet_strength random_jets reflectance relief roughness rts_per_interaction
     rts_fraction rubble samples samples_per_pixel scarps seed sequences shadow_hiding_amplitude shadow_hiding_width
     shard_samples sharpen shutter_transmission single_scattering_albedo site sites size_power slope_parameter smooth
     strata strength stretch stuck_bits stuck_fraction

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 from scipy import ndimage
+from scipy.spatial import cKDTree
 
 from vbnfault.body import Body, Patch, PatchSpec, Regolith, build_patch, choose_sites, ellipsoid, fields, regolith
 from vbnfault.body.fields import Octaves, Points
@@ -255,6 +256,38 @@ def test_a_preset_refines_a_users_own_shape(tmp_path: Path) -> None:
     contrast = assemble.dust_contrast(session.scene)
     assert contrast is not None
     assert np.all(contrast == scene.patch.regolith.albedo_contrast)
+
+
+def test_a_smooth_shape_has_the_roughness_of_a_preset(tmp_path: Path) -> None:
+    """Points 10 m apart differ in height as the key says, which regions vary by some tens of per cent."""
+    path = tmp_path / "ball.obj"
+    trimesh.creation.icosphere(subdivisions=3, radius=250.0).export(path)
+    patch: dict[str, Any] = {"preset": "moon", "craters_per_km2": 0.0, "boulders": False, "relief": 1.0}
+    deviation = {}
+    for roughness in (0.0, 0.05):
+        patch |= {"facet_m": 2.0, "radius_m": 120.0, "max_triangles": 200_000, "roughness": roughness}
+        body = {"name": "mine", "shape": str(path), "unit": "m"}
+        _, ground = patch_of(
+            config.parse_scene(
+                {"title": "t", "dataset": {"sites": 1}, "body": body, "patch": patch}, source="t.toml"
+            )
+        )
+        near = ground.vertices_L_m[np.linalg.norm(ground.vertices_L_m, axis=1) < 120.0].astype(np.float64)
+        height_m = np.linalg.norm(near + ground.site.position_T_m @ ground.site.T_from_L, axis=1)
+        tree = cKDTree(near)
+        a, b = tree.query_pairs(10.5, output_type="ndarray").T
+        apart = np.linalg.norm(near[a] - near[b], axis=1) > 9.5
+        deviation[roughness] = np.sqrt(np.mean((height_m[a] - height_m[b])[apart] ** 2))
+    assert deviation[0.0] < 0.1 * deviation[0.05]
+    assert 0.5 * 0.5 < deviation[0.05] < 2.0 * 0.5
+
+
+@pytest.mark.parametrize("name", [name for name in BODIES if name != "67p"])
+def test_the_roughness_of_a_preset_is_that_of_the_packaged_shape(name: str) -> None:
+    session = Session(config.parse_scene({"title": "t", "body": {"name": name}}, source="t.toml"))
+    law, roughness = session.body.roughness, session.scene.patch.roughness
+    assert law.at_least(roughness) == law
+    assert law.at_least(1.05 * roughness) != law
 
 
 def test_craters_of_a_large_body_do_not_swallow_a_small_one() -> None:

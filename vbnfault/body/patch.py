@@ -118,7 +118,7 @@ def build_patch(body: Body, site: Site, spec: PatchSpec) -> Patch:
         (points, normals, faces),
         facet,
         spec,
-        roughness=law.with_hurst(spec.hurst),
+        roughness=law.at_least(spec.roughness).with_hurst(spec.hurst),
         longest_m=LONGEST_EDGES * edge,
     )
     place_T_m = points + site.position_T_m
@@ -169,7 +169,7 @@ def _with_scarps(body: Body, site: Site, model: Surface, limit: EdgeLimit, spec:
 
 PATCHES = ArrayFiles(kind="patch", content="terrain")
 _GROUND = ("fields", "noise", "relief", "fractured", "regolith", "roughness", "scarps")
-_SOURCES = (*_GROUND, "refine", "boulders", "patch", "gravity", "geometry")
+_SOURCES = (*_GROUND, "body", "refine", "boulders", "patch", "gravity", "geometry")
 _ARRAYS = tuple(name for name in Patch.__dataclass_fields__ if name != "site")
 
 

@@ -58,6 +58,13 @@ class Roughness:
         """
         return self if hurst is None else replace(self, hurst=hurst, fine_hurst=max(hurst, self.hurst))
 
+    def at_least(self, roughness: float) -> Roughness:
+        """Return the surface, or where it is smoother at its baseline, one of this deviation over any distance."""
+        least_m = roughness * self.baseline_m
+        if self.deviation_m >= least_m:
+            return self
+        return Roughness(deviation_m=least_m, baseline_m=self.baseline_m, hurst=1.0)
+
     def deviation_at(self, baseline_m: NDArray | float) -> Float64:
         """Return the RMS deviation in metres at baselines in metres."""
         length = np.asarray(baseline_m, dtype=np.float64)

@@ -102,6 +102,8 @@ class PatchSpec:
         left out.
     boulder_index, boulders_per_km2, craters_per_km2
         Exponent of the size law, boulders of 7 m or more, and pits and craters of 10 m or more.
+    roughness
+        Least deviation of heights over distance below the model's facets, where the model is smoother.
     hurst
         Exponent of the roughness below the model's facets; None: that measured on the model.
     scarps
@@ -135,6 +137,7 @@ class PatchSpec:
     boulder_index: float = INDEX
     boulders_per_km2: float = PER_KM2
     craters_per_km2: float = 60.0
+    roughness: float = 0.0
     hurst: float | None = None
     scarps: float = 0.0
     contour_scarps: float = 0.0

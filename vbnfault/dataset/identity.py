@@ -79,6 +79,7 @@ _LEFT_OUT_AT_DEFAULT = (
     "patch.largest_boulder_m",
     "patch.preset",
     "patch.regolith",
+    "patch.roughness",
     "plan.order",
     "plan.unusable_views",
     "sky.bodies",

@@ -279,7 +279,7 @@ class Session:
         """Return the renderer's copy of a patch, with relief finer than its facets and the scene's spacecraft."""
         from .. import render
 
-        law = self.body.roughness.with_hurst(self.scene.patch.hurst)
+        law = self.body.roughness.at_least(self.scene.patch.roughness).with_hurst(self.scene.patch.hurst)
         fine = render.FineRelief(
             slope=0.0,
             facet_m=patch.facet_m,

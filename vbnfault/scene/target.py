@@ -251,6 +251,12 @@ class PatchTable(Table):
         1_600_000, ge=10_000, le=20_000_000, description="facets are coarsened to keep to it"
     )
     relief: float = Field(1.0, ge=0, le=10, description="amplitude of relief below the model's facets; 0: none")
+    roughness: float = Field(
+        0.0,
+        ge=0,
+        le=0.5,
+        description="least RMS difference in height over distance, below the facets of a model that is smoother",
+    )
     hurst: float | None = Field(
         None, ge=0.3, le=1.2, description="exponent of the relief's roughness; default: as the model's own"
     )
