@@ -40,6 +40,7 @@ from vbnfault.output.sample_files import annotated
 from vbnfault.pipeline import simulate
 from vbnfault.render.description import View
 from vbnfault.scene import config
+from vbnfault.world import ground
 from vbnfault.world.sky import SkyFrame, StarCatalogue, star_radiance
 
 F64 = NDArray[np.float64]
@@ -70,6 +71,23 @@ def camera(calibration: Calibration, **lens: Any) -> Camera:
         lens=ThinLens(focal_length_mm=focal_mm, f_number=4.0, calibration=calibration, **lens),
         detector=ThreeColourDetector(width_px=width, height_px=height, pixel_pitch_um=PITCH_UM),
     )
+
+
+@pytest.mark.parametrize("name", SIX)
+def test_ground_is_in_the_frame_where_opencv_projects_it_there(name: str) -> None:
+    calibration, rng = SIX[name], np.random.default_rng(4)
+    table: Any = SimpleNamespace(
+        width_px=calibration.width_px, height_px=calibration.height_px, frame_calibration=calibration
+    )
+    seen = ground.rays_C(table, np.linspace(0.02, 0.98, 9))
+    points = np.concatenate([seen, seen + rng.normal(0, 0.3 * calibration.width_px / 96, seen.shape)])
+    points = points[points[:, 2] > 0.05] * rng.uniform(1, 9, (np.count_nonzero(points[:, 2] > 0.05), 1))
+    xy = opencv_pixels(calibration, points)
+    size = np.array([calibration.width_px, calibration.height_px])
+    inside = ((xy >= 0) & (xy <= size)).all(axis=1)
+    holds = np.degrees(np.arctan2(np.hypot(points[:, 0], points[:, 1]), points[:, 2])) < calibration.valid_to_deg
+    assert np.count_nonzero(inside & holds) > 60
+    np.testing.assert_array_equal(ground.in_frame(table, points)[holds], inside[holds])
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from ..body import Site
 from ..core import frames
-from ..core.calibration import Calibration
 from ..core.errors import InputError, VbnfaultError, shown
 from ..render.description import Sunlight
 from ..scene import aims, exchange, names, plan, redraw
@@ -19,7 +18,7 @@ from ..scene.instrument import CameraTable
 from ..scene.trajectory import FlownPose
 from ..world import ephemeris
 from ..world.aiming import AimedView, aimed_view
-from ..world.ground import below_ground, encloses, nearest_ground
+from ..world.ground import below_ground, encloses, in_frame, nearest_ground, rays_C
 from ..world.spacecraft import SpacecraftMesh
 from .spec import Pose, SampleSpec, Terrain
 
@@ -402,18 +401,12 @@ def _body_in_frame(spec: SampleSpec, view: AimedView) -> bool:
     from .. import render
 
     camera, terrain, flown = spec.scene.camera, spec.terrain, view.pose
-    height_over_width = camera.height_px / camera.width_px
-    slope = _IN_FRAME * np.tan(np.radians(camera.fov_deg) / 2)
-    x, y, z = ((terrain.body.vertices_m - flown.camera_position_T_m) @ flown.T_from_C).T
-    if ((z > 0) & (np.abs(x) < slope * z) & (np.abs(y) < slope * height_over_width * z)).any():
+    away = terrain.body.vertices_m - flown.camera_position_T_m
+    if in_frame(camera, away @ flown.T_from_C, _IN_FRAME).any():
         return True
     position = _camera_L_m(terrain, view)
-    rays_L = (
-        _grid_rays_C(camera.fov_deg, height_over_width, camera.frame_calibration)
-        @ flown.T_from_C.T
-        @ terrain.site.T_from_L
-    )
-    beyond_m = 2 * float(np.hypot(x, np.hypot(y, z)).max())
+    rays_L = _grid_rays_C(camera) @ flown.T_from_C.T @ terrain.site.T_from_L
+    beyond_m = 2 * float(np.linalg.norm(away, axis=1).max())
     return render.is_between(terrain.surface, position, position + beyond_m * rays_L)
 
 
@@ -501,30 +494,20 @@ def _lit_fraction(camera: CameraTable, terrain: Terrain, position_L_m: F64, L_fr
     from .. import render
 
     vehicle = terrain.vehicle
-    field = camera.fov_deg, camera.height_px / camera.width_px, camera.frame_calibration
-    rays_C = _grid_rays_C(*field)
-    rays_L = np.einsum("vij,nj->vni", L_from_C, rays_C)
+    grid_C = _grid_rays_C(camera)
+    rays_L = np.einsum("vij,nj->vni", L_from_C, grid_C)
     lit = render.sunlit_ground(terrain.surface, position_L_m, rays_L, sun_L)
     if vehicle is not None:
-        lit &= ~_hidden_by(vehicle, *field)
+        lit &= ~_hidden_by(vehicle, grid_C.tobytes())
     return np.asarray(lit.mean(axis=1))
 
 
-def _grid_rays_C(fov_deg: float, height_over_width: float, calibration: Calibration | None = None) -> F64:
+def _grid_rays_C(camera: CameraTable) -> F64:
     """Return unit directions through the centres of a grid of cells over the frame, float64[ray, 3]."""
-    centres = (np.arange(_LIT_GRID) + 0.5) / _LIT_GRID * 2 - 1
-    if calibration is not None:
-        size = calibration.width_px, calibration.height_px
-        return calibration.directions_at(*((centres + 1) / 2 * n for n in size)).reshape(-1, 3)
-    slope = np.tan(np.radians(fov_deg) / 2)
-    x, y = np.meshgrid(slope * centres, slope * height_over_width * centres)
-    rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
-    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+    return rays_C(camera, (np.arange(_LIT_GRID) + 0.5) / _LIT_GRID)
 
 
 @lru_cache(maxsize=4)
-def _hidden_by(
-    vehicle: SpacecraftMesh, fov_deg: float, height_over_width: float, calibration: Calibration | None
-) -> Mask:
+def _hidden_by(vehicle: SpacecraftMesh, directions_C: bytes) -> Mask:
     """Return which rays of the grid meet the spacecraft, bool[ray]. They are the same in every view."""
-    return vehicle.blocked(_grid_rays_C(fov_deg, height_over_width, calibration))
+    return vehicle.blocked(np.frombuffer(directions_C).reshape(-1, 3))

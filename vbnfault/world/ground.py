@@ -20,6 +20,7 @@ from ..body import Body, Site, Sites, choose_sites, site_at
 from ..core import frames
 from ..core.errors import InputError, shown
 from ..scene.config import Scene
+from ..scene.instrument import CameraTable
 from ..scene.plan import Plan
 from ..scene.trajectory import FlownPose, Trajectory
 
@@ -152,6 +153,30 @@ def pixel_rad(scene: Scene) -> float:
     return float(2 * np.tan(np.radians(scene.camera.fov_deg) / 2) / scene.camera.width_px)
 
 
+def in_frame(camera: CameraTable, points_C: F64, part: float = 1.0) -> NDArray[np.bool_]:
+    """Return which points float64[n, 3] lie in the frame, or in the middle `part` of its sides, bool[n]."""
+    size_px = np.array([camera.width_px, camera.height_px])
+    calibration = camera.frame_calibration
+    if calibration is None:
+        z = np.where(points_C[:, 2:] > 0, points_C[:, 2:], np.nan)
+        off_px = points_C[:, :2] / z * (size_px[0] / 2 / np.tan(np.radians(camera.fov_deg) / 2))
+    else:
+        off_px = calibration.pixel_of(points_C) - size_px / 2
+    return np.asarray((np.abs(off_px) <= part * size_px / 2).all(axis=1))
+
+
+def rays_C(camera: CameraTable, places: F64) -> F64:
+    """Return unit directions through a grid of places in the frame, 0 to 1 along each side, float64[ray, 3]."""
+    calibration = camera.frame_calibration
+    if calibration is not None:
+        size_px = calibration.width_px, calibration.height_px
+        return calibration.directions_at(*(places * n for n in size_px)).reshape(-1, 3)
+    slope = np.tan(np.radians(camera.fov_deg) / 2)
+    x, y = np.meshgrid(slope * (places * 2 - 1), slope * camera.height_px / camera.width_px * (places * 2 - 1))
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
+    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+
+
 def _rounded(length_m: float) -> float:
     """Return a length rounded down to a power of `_STEP`."""
     return float(_STEP ** np.floor(np.log(max(length_m, 1e-3)) / np.log(_STEP) + 1e-9))
@@ -246,19 +271,13 @@ def _seen(scene: Scene, body: Body, pose: FlownPose, model: TerrainMesh) -> _See
     from .. import render
 
     camera = scene.camera
-    slope = np.tan(np.radians(camera.fov_deg) / 2)
-    slopes = slope * np.array([1.0, camera.height_px / camera.width_px])
     away = body.vertices_m - pose.camera_position_T_m
-    x, y, z = (away @ pose.T_from_C).T
-    framed = (z > 0) & (np.abs(x) <= slopes[0] * z) & (np.abs(y) <= slopes[1] * z)
     facing = np.einsum("ni,ni->n", body.vertex_normals, away) < 0
-    vertices = body.vertices_m[framed & facing]
+    vertices = body.vertices_m[in_frame(camera, away @ pose.T_from_C) & facing]
     points = [vertices[~render.hidden_points(model, pose.camera_position_T_m, vertices)]] if len(vertices) else []
-    for across in np.linspace(-slopes[0], slopes[0], _RAYS):
-        for down in np.linspace(-slopes[1], slopes[1], _RAYS):
-            towards = pose.T_from_C @ np.array([across, down, 1.0])
-            hit = first_hit(body, pose.camera_position_T_m, towards / np.linalg.norm(towards))
-            points += [] if hit is None else [hit[None]]
+    for towards in rays_C(camera, np.linspace(0, 1, _RAYS)) @ pose.T_from_C.T:
+        hit = first_hit(body, pose.camera_position_T_m, towards)
+        points += [] if hit is None else [hit[None]]
     ground = np.concatenate(points) if points else np.zeros((0, 3))
     if not len(ground):
         ground = looked_at(body, pose.camera_position_T_m, pose.T_from_C[:, 2])[None]
