@@ -169,7 +169,7 @@ class Effect(Table):
         """Raise ValueError with one sentence if the effect does not fit the sensor."""
 
     def binned(self, pixels: int, tile: tuple[int, ...]) -> Self:
-        """Return the effect on pixels of which each adds `pixels`² neighbours of one colour of a mosaic's tile."""
+        """Return the effect on pixels that each add a square of `pixels` neighbours a side, of one colour."""
         return self
 
     @abstractmethod
