@@ -40,16 +40,12 @@ def view(plan: Plan, scene: Scene, index: int, attempt: int) -> dict[str, float]
 def least_sun_angle_deg(scene: Scene) -> float:
     """Return the least angle between a Sun-averted boresight and the Sun.
 
-    It is √2·FoV/2, as for the paper's square frame, or the angle of the frame's farthest corner where that is
-    larger: in a frame that is higher than wide, or of a calibration whose principal point lies to one side.
+    It is √2·FoV/2, as for the paper's square frame, or the frame's half diagonal where that is larger: in a frame
+    that is higher than wide.
     """
     camera = scene.camera
-    if camera.frame_calibration is not None:
-        corner_deg = camera.frame_calibration.field_deg
-    else:
-        diagonal = np.hypot(1.0, camera.height_px / camera.width_px) * np.tan(np.radians(camera.fov_deg) / 2)
-        corner_deg = np.degrees(np.arctan(diagonal))
-    return float(max(np.sqrt(2) * camera.fov_deg / 2, corner_deg))
+    diagonal = np.hypot(1.0, camera.height_px / camera.width_px) * np.tan(np.radians(camera.fov_deg) / 2)
+    return float(max(np.sqrt(2) * camera.fov_deg / 2, np.degrees(np.arctan(diagonal))))
 
 
 def strata(scene: Scene) -> tuple[StratumTable, StratumTable]:
