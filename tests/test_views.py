@@ -21,6 +21,7 @@ from vbnfault.pipeline.record import to_sample
 from vbnfault.pipeline.rendering import render_view
 from vbnfault.pipeline.spec import Frame, Pose, SampleSpec, Terrain
 from vbnfault.scene import config, plan, redraw
+from vbnfault.scene.instrument import CameraTable
 
 SAMPLES = {"samples": 24, "sites": 1, "shard_samples": 8, "layers": ["clean"]}
 
@@ -384,7 +385,8 @@ def test_a_flown_pose_is_kept_with_its_sun_hidden_and_refused_within_the_ground(
 @pytest.mark.parametrize(("fov_deg", "height_over_width"), [(90.0, 1.0), (40.0, 0.5), (65.0, 1.5)])
 def test_rays_that_look_for_lit_ground_cover_the_frame(fov_deg: float, height_over_width: float) -> None:
     """Unit directions through the centres of equal cells: their slopes are symmetric, evenly spaced, row by row."""
-    rays = resolve._grid_rays_C(fov_deg, height_over_width)
+    table = CameraTable(width_px=200, height_px=round(200 * height_over_width), fov_deg=fov_deg)
+    rays = resolve._grid_rays_C(table)
     n = round(np.sqrt(len(rays)))
     assert rays.shape == (n * n, 3)
     np.testing.assert_allclose(np.linalg.norm(rays, axis=1), 1, rtol=1e-14)
