@@ -282,7 +282,7 @@ def test_a_smooth_shape_has_the_roughness_of_a_preset(tmp_path: Path) -> None:
     assert 0.5 * 0.5 < deviation[0.05] < 2.0 * 0.5
 
 
-@pytest.mark.parametrize("name", [name for name in BODIES if name != "67p"])
+@pytest.mark.parametrize("name", BODIES)
 def test_the_roughness_of_a_preset_is_that_of_the_packaged_shape(name: str) -> None:
     session = Session(config.parse_scene({"title": "t", "body": {"name": name}}, source="t.toml"))
     law, roughness = session.body.roughness, session.scene.patch.roughness

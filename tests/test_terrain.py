@@ -233,9 +233,9 @@ def test_boulders_are_where_they_are_said_to_be(patches: list[Patch]) -> None:
         mine = patch.vertices_L_m[np.unique(rocks.faces[label == k])].astype(np.float64)
         at = patch.boulder_position_L_m[np.flatnonzero(order == k)[0]]
         reach = np.linalg.norm(mine - at, axis=1).max()
-        # Its longest extent is the diameter, to 2 %, and planes cut its sides unevenly.
+        # Its longest extent is the diameter, to 6 %, and planes cut its sides unevenly.
         diameter_m = patch.boulder_diameter_m[np.flatnonzero(order == k)[0]]
-        assert 0.49 * diameter_m < reach < 0.7 * diameter_m
+        assert 0.49 * diameter_m < reach < 0.66 * diameter_m
 
 
 def test_walls_are_no_steeper_than_facets_can_show() -> None:

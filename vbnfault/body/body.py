@@ -82,6 +82,11 @@ class Body:
         """Return the volume that the mesh encloses."""
         return signed_volume(self.vertices_m, self.faces)
 
+    @property
+    def mean_radius_m(self) -> float:
+        """Return the radius of a sphere of the body's volume."""
+        return float((3 * self.volume_m3 / (4 * np.pi)) ** (1 / 3))
+
     @cached_property
     def centre_of_mass_T_m(self) -> Float64:
         """Return the centre of mass of the homogeneous body in T, float64[3] in m."""
@@ -112,8 +117,7 @@ class Body:
     @cached_property
     def mean_gravity_m_s2(self) -> float:
         """Return the attraction at the surface of a sphere of the same volume."""
-        radius = (3 * self.volume_m3 / (4 * np.pi)) ** (1 / 3)
-        return 4 / 3 * np.pi * GRAVITATIONAL_CONSTANT * self.density_kg_m3 * radius
+        return 4 / 3 * np.pi * GRAVITATIONAL_CONSTANT * self.density_kg_m3 * self.mean_radius_m
 
     @cached_property
     def places(self) -> Places:

@@ -36,7 +36,7 @@ _CLOSE_M, _CLOSEST = 50.0, 0.45
 # coarse ones are better than none.
 _COARSER, _COARSEST = (1.0, 1.2, 1.45, 1.75, 2.1), (2.6, 3.2, 4.0, 5.0)
 _FLAT_LEVELS = 2  # up to this level, triangles are the rock's fracture planes and are shaded flat
-_WIDTHS_LEVEL = 1  # sphere whose vertices are the directions in which a rock is measured, to 2 % of its width
+_WIDTHS_LEVEL = 1  # of the sphere whose vertices are the directions in which a rock is measured, to 6 %
 _RING = 12  # directions in which the ground around a rock is sampled
 _LOWEST_CORNERS = 8
 _CORNERS_AT_ONCE = 1 << 14  # of rocks that a thread cuts; the temporaries then fit the processor's cache

@@ -215,8 +215,7 @@ def _airfall(body: Body, elevation_m: Float64, slope_deg: Float32, factor: float
     """
     if not factor:
         return np.zeros(len(slope_deg), dtype=np.float32)
-    radius_m = (body.volume_m3 / (4 / 3 * np.pi)) ** (1 / 3)
-    low = np.clip((np.median(body.places[2]) - elevation_m) / (_LOW * radius_m), -1, 1)
+    low = np.clip((np.median(body.places[2]) - elevation_m) / (_LOW * body.mean_radius_m), -1, 1)
     return np.asarray(factor * (low + np.clip(1 - slope_deg / _MEAN_SLOPE_DEG, -1, 1)), dtype=np.float32)
 
 

@@ -29,10 +29,10 @@ _FIT_EDGES = (1.3, 1.7, 2.2, 2.9, 3.8)
 # Natural surfaces have exponents of 0.3 to 1 (Shepard et al. 2001). Heights against a quadric can show exponents up
 # to 2: near the facets of a smoothed shape model, the measured exponent exceeds 1.
 _HURST_RANGE = (0.5, 1.0)
-# In models of larger edges, over the radius of a sphere of their volume, the quadric leaves some of their roundness
+# A model is coarse if its mean edge is longer than this, over its mean radius: the quadric then leaves roundness
 _COARSE = 0.04
-# Of coarse models: longest baseline that tells the exponent, over the same radius, for deviations grow no more on
-# longer ones; and the exponent if fewer than two tell it
+# Deviations of a coarse model grow no more beyond the first, over its mean radius, so longer baselines do not tell
+# its exponent. It has the second as exponent if fewer than two baselines are shorter
 _LONGEST_RADII, _ASSUMED_HURST = 0.35, 0.8
 # Least cosine between the normals of a vertex and of the window's centre; steeper vertices belong to another side.
 _FACING = 0.5

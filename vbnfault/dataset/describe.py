@@ -103,7 +103,7 @@ def _body(session: Session) -> list[str]:
 def _size_m(session: Session) -> tuple[NDArray[np.float64], float]:
     """Return the body's extent along its axes, float64[3], and the radius of a sphere of its volume, both in m."""
     body = session.body
-    return np.ptp(body.vertices_m, axis=0), float(np.cbrt(3 * body.volume_m3 / (4 * np.pi)))
+    return np.ptp(body.vertices_m, axis=0), body.mean_radius_m
 
 
 def _small_body(session: Session) -> list[str]:

@@ -88,7 +88,7 @@ def _readout(spec: ReadoutSpec, n: int, adds_numbers: bool) -> ReadoutSpec:
     factors = {
         "read_noise_e_rms": n,
         "reset_noise_e_rms": n,
-        # n lines, each n times
+        # a block has n lines, and each counts n times
         "row_pattern_e_rms": n**1.5,
         "column_pattern_e_rms": n**1.5,
         "row_noise_e_rms": n**1.5,

@@ -320,7 +320,7 @@ class Session:
         if table.regolith is not None:
             regolith = Regolith(**table.regolith.model_dump())
             # none is wider than the mean radius: it would swallow the body
-            crater_m = boulder_m = float(np.cbrt(3 * self.body.volume_m3 / (4 * np.pi)))
+            crater_m = boulder_m = self.body.mean_radius_m
             if self.scene.body.shape != "ellipsoid":  # larger ones are in the shape
                 edge_m = mean_edge_m(self.body.vertices_m, self.body.faces)
                 crater_m, boulder_m = min(crater_m, _CRATER_EDGES * edge_m), min(boulder_m, _BOULDER_EDGES * edge_m)

@@ -416,7 +416,7 @@ def make_coma(table: ComaTable, body: Body, site: Site, sun_L: F64, sun_distance
     return Coma(
         centre_L_m=centre_L,
         reach_m=_SHADOW_MARGIN * _greatest_radius_m(body),
-        core_m=_CORE * (3 * body.volume_m3 / (4 * np.pi)) ** (1 / 3),
+        core_m=_CORE * body.mean_radius_m,
         afrho_m=0.01 * table.afrho_cm * (sun_distance_au / table.reference_au) ** -table.distance_exponent,
         outflow=Outflow(
             sun=sun,
@@ -454,7 +454,7 @@ def _jets(table: ComaTable, seed: int) -> tuple[F64, F64, F64]:
 
 def check_coma(table: ComaTable, body: Body, sun_distance_au: float) -> None:
     """Raise InputError if the body's gravity holds its dust back, or if the dust is not optically thin."""
-    radius_m = (3 * body.volume_m3 / (4 * np.pi)) ** (1 / 3)
+    radius_m = body.mean_radius_m
     mass_kg = body.density_kg_m3 * body.volume_m3
     escape_m_s = float(np.sqrt(2 * spectra.GRAVITATION_SI * mass_kg / radius_m))
     gas_m_s = _GAS_SPEED_M_S / np.sqrt(sun_distance_au)
