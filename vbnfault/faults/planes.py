@@ -24,9 +24,10 @@ _CELLS = 256  # cells along the longer side of a frame, on which scattered light
 
 def times(array: F32, factor: NDArray[Any]) -> F32:
     """Return planes float32[y, x, channel] times a factor for each channel [channel] or for each pixel [y, x]."""
+    factor = np.asarray(factor, dtype=np.float32)
     if factor.ndim == 1:
-        return by_channel(np.multiply, array, factor.astype(np.float32))
-    return array * cv2.merge([factor.astype(np.float32)] * array.shape[2]).reshape(array.shape)
+        return by_channel(np.multiply, array, factor)
+    return array * (cv2.merge([factor] * array.shape[2]) if array.shape[2] > 1 else factor).reshape(array.shape)
 
 
 def by_channel(function: Callable[[F32, F32], F32], array: F32, values: F32) -> F32:
@@ -73,8 +74,11 @@ def scale_by_intensity(
     channel. With `monochrome`, R, G and B always become the new I: scaled by the ratio, they could be rounded to
     another number.
     """
+    if monochrome:
+        level = np.clip(np.rint(intensity), 0, 255).astype(np.uint8)
+        return np.repeat(level[..., None], 4, axis=-1)
     before = rgbi[..., 3]
-    dark = np.ones_like(before, dtype=bool) if monochrome else before == 0
+    dark = before == 0
     exact = sum((rgbi[..., k] * np.float32(LUMINANCE[k]) for k in range(3)), np.float32(0))
     exact = np.where(np.abs(exact - before) <= 0.5, exact, before)
     ratio = (exact + (intensity - before)) / np.maximum(exact, np.float32(0.5))

@@ -193,25 +193,22 @@ class _LensStraylight(LensFault):
         return params
 
     def on_light(self, light: Electrons, params: Params, context: FaultContext) -> Electrons:
-        """Return the light with straylight added to that past the rims."""
-        past = np.zeros_like(light.array) if light.past_rims is None else light.past_rims
-        out: Electrons = self.apply(replace(light, past_rims=past), params, context)
-        return out
+        """Return the light, minus that which straylight is taken from, with straylight added past the rims."""
+        straylight = context.once(self._light, params)
+        if straylight is None:
+            return light
+        past = straylight.added
+        if not straylight.scene_added:
+            veil = sums(light.array) * straylight.scene_lost
+            plane = _in_frame(veil_per_px(_sensor_grid(context).shape, context.camera.focal_length_px), context)
+            past = past + plane[..., None] * veil.astype(np.float32)
+        if light.past_rims is not None:
+            past = times(light.past_rims, straylight.direct_left) + past
+        return replace(light, array=times(light.array, 1 - straylight.scene_lost), past_rims=past)
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
         """Return the expected electrons plus straylight, minus the light that straylight is taken from."""
-        light = context.once(self._light, params)
-        if light is None:
-            return quantity
-        scene, added = times(quantity.array, 1 - light.scene_lost), light.added
-        if not light.scene_added:
-            veil = sums(quantity.array) * light.scene_lost
-            plane = _in_frame(veil_per_px(_sensor_grid(context).shape, context.camera.focal_length_px), context)
-            added = added + plane[..., None] * veil.astype(np.float32)
-        if quantity.past_rims is None:
-            return quantity.with_array(scene + added)
-        past = times(quantity.past_rims, light.direct_left) + added
-        return replace(quantity, array=scene, past_rims=past)
+        return self.on_light(quantity, params, context).merged
 
     def footprint(self, params: Params, context: FaultContext) -> NDArray[np.bool_]:
         """Return the pixels where any channel gains at least `mask_level_dn` of straylight, bool[y, x]."""

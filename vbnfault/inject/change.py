@@ -49,7 +49,6 @@ def struck(
     """
     rng = development.rng
     before, optical = picture.electrons, acting_at(draws, "electrons")
-    after, change = before.array, np.zeros_like(picture.light)
     if optical:
         shared = after = development.signal(draws, optical).merged.array
         change = picture.in_image(after - before.array)
@@ -61,6 +60,8 @@ def struck(
 
         noise = _missing_noise(picture, change, picture.collected(after), moved, rng)
         change, after = change + noise, after + (picture.seen(noise).array if noise.any() else 0)
+    else:
+        after, change = before.array, np.zeros_like(picture.light)
     inside = any(acting_at(draws, step) for step in MOSAIC_STEPS)
     if inside or (optical and development.exposure.camera.detector.mosaic is not None):
         change = picture.in_image(_through_sensor(picture, development, draws, after, rng))
@@ -124,10 +125,11 @@ def _through_sensor(picture: Picture, development: Development, draws: Draws, af
     else:
         with_it = development.raw(draws, noisy=False).astype(np.float32)
     light = sample(struck_light.array, sensor.sensor.pattern)
-    added = sensor.device.expected_e(light, exposure_s, acts) - sensor.device.expected_e(light, exposure_s)
-    added = np.maximum(added, 0).astype(np.float32)
-    noise = poisson(added, draw_normals(added.shape, rng("inject", "charge"))) - added
-    change = (with_it - without) / np.float32(plain.sensor.readout.system_gain_dn_per_e) + noise
+    change = (with_it - without) / np.float32(plain.sensor.readout.system_gain_dn_per_e)
+    if acts["light"]:  # the only step at which faults change the charge that is expected
+        added = sensor.device.expected_e(light, exposure_s, acts) - sensor.device.expected_e(light, exposure_s)
+        added = np.maximum(added, 0).astype(np.float32)
+        change += poisson(added, draw_normals(added.shape, rng("inject", "charge"))) - added
     # the difference lacks what the plain sensor adds to the image, but a saturated pixel is white
     seen = picture.seen(picture.light)
     room = sample(seen.white_e - seen.array, sensor.sensor.pattern)
