@@ -30,13 +30,14 @@ def test_a_point_keeps_its_light_wherever_it_lies() -> None:
 
 
 def test_the_core_has_its_width_and_follows_the_axes() -> None:
-    core = Halo(core_rad=2e-4, halo_fraction=0.0, halo_rad=1e-4, halo_index=3.0)
-    image = core.applied(point(row=80, column=120), PIXEL_RAD)
-    row, column = np.indices(image.shape)
-    assert ((image * column).sum(), (image * row).sum()) == pytest.approx((120, 80), abs=1e-9)
-    # a pixel adds the variance of its own width, 1/12, to that of the core
-    for offset in (row - 80, column - 120):
-        assert (image * offset**2).sum() == pytest.approx(2.0**2 + 1 / 12, rel=1e-6)
+    for along_y in (None, 3e-4):
+        core = Halo(core_rad=2e-4, core_y_rad=along_y, halo_fraction=0.0, halo_rad=1e-4, halo_index=3.0)
+        image = core.applied(point(row=80, column=120), PIXEL_RAD)
+        row, column = np.indices(image.shape)
+        assert ((image * column).sum(), (image * row).sum()) == pytest.approx((120, 80), abs=1e-9)
+        # a pixel adds the variance of its own width, 1/12, to that of the core
+        for offset, sigma_px in ((row - 80, 3.0 if along_y else 2.0), (column - 120, 2.0)):
+            assert (image * offset**2).sum() == pytest.approx(sigma_px**2 + 1 / 12, rel=1e-6)
 
 
 def test_the_halo_is_the_stated_law() -> None:
@@ -102,6 +103,9 @@ def test_a_scene_sets_the_point_spread_in_angles() -> None:
     values = {"camera.point_spread.core_urad": 60.0, "camera.width_px": 64, "camera.height_px": 64}
     scene = vbnfault.load_scene("paper67p", values)
     lens = vbnfault.Session(scene).base_camera.lens
+    assert lens.halo.core_y_rad is None
+    wider = vbnfault.load_scene("paper67p", values | {"camera.point_spread.core_y_urad": 90.0})
+    assert vbnfault.Session(wider).base_camera.lens.halo.core_y_rad == pytest.approx(90e-6)
     seen = (lens.halo.core_rad, lens.halo.halo_fraction, lens.halo.halo_rad, lens.halo.halo_index)
     assert seen == pytest.approx((60e-6, 0.0, 100e-6, 3.0))
     assert lens.pixel_rad == pytest.approx(2 * np.tan(np.radians(32.5)) / 64)

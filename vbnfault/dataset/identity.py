@@ -149,8 +149,9 @@ def _leave_out_unused(identity: dict[str, Any], scene: Scene) -> None:
         holder: Any = functools.reduce(getattr, tables, scene)
         if holder is not None and getattr(holder, name) == type(holder).model_fields[name].default:
             del functools.reduce(operator.getitem, tables, identity)[name]
-    if (spread := scene.camera.point_spread) and not spread.wing_fraction:
-        for key in ("wing_fraction", "wing_urad", "wing_index"):
+    if spread := scene.camera.point_spread:
+        unused = () if spread.core_y_urad else ("core_y_urad",)
+        for key in unused if spread.wing_fraction else (*unused, "wing_fraction", "wing_urad", "wing_index"):
             del identity["camera"]["point_spread"][key]
     del identity["event_camera"]  # no sample depends on it
     if not scene.is_aimed:

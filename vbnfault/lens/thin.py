@@ -265,8 +265,9 @@ _FINE = 9  # points along each side of a pixel for that
 class Halo:
     """Describe a point spread with a halo.
 
-    `core_rad` is σ. `halo_fraction`, `halo_rad` and `halo_index` are h, θ and p of the halo, the fields `wing_…`
-    those of the wings; p is above 2. Angles are in radians.
+    `core_rad` is σ, and `core_y_rad` that along columns; None: the same. `halo_fraction`, `halo_rad` and
+    `halo_index` are h, θ and p of the halo, the fields `wing_…` those of the wings; p is above 2. Angles are in
+    radians.
     """
 
     core_rad: float
@@ -276,6 +277,7 @@ class Halo:
     wing_fraction: float = 0.0
     wing_rad: float = 1.0
     wing_index: float = 3.0
+    core_y_rad: float | None = None
 
     def applied(self, light: NDArray[np.floating], pixel_rad: float) -> NDArray[np.floating]:
         """Return light, float[..., y, x], after the point spread, at least 0.
@@ -303,7 +305,8 @@ class Halo:
 
         The sum over offsets of either sign is 1; at the largest offsets, both signs are the same pixel.
         """
-        core = [_gaussian(self.core_rad / pixel_rad, size) for size in shape]
+        sigmas_rad = (self.core_y_rad or self.core_rad, self.core_rad)
+        core = [_gaussian(rad / pixel_rad, size) for rad, size in zip(sigmas_rad, shape, strict=True)]
         out = (1 - self.halo_fraction - self.wing_fraction) * core[0][:, None] * core[1]
         out += self.halo_fraction * _moffat(self.halo_rad / pixel_rad, self.halo_index, shape)
         if self.wing_fraction:

@@ -59,6 +59,9 @@ class PointSpreadTable(Table):
     """
 
     core_urad: float = Field(gt=0, le=1e5, description="standard deviation of the core")
+    core_y_urad: float | None = Field(
+        None, gt=0, le=1e5, description="standard deviation of the core along columns; default: core_urad"
+    )
     halo_fraction: float = Field(0.0, ge=0, lt=1, description="fraction of the light that goes into the halo")
     halo_urad: float = Field(
         100.0, gt=0, le=1e6, description="angle beyond which the halo falls as a power: θ₀ of (1 + θ²/θ₀²)^(-p/2)"

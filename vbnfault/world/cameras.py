@@ -151,6 +151,7 @@ def _halo(table: PointSpreadTable | None) -> Halo | None:
         return None
     return Halo(
         core_rad=1e-6 * table.core_urad,
+        core_y_rad=None if table.core_y_urad is None else 1e-6 * table.core_y_urad,
         halo_fraction=table.halo_fraction,
         halo_rad=1e-6 * table.halo_urad,
         halo_index=table.halo_index,
