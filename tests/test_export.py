@@ -24,7 +24,7 @@ from vbnfault.core import registry
 from vbnfault.core.errors import InputError, VbnfaultError
 from vbnfault.output.export import Entry, Format, export_store, formats
 from vbnfault.output.export.folder import Folder
-from vbnfault.output.export.formats import coco
+from vbnfault.output.export.formats import coco, yolo
 from vbnfault.output.export.regions import coco_text, flare_discs, instances, polygon, regions, whole
 
 NAMES = ("coco", "exr", "huggingface", "png", "webdataset", "yolo")
@@ -254,14 +254,8 @@ def test_yolo_outlines_and_boxes_give_the_regions_back(exported: Any, data: st.S
             assert edges == pytest.approx(wanted, abs=1e-3)  # of a pixel: six digits of a fraction
             lines += 1
         for k, fault in enumerate(data.spec.faults):
-            wanted_mask = np.zeros(mask.shape[1:], np.uint8)
-            if fault in (data.spec.localised_faults or ()):
-                for region in regions(mask[k]):  # an outline has no holes
-                    x, y, w, h = region.box
-                    contours, _ = cv2.findContours(region.inside.astype(np.uint8), cv2.RETR_EXTERNAL, 1)
-                    cv2.drawContours(wanted_mask[y : y + h, x : x + w], contours, -1, 1, cv2.FILLED)
-            assert np.array_equal(drawn[k], wanted_mask)
-            assert (drawn[k] >= mask[k]).all() or fault not in (data.spec.localised_faults or ())
+            is_localised = fault in (data.spec.localised_faults or ())
+            assert np.array_equal(drawn[k], mask[k] if is_localised else np.zeros_like(mask[k]))
     assert lines > 50
 
 
@@ -289,6 +283,33 @@ def test_an_outline_of_the_smallest_regions_covers_them_exactly(
         x, y, w, h = region.box
         corners = [(x, y), (x + w, y), (x + w, y + h), (x, y + h)]
         np.testing.assert_allclose(polygon(region), corners, atol=2e-3)
+
+
+@pytest.mark.parametrize("size", [(141, 193), (1024, 1024), (3000, 4096)])
+def test_outlines_read_back_as_float32_cover_pixels_and_lines_exactly(size: tuple[int, int]) -> None:
+    """Six digits put the corner at 66 of 1024 px on 65.99987, so that a line was two rows wide."""
+    spec = st.StoreSpec(height=size[0], width=size[1], faults=(), mask_any_faults=())
+    for rows, columns in ((66, slice(0, 141)), (slice(0, 141), 66), (140, 140), (1, 192)):
+        mask = np.zeros(size, bool)
+        mask[rows, columns] = True
+        (region,) = regions(mask)
+        numbers = np.array(yolo._outline_line(0, region, spec).split()[1:], np.float32)
+        drawn = np.zeros(size, np.uint8)
+        cv2.fillPoly(drawn, [(numbers.reshape(-1, 2) * size[::-1]).astype(np.int32)], 1)
+        assert np.array_equal(drawn == 1, mask)
+
+
+def test_one_outline_covers_pieces_and_leaves_holes_out() -> None:
+    mask = np.zeros((40, 60), bool)
+    mask[[3, 30]] = mask[:, [5, 50]] = True  # a grid of dead lines, which encloses most of the image
+    mask[10:20, 20:30] = True  # another piece
+    mask[15, 25] = False  # a hole in it
+    drawn = np.zeros(mask.shape, np.uint8)
+    cv2.fillPoly(drawn, [polygon(whole(mask)).astype(np.int32)], 1)
+    bridge = (drawn == 1) & ~mask
+    assert (drawn[mask] == 1).all()
+    assert bridge.sum() <= 14  # a line between the nearest vertices, (6, 3) and (20, 10)
+    assert not bridge[15, 25]
 
 
 def test_regions_come_in_the_order_of_their_first_pixel_down_the_columns() -> None:

@@ -15,6 +15,8 @@ from ...core.errors import InputError
 from ...core.quantities import Sample
 from ...store import StoreSpec
 
+MOST_EDGES = 100  # of one outline: finding the way to ten thousand holes would take minutes
+
 
 def flare_discs(
     params: Mapping[str, Any], sun_xy_px: NDArray[np.float64], shape: tuple[int, int]
@@ -156,18 +158,29 @@ def coco_text(counts: NDArray[np.int64]) -> str:
 
 
 def polygon(region: Region) -> NDArray[np.float64]:
-    """Return the outline of a region, float64[n, 2] (x, y) in pixels, n at least 3; holes are filled.
+    """Return the outline of a region, float64[n, 2] (x, y) in pixels, n at least 3.
 
     The vertices are the centres of the pixels along the outline, at +0.5, so that `cv2.fillPoly` of their whole
-    numbers gives the region back. A region without three such vertices, such as one pixel, has the corners of its
-    box.
+    numbers gives the region back. The outline goes along one line to the edge of each hole or further piece of the
+    region, round it and back; of many, the `MOST_EDGES` longest are in it. A region without three vertices, such as
+    one pixel, has the corners of its box.
     """
+    from scipy.spatial import cKDTree
+
     left, top, width, height = region.box
-    contours, _ = cv2.findContours(region.inside.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-    outline = max(contours, key=len).reshape(-1, 2).astype(np.float64)
+    edges, _ = cv2.findContours(region.inside.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_SIMPLE)
+    by_length = sorted(edges, key=lambda edge: cv2.arcLength(edge, closed=True), reverse=True)
+    outline, *others = (edge.reshape(-1, 2).astype(np.float64) for edge in by_length[:MOST_EDGES])
+    for edge in others:
+        apart, nearest = cKDTree(edge).query(outline)
+        i = int(apart.argmin())
+        j = int(nearest[i])
+        round_it = np.concatenate([edge[j:], edge[: j + 1]])
+        outline = np.concatenate([outline[: i + 1], round_it, outline[i:]])
     if len(outline) < 3:
-        short = 1e-3  # keeps the corners within the last pixels, which contain coordinates below their far edge
-        corners = [(0, 0), (width - short, 0), (width - short, height - short), (0, height - short)]
+        short = 1e-3  # keeps the corners within the outer pixels, also where a reader has rounded them
+        right, bottom = width - short, height - short
+        corners = [(short, short), (right, short), (right, bottom), (short, bottom)]
         if len(outline) == 2 and width > 1 and height > 1:  # a diagonal line: its box would hold other pixels
             (x0, y0), (x1, y1) = outline
             corners = [(x0 + 0.25, y0 + 0.25), (x1 + 0.5, y1 + 0.5), (x1 + 0.75, y1 + 0.75), (x0 + 0.5, y0 + 0.5)]

@@ -24,9 +24,8 @@ class Yolo(Format):
       programs that read boxes only; rename the folder to `labels` for them.
     - The instances are the connected regions (8 neighbours) of `mask` of the localised classes; where the
       parameters list flares, each flare and the glare is one. An outline runs through the centres of the pixels
-      at the edge and has no holes; that of an instance in several pieces is the outline of the longest. A class
-      that is not localised, such as vignetting, has no instances here; `samples.jsonl` says which samples have
-      it.
+      at the edge, along a line to each hole and further piece, round it and back (100 edges at most). A class that
+      is not localised, such as vignetting, has no instances here; `samples.jsonl` says which samples have it.
     """
 
     name = "yolo"
@@ -73,7 +72,8 @@ class Yolo(Format):
 def _outline_line(category: int, region: Region, spec: StoreSpec) -> str:
     """Return the line of a region's outline."""
     points = polygon(region) / (spec.width, spec.height)
-    return f"{category} {' '.join(f'{v:.6f}' for v in np.ravel(points))}\n"
+    # nine digits, so that a whole number of pixels read back as float32 lies in the same pixel
+    return f"{category} {' '.join(f'{v:.9f}' for v in np.ravel(points))}\n"
 
 
 def _box_line(category: int, region: Region, spec: StoreSpec) -> str:
