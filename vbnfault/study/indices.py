@@ -27,7 +27,8 @@ Surrogates of the metric reduce the variance of all these means, as control vari
 and ST are those of `scipy.stats.sobol_indices` for one block (a test compares them). That function takes neither
 several blocks nor a number of base samples that is no power of two, as failed evaluations leave, and its bootstrap
 takes no seed. Both kinds of intervals come from `scipy.stats.bootstrap` over base samples, as if these were
-independent, so with a Sobol' sequence they are too wide rather than too narrow. Morris and delta come from SALib.
+independent, so with a Sobol' sequence they are too wide rather than too narrow. Morris' effects and the densities
+of delta come from SALib.
 
 A bootstrap of few samples knows too little of a distribution: of 95 % intervals from 8 samples, 58 to 95 % held the
 true index (`benchmarks/study_coverage.py`). Below `LEAST_SAMPLES_OF_INTERVALS`, the interval of a fraction of the
@@ -40,6 +41,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import math
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -174,8 +176,8 @@ _SUFFIXES = {
     "_seed_deviation": ", standard deviation over the seeds",
 }
 _FORMULAE = {
-    "S1": "sum_b <y_B (y_AB - y_A)> / sum_b V_b",
-    "ST": "sum_b <(y_A - y_AB)^2> / (2 sum_b V_b)",
+    "S1": "of a Sobol' design: sum_b <y_B (y_AB - y_A)> / sum_b V_b",
+    "ST": "of a Sobol' design: sum_b <(y_A - y_AB)^2> / (2 sum_b V_b)",
     "interaction": "sum_b <(y_A - y_ABi) (y_A - y_ABj)> / sum_b V_b",
     "model_share": "sum_b V_m(E[y|m]) / sum_b V_b, where V = E_m[V(y|m)] + V_m(E[y|m]) (law of total variance)",
 }
@@ -355,6 +357,7 @@ def _steady() -> Iterator[None]:
     state, form = np.random.get_state(), warnings.formatwarning  # noqa: NPY002
     try:
         with warnings.catch_warnings(record=True):  # SALib has its warnings shown, whatever the filters say
+            warnings.simplefilter("ignore")
             yield
     finally:
         np.random.set_state(state)  # noqa: NPY002
@@ -439,7 +442,7 @@ def _add_morris(arrays: _Arrays, results: Results) -> None:
 
 
 def _add_delta(arrays: _Arrays, results: Results) -> None:
-    """Add the moment-independent index delta and the first-order index of given data, by SALib; means over blocks.
+    """Add the moment-independent index delta, a mean over blocks, and the first-order index of given data.
 
     Delta needs 100 samples; from fewer it is nan. Its bootstrap has at most 20 resamples. Where nearly all values
     are equal, a resample can have a single value, which has no density, and delta is nan, too. Delta is that of the
@@ -447,38 +450,85 @@ def _add_delta(arrays: _Arrays, results: Results) -> None:
     """
     from scipy import stats
 
-    analyze = salib("analyze.delta", "design.method = 'latin_hypercube'").analyze
+    of_groups = salib("analyze.delta", "design.method = 'latin_hypercube'").calc_delta
     design, table = results.design, results.design.spec.design
-    problem = unit_problem(design.spec)
+    quantile = stats.norm.ppf(0.5 + table.confidence / 2)
 
     def analyse(y: _Array) -> Mapping[str, Any]:
         rows = np.isfinite(y)
-        if rows.sum() < 2 or np.ptp(y[rows]) == 0:
+        n = int(rows.sum())
+        if n < LEAST_SAMPLES_OF_DELTA or np.ptp(y[rows]) == 0:
             return {}
-        analysed = partial(
-            analyze,
-            problem,
-            design.points[rows],
-            num_resamples=min(table.resamples, _MOST_RESAMPLES_OF_DELTA),
-            conf_level=table.confidence,
-            seed=table.seed % (2**32 - 1) + 1,  # SALib takes 0 as no seed
-        )
-        found: dict[str, Any] = dict(analysed(y[rows], method="sobol"))
-        if rows.sum() >= LEAST_SAMPLES_OF_DELTA:
-            # ranks have the same delta; densities of a few far values lie between the nodes of SALib's grid
-            with contextlib.suppress(ValueError):
-                found |= analysed(stats.rankdata(y[rows]), method="delta")
-        return found
+        # ranks have the same delta; densities of a few far values lie between the nodes of the grid
+        x, ranks = design.points[rows], stats.rankdata(y[rows])
+        grid = np.linspace(ranks.min(), ranks.max(), 100)
+        ends = np.linspace(0, n, 1 + min(48, math.ceil(n ** (2 / (7 + math.tanh((1500 - n) / 500))))))
+        resamples = min(table.resamples, _MOST_RESAMPLES_OF_DELTA)
+        drawn = np.random.default_rng(table.seed).integers(n, size=(resamples, n))
+        with contextlib.suppress(ValueError):
+            once = np.array([of_groups(ranks, grid, column, ends) for column in x.T])
+            again = np.array([[of_groups(ranks[k], grid, column[k], ends) for k in drawn] for column in x.T])
+            return {"delta": 2 * once - again.mean(axis=1), "half": quantile * again.std(axis=1, ddof=1)}
+        return {}
 
-    delta, delta_half, s1, s1_half = _by_block(results, ("delta_raw", "delta_raw_conf", "S1", "S1_conf"), analyse)
+    delta, half = _by_block(results, ("delta", "half"), analyse)
     finite = np.isfinite(results.values).reshape(-1, *results.values.shape[2:])
     used = finite.sum(axis=1).max(axis=0).T.astype(np.float64)
-    for name, values, half in (("delta", delta, delta_half), ("S1", s1, s1_half)):
-        mean, interval, by_seed = _mean_with_interval(values, half, design.shape[0])
-        mean, possible = _possible(mean, int(used.max()), (..., -1))
-        _add_index(arrays, name, mean, interval if possible is None else possible, by_seed)
+    first, seeds = np.empty(delta.shape[:3]), design.shape[0]
+    first_half, by_seed = np.full_like(first, np.nan), np.empty((*first.shape, seeds))
+    once = np.ones((1, len(design.points)))
+    for i, j in np.ndindex(*first.shape[:2]):
+        blocks = results.blocks(i, j)
+        statistic = partial(_first_order, design.points, blocks)
+        first[i, j] = statistic(once)[:, 0]
+        for k, of_seed in enumerate(np.split(blocks, seeds)):
+            by_seed[i, j, :, k] = _first_order(design.points, of_seed, once)[:, 0]
+        if len(design.points) > 1:
+            found = bootstrap_of_counts(statistic, len(design.points), table)
+            first_half[i, j] = quantile * found.bootstrap_distribution.std(axis=-1, ddof=1)
+    interval = np.stack([first - first_half, first + first_half], axis=-1)
+    of_delta, of_first = _mean_with_interval(delta, half, seeds), (first, interval, by_seed)
+    for name, (values, interval, by_seed) in (("delta", of_delta), ("S1", of_first)):
+        values, possible = _possible(values, int(used.max()), (..., -1))
+        _add_index(arrays, name, values, interval if possible is None else possible, by_seed)
     arrays["samples_used"] = (_DIMS[:2], used)
     arrays["samples_left_out"] = (_DIMS[:2], len(design.roles) - used)
+
+
+def _first_order(points: _Array, blocks: _Array, counts: _Array) -> _Array:
+    """Return first-order indices of given data, float64[factor, resample], as an analysis of variance.
+
+    The values of a block are divided by a factor into some √(2n) groups of equal size. The index is one minus the
+    variance within groups over the whole one, both without bias (ε² of Kelley 1935, doi 10.1073/pnas.21.9.554), and
+    both summed over blocks. Variances between groups alone are too large by (groups - 1) / n.
+
+    Parameters
+    ----------
+    points
+        float64[sample, factor].
+    blocks
+        float64[block, sample]; nan where a sample has no value.
+    counts
+        float64[resample, sample], how often each sample counts.
+    """
+    within, whole = np.zeros((points.shape[1], len(counts))), np.zeros(len(counts))
+    for y in blocks:
+        rows = np.isfinite(y)
+        n = int(rows.sum())
+        if n < 2:
+            continue
+        y, times = y[rows] - y[rows].mean(), counts[:, rows]
+        number, squares = times.sum(axis=1), times @ y**2
+        groups = min(round(math.sqrt(2 * n)), n // 2)
+        first = np.arange(groups) * n // groups
+        with np.errstate(divide="ignore", invalid="ignore"):
+            whole += (squares - (times @ y) ** 2 / number) / (number - 1)
+            for k, order in enumerate(np.argsort(points[rows], axis=0).T):
+                size = np.add.reduceat(times[:, order], first, axis=1)
+                sums = np.add.reduceat(times[:, order] * y[order], first, axis=1)
+                between = np.where(size > 0, sums**2 / size, 0.0).sum(axis=1)
+                within[k] += (squares - between) / (number - (size > 0).sum(axis=1))
+    return 1 - ratios(within, whole)
 
 
 def _add_grid(arrays: _Arrays, results: Results) -> None:
