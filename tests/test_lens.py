@@ -15,14 +15,15 @@ from lens_kit import paraxial_ghosts
 
 from vbnfault.core.errors import InputError
 from vbnfault.core.files import resources, toml_files
+from vbnfault.faults.degradation_lens import worn
 from vbnfault.lens import load_lens, paraxial_properties, parse_lens, scaled_to_field, scaled_to_focal_length
 from vbnfault.lens import rays as trace_module
 from vbnfault.lens.coating import NAMES, Layer, design, mean_reflectance, reflect_transmit
-from vbnfault.lens.glass import AIR, GLASSES, from_abbe
+from vbnfault.lens.glass import AIR, D_NM, GLASSES, from_abbe
 from vbnfault.lens.paraxial import along, gap, refraction, system
 from vbnfault.lens.prescription import Surface
 from vbnfault.lens.prescription_file import write_lens
-from vbnfault.lens.rays import ghost, real_pupil_diameter_mm, trace, transmittance
+from vbnfault.lens.rays import axial_transmittance, ghost, real_pupil_diameter_mm, trace, transmittance
 from vbnfault.lens.straylight.bundles import routes
 
 # (EFL, BFD, f-number by the paraxial pupil), the patents' rows recomputed
@@ -146,6 +147,21 @@ def test_coatings_against_tmm() -> None:
                     theirs = [tmm.coh_tmm(p, n, d, angle, wavelength) for p in "sp"]
                     expected = [t[key] for key in ("R", "T") for t in theirs]
                     np.testing.assert_allclose([float(v) for v in ours], expected, atol=1e-9)
+
+
+def test_a_film_that_absorbs_dims_the_image_and_reflects_otherwise_from_behind() -> None:
+    """A neutral filter of 20 nm of metal on a plane plate, by the package tmm."""
+    tmm = pytest.importorskip("tmm", reason="tmm (of the extra 'test') is not installed")
+    metal = {"n": 3.2, "k": 3.3, "thickness_nm": 20.0}
+    plate = {"radius_mm": math.inf, "thickness_mm": 2.0, "diameter_mm": 20.0}
+    lens = parse_lens({"surface": [STOP, plate | {"nd": 1.5, "coating": [metal]}, plate, GLASS, BACK]}, source="nd")
+    stack = [1.0, 3.2 + 3.3j, 1.5], [np.inf, 20.0, np.inf]
+    into, behind = (tmm.coh_tmm("s", n, d, 0, D_NM) for n, d in (stack, (stack[0][::-1], stack[1])))
+    bare = 0.04
+    assert axial_transmittance(lens, [D_NM]) == pytest.approx([into["T"] * (1 - bare) ** 3], rel=1e-9)
+    ghost_of_plate = transmittance(lens, ghost(lens, 1, 2), D_NM)
+    assert ghost_of_plate == pytest.approx(into["T"] * bare * behind["R"] * (1 - bare) ** 3, rel=1e-9)
+    assert worn(lens, np.array([D_NM]), 0.5) == pytest.approx([(into["T"] + 1 - bare) / (2 * into["T"])], rel=1e-9)
 
 
 def test_published_reflectances() -> None:

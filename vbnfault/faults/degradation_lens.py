@@ -37,7 +37,7 @@ from scipy import fft
 from ..core import spectra
 from ..core.spectra import Bands
 from ..lens import Prescription
-from ..lens.coating import mean_reflectance
+from ..lens.coating import reflect_transmit
 from ..lens.image_frame import ImageFrame
 from ..lens.straylight.scatter import Harvey
 from .context import FaultContext, Params
@@ -160,14 +160,14 @@ def browned(
 
 
 @lru_cache(maxsize=8)
-def _reflectances(lens: Prescription, wavelength_nm: tuple[float, ...]) -> tuple[F64, F64]:
-    """Return the reflectances of every surface at normal incidence, coated and bare, float64[row, band] each."""
+def _transmittances(lens: Prescription, wavelength_nm: tuple[float, ...]) -> tuple[F64, F64]:
+    """Return the transmittances of every surface at normal incidence, coated and bare, float64[row, band] each."""
     nodes = np.array(wavelength_nm)
     media = [np.ones_like(nodes), *(surface.medium.index(nodes) for surface in lens.surfaces)]
     coated, bare = (
         np.stack(
             [
-                mean_reflectance(surface.coating if whole else (), front, back, 1.0, nodes)
+                reflect_transmit(surface.coating if whole else (), front, back, 1.0, nodes)[2]
                 for surface, front, back in zip(lens.surfaces, media[:-1], media[1:], strict=True)
             ]
         )
@@ -181,8 +181,8 @@ def worn(lens: Prescription, wavelength_nm: F64, coating_loss: float) -> F64:
 
     `coating_loss` is the fraction of the coatings' area that is gone, in [0, 1].
     """
-    coated, bare = _reflectances(lens, tuple(wavelength_nm.tolist()))
-    return np.asarray(np.prod((1 - (coated + coating_loss * (bare - coated))) / (1 - coated), axis=0))
+    coated, bare = _transmittances(lens, tuple(wavelength_nm.tolist()))
+    return np.asarray(np.prod(1 + coating_loss * (bare / coated - 1), axis=0))
 
 
 def colours(params: Params, context: FaultContext) -> F64:

@@ -14,7 +14,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .coating import mean_reflectance
+from .coating import reflect_transmit
 from .glass import D_NM
 from .paraxial import paraxial_properties
 from .prescription import Prescription, Surface
@@ -185,14 +185,16 @@ def transmittance(lens: Prescription, path: Sequence[tuple[int, bool]], waveleng
     """
     nm = np.asarray(wavelength_nm, dtype=np.float64)
     index = [np.ones(nm.shape), *(surface.medium.index(nm) for surface in lens.surfaces)]
-    fraction = np.ones(nm.shape)
+    fraction, turn = np.ones(nm.shape), 1
     for row, mirror in path:
         if row == len(lens.surfaces):
             fraction = fraction * lens.sensor_reflectance
-            continue
-        films = lens.surfaces[row].coating
-        reflected = mean_reflectance(films, index[row], index[row + 1], 1.0, nm)
-        fraction = fraction * (reflected if mirror else 1 - reflected)
+        else:
+            # films that absorb reflect otherwise from behind; at normal incidence both polarisations are alike
+            films, (front, back) = lens.surfaces[row].coating[::turn], index[row : row + 2][::turn]
+            reflected, _, passed, _ = reflect_transmit(films, front, back, 1.0, nm)
+            fraction = fraction * (reflected if mirror else passed)
+        turn *= -1 if mirror else 1
     return fraction
 
 
