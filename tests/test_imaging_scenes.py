@@ -164,6 +164,31 @@ def test_stars_go_through_the_lens(sigma_px: float) -> None:
     assert checked >= 3
 
 
+def test_a_star_out_of_focus_is_a_disc_of_the_pupil() -> None:
+    """Focused at 0.2 m, the pupil's radius of f / 2N makes discs of radius f / (2 N 0.2 m) in tangents."""
+    images = []
+    for focus in ({}, {"focus_distance_m": 0.2}):
+        table = small_scene(
+            camera={"width_px": 256, "height_px": 256, "pixel_pitch_um": 100.0, "f_number": 2.0, **focus},
+            sky={"stars": "on", "limiting_magnitude": 2.0},
+            render={"bands": 3},
+        )
+        scene = config.parse_scene(table, source="test")
+        c, nodes = cameras.base_camera(scene), ephemeris.wavelengths_nm(scene)
+        dark = Radiance(array=np.zeros((3, 256, 256), np.float32), wavelength_nm=nodes)
+        stars = assemble.visible_stars(scene, dark, c, [np.eye(3)], np.ones((256, 256), dtype=bool))
+        assert stars is not None
+        images.append(stars.added_to(dark).array[1].astype(float))
+    radius_px = c.focal_length_px**2 * 100e-6 / (2 * 2.0 * 0.2)
+    assert 4 < radius_px < 6
+    sharp, soft = images
+    top, left = np.unravel_index(sharp[20:-20, 20:-20].argmax(), (216, 216))
+    light, disc = (picture[top + 8 : top + 33, left + 8 : left + 33] for picture in images)
+    assert disc.sum() == pytest.approx(light.sum(), rel=1e-3)
+    assert disc.max() == pytest.approx(light.sum() / (np.pi * (radius_px**2 + (2 * 0.6) ** 2)), rel=0.03)
+    assert soft.max() < sharp.max() / 20
+
+
 def test_a_thin_lens_has_neither_distortion_nor_guard_band() -> None:
     thin = cameras.base_camera(scene())
     assert isinstance(thin.lens, ThinLens)

@@ -332,15 +332,16 @@ def visible_stars(
         As in `sky.SkyFrame`.
 
     A lens with a point spread blurs the stars itself. For it they are drawn with `_STAR_SIGMA_PX`, whatever
-    `sky.sigma_px` is.
+    `sky.sigma_px` is. A lens that is focused on something near makes discs of them.
     """
     if scene.sky.stars == "off" or not open_sky.any():
         return None
     sigma_px = _STAR_SIGMA_PX if camera.lens.blurs else scene.sky.sigma_px
-    faintest = _faintest_star(scene, camera, radiance.wavelength_nm, sigma_px)
+    grid = camera if view is None else view
+    blur_px = camera.lens.aperture_radius_m / camera.lens.focus_distance_m * float(grid.intrinsics[0])
+    faintest = _faintest_star(scene, camera, radiance.wavelength_nm, float(np.hypot(sigma_px, blur_px / 2)))
     if faintest < sky.BRIGHTEST_V:
         return None
-    grid = camera if view is None else view
     catalogue = sky.load_catalogue().brighter_than(faintest)
     at_times = [
         sky.star_radiance(
@@ -355,6 +356,7 @@ def visible_stars(
             ),
             wavelength_nm=radiance.wavelength_nm,
             sigma_px=sigma_px,
+            blur_px=blur_px,
             julian_date=scene.sun.julian_date,
             sky=open_sky,
             lens_falloff=camera.lens.falls_off,

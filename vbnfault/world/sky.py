@@ -28,6 +28,7 @@ from ..core.files import file_contents, resources, user_files
 from ..core.frames import J2000_JD
 from ..core.quantities import Radiance
 from ..core.sundisc import Pinhole, Projection
+from ..lens.streaks import Streaks, drawn
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -54,6 +55,8 @@ COLOUR_RANGE_BV = (-0.4, 4.0)
 
 # The point spread is cut at this many σ, where 6e-7 of a star's light is left on either axis.
 REACH_SIGMA = 5.0
+
+_SHARP_PX = 0.05  # a smaller blur circle of defocus is ignored, as of the Sun
 
 # Sirius, the brightest star, has V = -1.44. A limiting magnitude below this value shows no star.
 BRIGHTEST_V = -1.5
@@ -246,6 +249,7 @@ def star_radiance(
     *,
     wavelength_nm: F64,
     sigma_px: float,
+    blur_px: float = 0.0,
     julian_date: float = J2000_JD,
     sky: NDArray[np.bool_] | None = None,
     lens_falloff: bool = False,
@@ -266,6 +270,9 @@ def star_radiance(
         Standard deviation of the Gaussian point spread in pixels, at least 0. The Gaussian is integrated over the
         pixels and cut at 5 σ. With 0, a star lights the one pixel that contains it. Nothing else may blur the frame
         by it again.
+    blur_px
+        Radius of the disc that a lens out of focus makes of a star. The disc is then drawn so much wider that its
+        variance holds that of the point spread.
     julian_date
         TDB Julian date, for proper motion.
     sky
@@ -276,11 +283,24 @@ def star_radiance(
         Whether a lens or a later stage multiplies by cos⁴ θ.
     """
     position, cosines, ahead = frame.positions_px(catalogue.direction_J(julian_date))
-    visible = _visible(position, frame, REACH_SIGMA * sigma_px, sky)
+    visible = _visible(position, frame, REACH_SIGMA * sigma_px + blur_px, sky)
     position, stars = position[visible], ahead[visible]
 
     irradiance = star_irradiance_W_m2_nm(catalogue.magnitude_V[stars], catalogue.colour_BV[stars], wavelength_nm)
     total = irradiance * _radiance_px_per_irradiance(frame, cosines[stars], lens_falloff)[:, None]
+    if blur_px > _SHARP_PX:
+        nothing = np.zeros(len(position))
+        discs = Streaks(
+            x_px=position[:, 0],
+            y_px=position[:, 1],
+            dx_px=nothing,
+            dy_px=nothing,
+            radius_px=nothing + np.hypot(blur_px, 2 * sigma_px),  # a disc has the variance (radius / 2)²
+            depth_m=nothing,
+        )
+        light = drawn(discs, total.T, (frame.height_px, frame.width_px))
+        rows, columns = np.nonzero(light.any(axis=0))
+        return StarRadiance(rows=rows, columns=columns, radiance=light[:, rows, columns].astype(np.float32))
     pixels, spread = _spread_over_pixels(position, np.array([frame.width_px, frame.height_px]), sigma_px)
     return StarRadiance(
         rows=pixels // frame.width_px,
