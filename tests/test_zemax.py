@@ -311,6 +311,8 @@ def test_glasses_are_those_beside_the_lens_file(tmp_path: Path) -> None:
     assert nodes == (350.0, 400.0)
     assert fractions == pytest.approx((0.93**0.4, 0.992**0.4))
     by_index = load_lens(written(tmp_path, TRIPLET.replace("GLAS SF6 0 0 1.5 40", "GLAS XYZ 0 0 1.7 30"), "b.zmx"))
+    assert by_index.source.endswith("; GLAS XYZ by nd and vd of the record, as no catalogue beside the file has it")
+    assert "GLAS" not in load_lens(written(tmp_path)).source
     assert by_index.surfaces[5].medium.nd == pytest.approx(1.7)
     assert by_index.surfaces[5].medium.vd == pytest.approx(30)
 

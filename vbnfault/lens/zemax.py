@@ -29,8 +29,9 @@ GLAS        glass by name, or by nd and vd
 Rims that are missing come from paraxial beams (`_with_rims`), and `source` says so.
 
 A glass is looked up in the catalogues, then among the registered glasses. If it is in neither, nd and vd of its
-GLAS record serve; older files have 1.5 and 40 there for every glass, which is refused. Surfaces in one medium
-without stop and aperture only set distances and are left out.
+GLAS record serve, and `source` names it: they may be those of a glass that stood there before. Older files have 1.5
+and 40 there for every glass, which is refused. Surfaces in one medium without stop and aperture only set distances
+and are left out.
 
 Records that change the light's path and are not read (COORDBRK and other surface types, mirrors, apertures that are
 not circular or not centred) are refused in a sentence. Wavelengths, pick-ups, solves, tolerances, drawing and
@@ -356,6 +357,9 @@ def read_lens(path: Path) -> tuple[dict[str, Any], tuple[GlassCatalogue, ...], t
         source += f"; the file has its object at {object_mm:g} mm; camera.focus_distance_m is used instead"
     source += _with_rims(surfaces[:-1], head, catalogues, f"{path}: SURF {stops[0]}")
     rows, numbers = _rows(surfaces[1:-1], unit_mm, catalogues)
+    fixed = {surface.glass[1] for surface in surfaces if surface.glass and surface.glass[2:3] == ["0"]}
+    if unlisted := sorted(name for name in fixed if glass_named(name, catalogues) is None):
+        source += f"; GLAS {', '.join(unlisted)} by nd and vd of the record, as no catalogue beside the file has it"
     return {"name": name, "source": source, "surface": rows}, catalogues, numbers
 
 
