@@ -17,9 +17,11 @@ from vbnfault.lens import (
     RealLens,
     imaging,
     load_lens,
+    parse_lens,
     scaled_to_field,
 )
 from vbnfault.lens.glass import C_NM, D_NM, F_NM
+from vbnfault.output import lens_sheet
 from vbnfault.scene import config
 from vbnfault.world import cameras
 
@@ -39,6 +41,28 @@ def test_distortion_is_that_of_chief_rays(name: str) -> None:
         np.testing.assert_allclose(found, expected, atol=0.5)
         np.testing.assert_allclose(lens.undistorted(found / lens.focal_length_px, wavelength), slope, rtol=1e-6)
     assert abs(expected / (slope * lens.focal_length_px) - 1).max() > 1e-3  # there is some
+
+
+def test_a_wide_lens_whose_heights_follow_the_angle_has_them_to_the_corners() -> None:
+    """At 55 degrees such a lens rises by a third of what it does on the axis, per tangent: no ray turns back."""
+    glass = {"thickness_mm": 2.0, "nd": 1.7, "diameter_mm": 60.0, "radius_mm": 60.0}
+    rows = [
+        glass,
+        {"radius_mm": 10.0, "thickness_mm": 16.0, "diameter_mm": 19.8},
+        {"stop": True, "thickness_mm": 0.5, "diameter_mm": 1.0},
+        glass | {"radius_mm": math.inf, "thickness_mm": 4.0, "diameter_mm": 16.0},
+        {"radius_mm": -10.0, "diameter_mm": 16.0},
+    ]
+    wide = parse_lens({"surface": rows}, source="wide")
+    lens = RealLens(prescription=wide, width_px=1024, height_px=1024, pixel_pitch_um=14.8)
+    assert lens.guard_px[0] > 200
+    slope = np.tan(np.radians([30.0, 45.0, 52.0, 54.0, 55.5]))
+    expected = chief_px(lens, slope, D_NM)
+    assert np.diff(expected)[-1] < 0.3 * np.diff(slope)[-1] * lens.focal_length_px
+    np.testing.assert_allclose(lens.distorted(slope) * lens.focal_length_px, expected, atol=0.012)
+    assert lens.coverage.corner_deg > 55
+    with pytest.raises(InputError, match="light from beyond 63 degrees into the corners"):
+        lens_sheet.opencv_fit(wide, 80.0, 1024, 1024)
 
 
 def test_lateral_colour_is_that_of_chief_rays() -> None:

@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 
 F64 = NDArray[np.float64]
 
-_STEEPNESS = 0.3  # dh/dt in focal lengths; below it chief rays are taken to turn back
-_ONWARD = (0.3, 1.5)  # limits of dh/dt beyond the last chief ray
+_STEEPNESS = 0.3  # dh/dθ in focal lengths; below it chief rays are taken to turn back
+_ONWARD = (0.3, 1.5)  # limits of the height's rise beyond the last chief ray: dh/dθ there, and dh/dt
 _HEIGHTS = 129  # rays of a meridional fan
 _SECANT_STEPS = 7
 _KNOWN, _CONTINUED = 192, 64  # field angles of the fit with and without a chief ray
@@ -146,7 +146,7 @@ def chief_heights(
 
     height = chief_heights_mm(lens, slope, wavelength_nm=wavelength_nm, sensor_mm=sensor_mm)
     with np.errstate(invalid="ignore"):
-        good = np.diff(height) > _STEEPNESS * efl_mm * np.diff(slope)
+        good = np.diff(height) > _STEEPNESS * efl_mm * np.diff(np.arctan(slope))
     last = len(slope) - 1 if good.all() else int(np.argmin(good))
     end = min(float(slope[last]), within)
     last = int(np.searchsorted(slope, end))
@@ -157,7 +157,8 @@ def chief_heights(
         )
     # h / t is even in t, so its derivative is 0 on the axis
     ratio = CubicSpline(slope[: last + 1], height[: last + 1] / slope[: last + 1], bc_type=((1, 0.0), "not-a-knot"))
-    onward = np.clip(ratio(end) + end * ratio(end, 1), _ONWARD[0] * efl_mm, _ONWARD[1] * efl_mm)
+    least_mm, most_mm = _ONWARD[0] * efl_mm / (1 + end * end), _ONWARD[1] * efl_mm
+    onward = np.clip(ratio(end) + end * ratio(end, 1), least_mm, most_mm)
     return ChiefHeights(ratio=ratio, end=end, onward_mm=float(onward))
 
 

@@ -44,11 +44,12 @@ def opencv_fit(lens: Prescription, fov_deg: float, width_px: int, height_px: int
     """Return the lens's distortion as a table `[camera.calibration]` of OpenCV's rational model, with the residual.
 
     The image of `width_px` x `height_px` pixels has the field of view `fov_deg` across its width, without
-    distortion. Raises InputError if no model reaches its corners.
+    distortion. Raises InputError if no model reaches its corners, or if the lens cannot image such a frame.
     """
     f_px = width_px / 2 / float(np.tan(np.radians(fov_deg) / 2))
     pitch_um = paraxial_properties(lens).efl_mm * 1e3 / f_px
     real_lens = RealLens(prescription=lens, width_px=width_px, height_px=height_px, pixel_pitch_um=pitch_um)
+    _ = real_lens.guard_px  # raises InputError where light comes into the corners from beyond the traced field
     rms, most = real_lens.distortion_residual_px
     values = {
         "model": '"opencv"',
