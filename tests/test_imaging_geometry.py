@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from conftest import small_scene
-from lens_kit import LENSES, PITCH_UM, SIDE_PX, camera, chief_px, real
+from lens_kit import LENSES, PITCH_UM, SIDE_PX, bundle, camera, chief_px, real
 
 from vbnfault import navigation, pipeline
 from vbnfault.core.errors import InputError
@@ -21,6 +21,7 @@ from vbnfault.lens import (
     scaled_to_field,
 )
 from vbnfault.lens.glass import C_NM, D_NM, F_NM
+from vbnfault.lens.point_spread import REACH_PX
 from vbnfault.output import lens_sheet
 from vbnfault.scene import config
 from vbnfault.world import cameras
@@ -49,7 +50,7 @@ def test_a_wide_lens_whose_heights_follow_the_angle_has_them_to_the_corners() ->
     rows = [
         glass,
         {"radius_mm": 10.0, "thickness_mm": 16.0, "diameter_mm": 19.8},
-        {"stop": True, "thickness_mm": 0.5, "diameter_mm": 1.0},
+        {"stop": True, "thickness_mm": 0.5, "diameter_mm": 1.5},
         glass | {"radius_mm": math.inf, "thickness_mm": 4.0, "diameter_mm": 16.0},
         {"radius_mm": -10.0, "diameter_mm": 16.0},
     ]
@@ -61,6 +62,11 @@ def test_a_wide_lens_whose_heights_follow_the_angle_has_them_to_the_corners() ->
     assert np.diff(expected)[-1] < 0.3 * np.diff(slope)[-1] * lens.focal_length_px
     np.testing.assert_allclose(lens.distorted(slope) * lens.focal_length_px, expected, atol=0.012)
     assert lens.coverage.corner_deg > 55
+    # the spots there are those of their own rays, too; across the radius they lie within reach of the point spread
+    spot, _ = bundle(lens, float(slope[-1]), D_NM)
+    kernel = imaging.point_spreads(lens, lens.distorted(slope[-1:]), np.zeros(1), D_NM)[0]
+    across = float((kernel.sum(axis=1) * np.arange(-REACH_PX, REACH_PX + 1) ** 2).sum())
+    assert across == pytest.approx(spot[:, 1].var(), rel=0.15)
     with pytest.raises(InputError, match="light from beyond 63 degrees into the corners"):
         lens_sheet.opencv_fit(wide, 80.0, 1024, 1024)
 

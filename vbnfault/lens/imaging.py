@@ -355,11 +355,14 @@ class RealLens:
         return field_bundles(self._round, self._slopes)
 
     @cached_property
+    def _lit_beams(self) -> FieldBundles:
+        """Return the bundles with light."""
+        return self._beams.select(self._beams.area_mm2 > 0)
+
+    @cached_property
     def _zones(self) -> FieldBundles:
-        """Return the bundles for point spreads: those with light, from the axis to the corner."""
-        beams = self._beams
-        lit = (beams.area_mm2 > 0) & (beams.slope <= 1.1 * self._corner)
-        return FieldBundles(slope=beams.slope[lit], centre_mm=beams.centre_mm[lit], rim_mm=beams.rim_mm[lit])
+        """Return the bundles whose spots set the best focus: those with light, from the axis to the corner."""
+        return self._lit_beams.select(self._lit_beams.slope <= 1.1 * self._corner)
 
     @cached_property
     def _best_shift_mm(self) -> float:
@@ -647,8 +650,8 @@ def point_spreads(lens: RealLens, distance: F64, azimuth_rad: F64, wavelength_nm
     slope = mapped.slope_at(distance * lens.focal_length_mm)
     solid = np.interp(slope, mapped.slope, lens._solid_angle_sr(mapped))
     return kernels_of_spots(
-        spot_diagrams(lens._round, lens._zones, wavelength_nm, lens.sensor_mm),
-        lens._zones.slope,
+        spot_diagrams(lens._round, lens._lit_beams, wavelength_nm, lens.sensor_mm),
+        lens._lit_beams.slope,
         slope,
         azimuth_rad,
         f_number=np.sqrt(np.pi / np.maximum(solid, 1e-3 * solid.max())) / 2,

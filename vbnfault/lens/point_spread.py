@@ -43,6 +43,10 @@ class FieldBundles:
     centre_mm: F64
     rim_mm: F64
 
+    def select(self, keep: NDArray[np.bool_]) -> FieldBundles:
+        """Return some of the bundles, bool[angle]."""
+        return FieldBundles(slope=self.slope[keep], centre_mm=self.centre_mm[keep], rim_mm=self.rim_mm[keep])
+
     @property
     def azimuth_rad(self) -> F64:
         """Return the azimuths of `rim_mm`, float64[azimuth]."""
