@@ -200,7 +200,8 @@ def patch_key(body: Body, site: Site, spec: PatchSpec) -> str:
         "site": [site.index, site.position_T_m.tolist(), site.T_from_L.tolist()],
         "spec": dataclasses.asdict(spec),
     }
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+    text = json.dumps(content, sort_keys=True, default=lambda table: table.model_dump())
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 @lru_cache(maxsize=1)

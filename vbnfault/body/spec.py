@@ -1,11 +1,15 @@
 """Describe how the terrain of a patch is built, as numbers that can be compared and hashed.
 
-The tables of a scene file (`scene.target`) state the range of each number and check it.
+`Fractured` and `Regolith` are tables of a scene file, too. `scene.target` states the ranges of the other numbers.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+
+from pydantic import Field
+
+from ..core.tables import Table, pair_within
 
 # Boulders of 7 m or more. Pajola et al. (2015, A&A 583, A37) counted 3546 on 36.4 km²: 97.4 ± 1.6 per km², with the
 # Poisson error of the count.
@@ -13,67 +17,56 @@ PER_KM2 = 98.0
 INDEX = 3.6
 
 
-@dataclass(frozen=True, kw_only=True)
-class Fractured:
-    """Shape the ground as layered and jointed rock with basins of dust, in place of rounded relief.
+class Fractured(Table):
+    """Shape the ground as layered and jointed rock with basins of dust, as on 67P."""
 
-    Attributes
-    ----------
-    strata, joints
-        Factors on terraces and ledges, and on the blocks and cracks between fractures.
-    dust_m
-        Thickness of dust on level ground.
-    dust_slope_deg
-        Slopes up to which all dust rests, and from which none does.
-    border_m
-        Thickness over which the cover of dust grows.
-    apron
-        Density of boulders on debris at the feet of cliffs, over that of other ground.
-    """
-
-    strata: float = 1.0
-    joints: float = 1.0
-    dust_m: float = 1.5
-    dust_slope_deg: tuple[float, float] = (20.0, 42.0)
-    border_m: float = 1.5
-    apron: float = 8.0
+    strata: float = Field(1.0, ge=0, le=3, description="factor on terraces and ledges")
+    joints: float = Field(1.0, ge=0, le=3, description="factor on the blocks and cracks between fractures")
+    dust_m: float = Field(1.5, ge=0, le=20, description="thickness of dust on level ground")
+    dust_slope_deg: pair_within(0, 85) = Field(  # type: ignore[valid-type]
+        (20.0, 42.0), description="slopes up to which all dust rests, and from which none does"
+    )
+    border_m: float = Field(1.5, gt=0, le=20, description="thickness over which the cover of dust grows")
+    apron: float = Field(
+        8.0,
+        ge=1,
+        le=50,
+        description="density of boulders on debris at the feet of cliffs, over that of other ground",
+    )
 
 
-@dataclass(frozen=True, kw_only=True)
-class Regolith:
-    """Shape the ground as that of asteroids and moons: craters of all sizes, regolith, rubble, smooth low plains.
+class Regolith(Table):
+    """Shape the ground as on asteroids and moons: craters of all sizes, regolith, rubble, smooth low plains."""
 
-    Attributes
-    ----------
-    crater_index
-        Exponent of the cumulative size law of craters, until they reach equilibrium.
-    crater_depth
-        Mean depth over diameter; fresh craters have 0.2.
-    largest_crater_m
-        Larger craters belong to the shape model.
-    simple_crater_m
-        Larger craters are complex: shallower, with level floors and central peaks.
-    equilibrium
-        Fraction of geometric saturation that the number of craters does not exceed.
-    ponds
-        Fraction of the craters that have level floors.
-    smooth
-        Fraction of the body, the lowest, that fine material levels where it is gentle.
-    rubble
-        Fraction of the places of small stones that hold one; 1: heaps without any ground between.
-    albedo_contrast
-        Scale by which the albedo of units of the ground and of boulders departs from its mean, over the mean.
-    """
-
-    crater_index: float = 2.0
-    crater_depth: float = 0.12
-    largest_crater_m: float = 300.0
-    simple_crater_m: float = 1e9
-    equilibrium: float = 0.05
-    ponds: float = 0.0
-    smooth: float = 0.0
-    rubble: float = 0.0
-    albedo_contrast: float = 0.1
+    crater_index: float = Field(
+        2.0, ge=0.5, le=5, description="of the cumulative size law of craters, until they reach equilibrium"
+    )
+    crater_depth: float = Field(0.12, ge=0.02, le=0.18, description="mean depth over diameter; fresh craters: 0.2")
+    largest_crater_m: float = Field(
+        300.0,
+        ge=1,
+        le=1e6,
+        description="larger ones belong to the shape: those beyond its mean radius, or two edges of a shape file",
+    )
+    simple_crater_m: float = Field(
+        1e9, ge=1, le=1e9, description="larger craters are complex: shallower, with level floors and central peaks"
+    )
+    equilibrium: float = Field(
+        0.05, ge=0.001, le=0.2, description="most craters, over those of geometric saturation (Gault 1970)"
+    )
+    ponds: float = Field(0.0, ge=0, le=1, description="fraction of the craters that have level floors")
+    smooth: float = Field(
+        0.0,
+        ge=0,
+        le=0.9,
+        description="fraction of the body, the lowest, that fine material levels where it is gentle",
+    )
+    rubble: float = Field(
+        0.0, ge=0, le=1, description="fraction of the places of small stones that hold one; 1: heaps everywhere"
+    )
+    albedo_contrast: float = Field(
+        0.1, ge=0, le=0.6, description="scale by which the albedos of ground and boulders depart from the mean"
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

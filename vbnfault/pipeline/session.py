@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..body import Body, Fractured, Patch, PatchSpec, Regolith, Site, Sites, cached_patch, choose_sites
+from ..body import Body, Patch, PatchSpec, Site, Sites, cached_patch, choose_sites
 from ..body.geometry import mean_edge_m
 from ..body.refine import GROWTH_POWER
 from ..camera import Camera
@@ -315,18 +315,16 @@ class Session:
         }
         near_m = []  # boulders lie as near as that
         if table.fractured is not None:
-            keys["fractured"] = Fractured(**table.fractured.model_dump())
             near_m.append(table.radius_m)
         if table.regolith is not None:
-            regolith = Regolith(**table.regolith.model_dump())
             # none is wider than the mean radius: it would swallow the body
             crater_m = boulder_m = self.body.mean_radius_m
             if self.scene.body.shape != "ellipsoid":  # larger ones are in the shape
                 edge_m = mean_edge_m(self.body.vertices_m, self.body.faces)
                 crater_m, boulder_m = min(crater_m, _CRATER_EDGES * edge_m), min(boulder_m, _BOULDER_EDGES * edge_m)
-            regolith = replace(regolith, largest_crater_m=min(regolith.largest_crater_m, crater_m))
+            largest = {"largest_crater_m": min(table.regolith.largest_crater_m, crater_m)}
             keys["largest_boulder_m"] = min(table.largest_boulder_m, boulder_m)
-            keys["regolith"] = regolith
+            keys["regolith"] = table.regolith.model_copy(update=largest)
             near_m.append(table.radius_m)
         if detail is not None:
             keys |= {"facet_m": detail.facet_m, "radius_m": detail.radius_m, "min_boulder_m": detail.boulder_m}

@@ -6,8 +6,9 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from ..body.spec import Fractured, Regolith
 from ..core import spectra
-from ..core.tables import Table, check_spectrum, pair_within
+from ..core.tables import Table, check_spectrum
 from ..reflectance import AnyReflectance
 from ..reflectance.disc import Lambert
 from .bodies import named_body, packaged_bodies
@@ -182,58 +183,6 @@ class BodyTable(Table):
         return self
 
 
-class FracturedTable(Table):
-    """Shape the ground as layered and jointed rock with basins of dust, as on 67P."""
-
-    strata: float = Field(1.0, ge=0, le=3, description="factor on terraces and ledges")
-    joints: float = Field(1.0, ge=0, le=3, description="factor on the blocks and cracks between fractures")
-    dust_m: float = Field(1.5, ge=0, le=20, description="thickness of dust on level ground")
-    dust_slope_deg: pair_within(0, 85) = Field(  # type: ignore[valid-type]
-        (20.0, 42.0), description="slopes up to which all dust rests, and from which none does"
-    )
-    border_m: float = Field(1.5, gt=0, le=20, description="thickness over which the cover of dust grows")
-    apron: float = Field(
-        8.0,
-        ge=1,
-        le=50,
-        description="density of boulders on debris at the feet of cliffs, over that of other ground",
-    )
-
-
-class RegolithTable(Table):
-    """Shape the ground as on asteroids and moons: craters of all sizes, regolith, rubble, smooth low plains."""
-
-    crater_index: float = Field(
-        2.0, ge=0.5, le=5, description="of the cumulative size law of craters, until they reach equilibrium"
-    )
-    crater_depth: float = Field(0.12, ge=0.02, le=0.18, description="mean depth over diameter; fresh craters: 0.2")
-    largest_crater_m: float = Field(
-        300.0,
-        ge=1,
-        le=1e6,
-        description="larger ones belong to the shape: those beyond its mean radius, or two edges of a shape file",
-    )
-    simple_crater_m: float = Field(
-        1e9, ge=1, le=1e9, description="larger craters are complex: shallower, with level floors and central peaks"
-    )
-    equilibrium: float = Field(
-        0.05, ge=0.001, le=0.2, description="most craters, over those of geometric saturation (Gault 1970)"
-    )
-    ponds: float = Field(0.0, ge=0, le=1, description="fraction of the craters that have level floors")
-    smooth: float = Field(
-        0.0,
-        ge=0,
-        le=0.9,
-        description="fraction of the body, the lowest, that fine material levels where it is gentle",
-    )
-    rubble: float = Field(
-        0.0, ge=0, le=1, description="fraction of the places of small stones that hold one; 1: heaps everywhere"
-    )
-    albedo_contrast: float = Field(
-        0.1, ge=0, le=0.6, description="scale by which the albedos of ground and boulders depart from the mean"
-    )
-
-
 class PatchTable(Table):
     """Set how far and how finely the terrain around a site is refined."""
 
@@ -287,10 +236,8 @@ class PatchTable(Table):
     boulder_index: float = Field(3.6, ge=0.5, le=6, description="of the cumulative size law; Pajola et al. 2015")
     boulders_per_km2: float = Field(98.0, ge=0, le=1e5, description="of 7 m or more; Pajola et al. 2015")
     largest_boulder_m: float = Field(45.0, ge=0.1, le=1000, description="diameter of the largest")
-    fractured: FracturedTable | None = Field(
-        None, description="layered and jointed rock in place of rounded relief"
-    )
-    regolith: RegolithTable | None = Field(
+    fractured: Fractured | None = Field(None, description="layered and jointed rock in place of rounded relief")
+    regolith: Regolith | None = Field(
         None,
         description="ground of asteroids and moons in place of a comet's; fractured, scarps, contour_scarps and "
         "intermittency do not count then",
