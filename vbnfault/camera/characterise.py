@@ -8,7 +8,7 @@ with a device of a simulated sensor.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Protocol
 
@@ -170,10 +170,7 @@ def characterise(
     darks = [_pair(take, 0.0, t, sites) for t in (use.exposure_s, *use.dark_exposures_s)]
     half = _half_saturation(photons, flats, next(iter(sites)))
     stacks = {"flat": _stack(take, half, use), "dark": _stack(take, 0.0, use)}
-    return {
-        name: _characterisation(_measurement(name, site, photons, flats, darks, stacks, use))
-        for name, site in sites.items()
-    }
+    return {name: _characterisation(name, site, photons, flats, darks, stacks, use) for name, site in sites.items()}
 
 
 def pictures(settings: Settings) -> int:
@@ -215,101 +212,51 @@ def _stack(take: Take, photons: float, use: Settings) -> tuple[F64, F64]:
     return mean, np.maximum(square / use.stack - mean * mean, 0) * use.stack / (use.stack - 1)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Measurement:
-    """Hold what the images of one channel give: means and variances of pairs, and the mean images of stacks.
+def _result(
+    channel: str,
+    transfer: PhotonTransfer,
+    light_dn: float,
+    dark_slopes: Sequence[float],
+    spatial_dn2: Sequence[float],
+) -> Result:
+    """Return the parameters of one channel. Raises InputError if no line fits its signal and its variance.
 
-    `dark_*` are float64[exposure]. `flat_dn` and `dark_dn` are float64[y, x]; the spatial variances are those of
-    these images without the part that comes from the temporal noise.
+    Parameters
+    ----------
+    light_dn
+        Mean signal of the light in the flat image of the stack.
+    dark_slopes
+        How mean and variance of darks grow with the exposure, in DN/s and DN²/s.
+    spatial_dn2
+        Spatial variances of the flat and of the dark image of the stacks, without those of the temporal noise.
     """
-
-    channel: str
-    transfer: PhotonTransfer
-    dark_mean_dn: F64
-    dark_variance_dn2: F64
-    dark_exposure_s: F64
-    flat_dn: F64
-    dark_dn: F64
-    flat_spatial_dn2: float
-    dark_spatial_dn2: float
-
-    @property
-    def light_dn(self) -> float:
-        """Return the mean signal of the light in the flat image of the stack."""
-        return float(self.flat_dn.mean() - self.dark_dn.mean())
-
-
-def _measurement(
-    name: str,
-    site: Site,
-    photons: F64,
-    flats: list[Pair],
-    darks: list[Pair],
-    stacks: dict[str, tuple[F64, F64]],
-    use: Settings,
-) -> _Measurement:
-    """Return what the pairs and stacks of images give for one channel."""
-    mean, variance = (np.array([pair[name][k] for pair in flats]) for k in (0, 1))
-    dark_means, dark_variances = (np.array([pair[name][k] for pair in darks]) for k in (0, 1))
-    (flat, flat_var), (dark, dark_var) = ((v[site] for v in stacks[kind]) for kind in ("flat", "dark"))
-    flat_spatial, dark_spatial = (
-        max(float(v.var(ddof=1) - in_time.mean() / use.stack), 0.0)
-        for v, in_time in ((flat, flat_var), (dark, dark_var))
-    )
-    return _Measurement(
-        channel=name,
-        transfer=PhotonTransfer(
-            photons=photons,
-            mean_dn=mean,
-            variance_dn2=variance,
-            dark_mean_dn=float(dark_means[0]),
-            dark_variance_dn2=float(dark_variances[0]),
-        ),
-        dark_mean_dn=dark_means,
-        dark_variance_dn2=dark_variances,
-        dark_exposure_s=np.array([use.exposure_s, *use.dark_exposures_s]),
-        flat_dn=flat,
-        dark_dn=dark,
-        flat_spatial_dn2=flat_spatial,
-        dark_spatial_dn2=dark_spatial,
-    )
-
-
-def _result(measured: _Measurement) -> Result:
-    """Return the parameters of one channel. Raises InputError if no line fits its signal and its variance."""
-    transfer = measured.transfer
     photons, signal = transfer.photons, transfer.mean_dn - transfer.dark_mean_dn
     dark_variance = transfer.dark_variance_dn2
     # saturation: where the variance is largest (section 6.6)
     last = int(np.argmax(transfer.variance_dn2))
     if last < 3:
         raise InputError(
-            f"channel {measured.channel}: it saturates within the first three exposures, so that no line can be "
-            "fitted"
+            f"channel {channel}: it saturates within the first three exposures, so that no line can be fitted"
         )
     before = np.arange(len(signal)) <= last
     linear = before & (signal <= _LINEAR_RANGE * signal[last])
     low, high = (fraction * signal[last] for fraction in _LINEARITY_RANGE)
     tested = before & (signal >= low) & (signal <= high)
-    if min(linear.sum(), tested.sum()) < 2 or min(signal[last], measured.light_dn) <= 0:
+    if min(linear.sum(), tested.sum()) < 2 or min(signal[last], light_dn) <= 0:
         raise InputError(
-            f"channel {measured.channel}: its signal does not rise with the light up to {signal[last]:.4g} DN, "
+            f"channel {channel}: its signal does not rise with the light up to {signal[last]:.4g} DN, "
             "where its variance is largest, so that no line can be fitted"
         )
     gain, response = _slopes(photons[linear], signal[linear], (transfer.variance_dn2 - dark_variance)[linear])
     if min(gain, response) <= 0:
-        raise InputError(
-            f"channel {measured.channel}: its variance does not rise with its signal, so that it has no gain"
-        )
+        raise InputError(f"channel {channel}: its variance does not rise with its signal, so that it has no gain")
     efficiency = response / gain
     dark_noise_e = float(np.sqrt(max(dark_variance - _QUANTISATION_DN2, 0.0)) / gain)
     saturation_photons = float(photons[last])
     saturation_e = efficiency * saturation_photons
     least = (np.sqrt(dark_noise_e**2 + _QUANTISATION_DN2 / gain**2 + 0.25) + 0.5) / efficiency
-    slope_mean, slope_variance = (
-        np.polyfit(measured.dark_exposure_s, v, 1)[0] for v in (measured.dark_mean_dn, measured.dark_variance_dn2)
-    )
-    prnu_dn = np.sqrt(max(measured.flat_spatial_dn2 - measured.dark_spatial_dn2, 0.0))
+    flat_spatial, dark_spatial = spatial_dn2
+    prnu_dn = np.sqrt(max(flat_spatial - dark_spatial, 0.0))
     return Result(
         gain_dn_per_e=gain,
         quantum_efficiency=efficiency,
@@ -321,27 +268,51 @@ def _result(measured: _Measurement) -> Result:
         snr_max=float(np.sqrt(saturation_e)),
         dynamic_range=float(saturation_photons / least),
         linearity_error_percent=_linearity(photons[tested], signal[tested]),
-        dark_current_mean_e_s=float(slope_mean / gain),
-        dark_current_variance_e_s=float(slope_variance / gain**2),
-        dsnu_e=float(np.sqrt(measured.dark_spatial_dn2) / gain),
-        prnu_percent=float(100 * (prnu_dn / measured.light_dn)),
+        dark_current_mean_e_s=float(dark_slopes[0] / gain),
+        dark_current_variance_e_s=float(dark_slopes[1] / gain**2),
+        dsnu_e=float(np.sqrt(dark_spatial) / gain),
+        prnu_percent=float(100 * (prnu_dn / light_dn)),
         black_level_dn=transfer.dark_mean_dn,
     )
 
 
-def _characterisation(measured: _Measurement) -> Characterisation:
-    """Return the characterisation of one channel. Raises InputError as `_result` does."""
-    flat, dark = measured.flat_dn, measured.dark_dn
+def _characterisation(
+    name: str,
+    site: Site,
+    photons: F64,
+    flats: list[Pair],
+    darks: list[Pair],
+    stacks: dict[str, tuple[F64, F64]],
+    use: Settings,
+) -> Characterisation:
+    """Return what the pairs and stacks of images give for one channel. Raises InputError as `_result` does."""
+    mean, variance = (np.array([pair[name][k] for pair in flats]) for k in (0, 1))
+    dark_means, dark_variances = (np.array([pair[name][k] for pair in darks]) for k in (0, 1))
+    transfer = PhotonTransfer(
+        photons=photons,
+        mean_dn=mean,
+        variance_dn2=variance,
+        dark_mean_dn=float(dark_means[0]),
+        dark_variance_dn2=float(dark_variances[0]),
+    )
+    (flat, flat_var), (dark, dark_var) = ((v[site] for v in stacks[kind]) for kind in ("flat", "dark"))
+    spatial_dn2 = [
+        max(float(v.var(ddof=1) - in_time.mean() / use.stack), 0.0)
+        for v, in_time in ((flat, flat_var), (dark, dark_var))
+    ]
+    exposure_s = np.array([use.exposure_s, *use.dark_exposures_s])
+    slopes = [np.polyfit(exposure_s, of_darks, 1)[0] for of_darks in (dark_means, dark_variances)]
+    light_dn = float(flat.mean() - dark.mean())
     return Characterisation(
-        channel=measured.channel,
-        result=_result(measured),  # refuses what the maps could not divide by
-        transfer=measured.transfer,
-        dark_mean_dn=measured.dark_mean_dn,
-        dark_variance_dn2=measured.dark_variance_dn2,
-        dark_exposure_s=measured.dark_exposure_s,
+        channel=name,
+        result=_result(name, transfer, light_dn, slopes, spatial_dn2),  # refuses what the maps could not divide by
+        transfer=transfer,
+        dark_mean_dn=dark_means,
+        dark_variance_dn2=dark_variances,
+        dark_exposure_s=exposure_s,
         spectrum=_spectrum(flat, dark),
         dsnu_map_dn=dark - dark.mean(),
-        prnu_map=(flat - dark) / measured.light_dn - 1,
+        prnu_map=(flat - dark) / light_dn - 1,
     )
 
 
