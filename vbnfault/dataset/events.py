@@ -77,34 +77,30 @@ def events(path: str | os.PathLike[str] | Url) -> list[FaultEvent]:
     store = stores.open_store(path)
     if not store.spec.sequence_names:
         raise InputError(f"{store.path}: has no sequences, so nothing happens in time")
-    seen: dict[tuple[int, int, str, float], dict[str, Any]] = {}
+    seen: dict[tuple[int, int, float, str], list[tuple[int, float, float | None]]] = {}
     for samples, columns in finished_scalars(store, _READ):
-        for sequence, frame, k, fault, event in _in_frames(store, samples, columns):
-            onset_s, cause = _number(event, "onset_s"), str(event.get("cause", ""))
-            fraction = _number(event, "fraction")
-            key = sequence, k, cause, float("-inf") if onset_s is None else onset_s
-            known = seen.setdefault(
-                key,
-                {
-                    "sequence": _name(store, sequence),
-                    "fault": fault,
-                    "cause": cause,
-                    "onset_s": onset_s,
-                    "end_s": _number(event, "end_s"),
-                    "first_frame": frame,
-                    "last_frame": frame,
-                    "frames": 0,
-                    "largest_fraction": 0.0,
-                },
+        for sequence, frame, k, event in _in_frames(store, samples, columns):
+            onset_s, fraction = _number(event, "onset_s"), _number(event, "fraction")
+            key = sequence, k, float("-inf") if onset_s is None else onset_s, str(event.get("cause", ""))
+            of_frame = frame, 1.0 if fraction is None else fraction, _number(event, "end_s")
+            seen.setdefault(key, []).append(of_frame)
+    listed = []
+    for (sequence, k, onset_s, cause), of_frames in sorted(seen.items(), key=lambda item: item[0]):
+        frames, fractions, ends_s = zip(*of_frames, strict=True)
+        listed.append(
+            FaultEvent(
+                sequence=_name(store, sequence),
+                fault=store.spec.faults[k],
+                cause=cause,
+                onset_s=None if onset_s == float("-inf") else onset_s,
+                end_s=ends_s[0],
+                first_frame=min(frames),
+                last_frame=max(frames),
+                frames=len(frames),
+                largest_fraction=max(fractions),
             )
-            known["frames"] += 1
-            known["first_frame"], known["last_frame"] = (
-                min(known["first_frame"], frame),
-                max(known["last_frame"], frame),
-            )
-            known["largest_fraction"] = max(known["largest_fraction"], 1.0 if fraction is None else fraction)
-    order = sorted(seen, key=lambda key: (key[0], key[1], key[3], key[2]))
-    return [FaultEvent(**seen[key]) for key in order]
+        )
+    return listed
 
 
 def _number(event: Mapping[str, Any], name: str) -> float | None:
@@ -121,14 +117,14 @@ def _name(store: Store, sequence: int) -> str:
 
 def _in_frames(
     store: Store, samples: Sequence[int], columns: Mapping[str, NDArray[Any]]
-) -> Iterator[tuple[int, int, int, str, Mapping[str, Any]]]:
-    """Yield sequence, frame, number and name of every fault of every frame, and what is stored of its event."""
+) -> Iterator[tuple[int, int, int, Mapping[str, Any]]]:
+    """Yield sequence, frame and number of every fault of every frame, and what is stored of its event."""
     rows = zip(samples, *(columns[name].tolist() for name in _READ), strict=True)
     for i, sequence, frame, text in rows:
         parameters = store.table(i, "parameters", text)
         for k, fault in enumerate(store.spec.faults):
             if fault in parameters:
-                yield sequence, frame, k, fault, event_of(parameters, fault)
+                yield sequence, frame, k, event_of(parameters, fault)
 
 
 def as_csv(listed: Iterable[FaultEvent]) -> str:
