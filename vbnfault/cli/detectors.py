@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -12,7 +11,7 @@ import typer
 
 from ..core.errors import InputError
 from .app import app
-from .options import MOST_PROCESSES, MOST_SEED, grouped, local_path, number, progress_bar, whole
+from .options import MOST_PROCESSES, MOST_SEED, advancing, grouped, local_path, number, whole
 
 if TYPE_CHECKING:
     from ..detect.training import TrainOptions
@@ -154,30 +153,15 @@ def score(
     )
     folder = out or model.absolute().parent / f"{model.absolute().name}_on_{Path(dataset.rstrip('/')).stem}"
     if not whole_tests:
-        with _advancing() as advance:
+        with advancing("samples") as advance:
             result = compare(model, dataset, folder, options, advance=advance)
         _say_means(result)
         typer.echo(f"page: {folder / PAGE}")
         return
-    with _advancing() as advance:
+    with advancing("samples") as advance:
         for part, result in score_benchmark(model, Path(dataset), folder, options, advance):
             _say_means(result, f"{part}: ")
             typer.echo(f"page: {folder / part / PAGE}")
-
-
-@contextlib.contextmanager
-def _advancing() -> Iterator[Callable[[int, int], None]]:
-    """Yield a function that shows how many of how many samples are done; a smaller number begins a new bar."""
-    with contextlib.ExitStack() as stack:
-        bars: list[Any] = []
-
-        def advance(done: int, count: int) -> None:
-            if not bars or done < bars[-1].pos:
-                stack.close()
-                bars.append(stack.enter_context(progress_bar(count, "samples")))
-            bars[-1].update(done - bars[-1].pos)
-
-        yield advance
 
 
 def _say_means(result: Mapping[str, Any], where: str = "") -> None:

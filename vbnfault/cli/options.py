@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import inspect
@@ -9,7 +10,7 @@ import math
 import re
 import sys
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
@@ -253,6 +254,21 @@ def progress_bar(length: int, label: str) -> Any:
     """
     hidden = not length or not sys.stderr.isatty()
     return typer.progressbar(length=length, label=label, file=sys.stderr, hidden=hidden)
+
+
+@contextlib.contextmanager
+def advancing(label: str) -> Iterator[Callable[[int, int], None]]:
+    """Yield a function that shows how many of how many steps are done; a smaller number begins a new bar."""
+    with contextlib.ExitStack() as stack:
+        bars: list[Any] = []
+
+        def advance(done: int, count: int) -> None:
+            if not bars or done < bars[-1].pos:
+                stack.close()
+                bars.append(stack.enter_context(progress_bar(count, label)))
+            bars[-1].update(done - bars[-1].pos)
+
+        yield advance
 
 
 def check_written(read: str, written: Mapping[str, Path | None]) -> None:

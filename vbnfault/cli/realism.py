@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import typer
 
@@ -13,11 +13,11 @@ from .app import app
 from .options import (
     MOST_PROCESSES,
     SceneOption,
+    advancing,
     check_written,
     local_path,
     number,
     overrides,
-    progress_bar,
     replaced,
     whole,
 )
@@ -57,21 +57,11 @@ def passport(
     options = PassportOptions(
         part=part, kept_back=kept_back, gains=tuple(gain or (1.0,)), mendings=mend_poses, threads=threads
     )
-    with contextlib.ExitStack() as stack:
-        bars: list[Any] = []
-
-        def advance(done: int, count: int) -> None:
-            if not bars:
-                bars.append(stack.enter_context(progress_bar(count, "frames and classifiers")))
-            bars[0].update(done - bars[0].pos)
-
+    with advancing("frames and classifiers") as advance:
         result = compare(frames, scene, out, options, overrides=overrides(settings), poses=poses, advance=advance)
-    for text in result["conclusions"]["may"]:
-        typer.echo(f"may: {text}")
-    for text in result["conclusions"]["undecided"]:
-        typer.echo(f"undecided: {text}")
-    for text in result["conclusions"]["may_not"]:
-        typer.echo(f"may not: {text}")
+    for name in ("may", "undecided", "may_not"):
+        for text in result["conclusions"][name]:
+            typer.echo(f"{name.replace('_', ' ')}: {text}")
     typer.echo(f"page: {out / PAGE}")
 
 
