@@ -103,23 +103,15 @@ def with_numbers(data: bytes, numbers: NDArray[Any], text: str) -> bytes:
 
     stream = io.BytesIO(data)
     with _without_log_lines(), tifffile.TiffFile(stream, mode="r+") as file:
-        page = _only_page(file)
-        height, width, every = page.imagelength, page.imagewidth, page.samplesperpixel
-        together = every if page.planarconfig == 1 else 1
-        tall, wide = (page.tilelength, page.tilewidth) if page.is_tiled else (min(page.rowsperstrip, height), width)
-        order, offsets, counts = file.byteorder, [], []
-        kind = numbers.dtype.newbyteorder(order)
+        page, offsets, counts = _only_page(file), [], []
+        kind = numbers.dtype.newbyteorder(file.byteorder)
         stream.seek(0, io.SEEK_END)
-        for plane in range(every // together):
-            for top in range(0, height, tall):
-                for left in range(0, width, wide):
-                    rows = tall if page.is_tiled else min(tall, height - top)
-                    block = np.zeros((rows, wide, together), kind)
-                    part = numbers[top : top + rows, left : left + wide, plane * together : (plane + 1) * together]
-                    block[: part.shape[0], : part.shape[1]] = part
-                    stream.seek(stream.tell() % 2, io.SEEK_CUR)  # blocks start at even offsets
-                    offsets.append(stream.tell())
-                    counts.append(stream.write(block.tobytes()))
+        for place, shape in _blocks(page):
+            block, part = np.zeros(shape, kind), numbers[place]
+            block[: part.shape[0], : part.shape[1]] = part
+            stream.seek(stream.tell() % 2, io.SEEK_CUR)  # blocks start at even offsets
+            offsets.append(stream.tell())
+            counts.append(stream.write(block.tobytes()))
         where, sizes = (324, 325) if page.is_tiled else (273, 279)
         for tag, value in ((where, tuple(offsets)), (sizes, tuple(counts)), (259, 1), (266, 1), (317, 1)):
             if tag in page.tags:
@@ -239,27 +231,33 @@ def _name(value: Any) -> str:
     return getattr(value, "name", str(value))
 
 
-def _samples(page: TiffPage, data: bytes, most_values: int) -> NDArray[Any]:
-    """Return the numbers of a page as stored, [y, x, sample]. Raises InputError."""
+def _blocks(page: TiffPage) -> Iterator[tuple[tuple[slice, slice, slice], tuple[int, int, int]]]:
+    """Yield the place of each block in a page's numbers [y, x, sample], and its own shape, which may be larger."""
     height, width, every = page.imagelength, page.imagewidth, page.samplesperpixel
     together = every if page.planarconfig == 1 else 1  # samples of one block
     tall, wide = (page.tilelength, page.tilewidth) if page.is_tiled else (min(page.rowsperstrip, height), width)
-    down, across = -(-height // tall), -(-width // wide)
+    for plane in range(0, every, together):
+        for top in range(0, height, tall):
+            rows = tall if page.is_tiled else min(tall, height - top)
+            for left in range(0, width, wide):
+                place = slice(top, top + rows), slice(left, left + wide), slice(plane, plane + together)
+                yield place, (rows, wide, together)
+
+
+def _samples(page: TiffPage, data: bytes, most_values: int) -> NDArray[Any]:
+    """Return the numbers of a page as stored, [y, x, sample]. Raises InputError."""
+    _, (tall, wide, together) = next(_blocks(page))
     check_values(tall, wide, together, most_values)
     row_bytes = -(-wide * together * page.bitspersample // 8)
-    offsets, counts = page.dataoffsets, page.databytecounts
-    if len(offsets) != down * across * (every // together) or len(counts) != len(offsets):
-        raise InputError("is a damaged TIFF file")
-    out = np.zeros((height, width, every), page.dtype)
-    for number, (offset, count) in enumerate(zip(offsets, counts, strict=True)):
-        plane, place = divmod(number, down * across)
-        top, left = tall * (place // across), wide * (place % across)
-        rows = tall if page.is_tiled else min(tall, height - top)
+    out = np.zeros((page.imagelength, page.imagewidth, page.samplesperpixel), page.dtype)
+    # other numbers of offsets than of blocks raise an error, which stands for a damaged file
+    blocks = zip(_blocks(page), page.dataoffsets, page.databytecounts, strict=True)
+    for (place, (rows, _, _)), offset, count in blocks:
         if count == 0:
             raise InputError("is a TIFF file without data in some of its blocks; save it with all of them")
         block = _unpacked(page, data[offset : offset + count], rows, row_bytes, count)
-        values = _unpredicted(page, block, wide, together)[: height - top, : width - left]
-        out[top : top + rows, left : left + wide, plane : plane + together] = values
+        part = out[place]
+        part[...] = _unpredicted(page, block, wide, together)[: part.shape[0], : part.shape[1]]
     if _GDAL_NODATA in page.tags:
         missing = int(np.count_nonzero(out == np.float64(page.tags[_GDAL_NODATA].value)))
         if missing:
