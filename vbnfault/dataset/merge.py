@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -165,15 +165,6 @@ def _same(path: Location, other: Location) -> bool:
     return real(path) == real(other)
 
 
-@dataclass
-class _Counts:
-    """Count what becomes of the samples."""
-
-    before: int = 0
-    taken: dict[str, int] = field(default_factory=dict)
-    damaged: dict[int, str] = field(default_factory=dict)  # sample → what is wrong with it, in the last store
-
-
 class _Merge:
     """Join stores; the constructor compares them and prepares the store that gets their samples.
 
@@ -199,7 +190,8 @@ class _Merge:
         self.store = self._with_versions(store_module.recover(target))
         self._digests = SampleDigests(self.store.samples)
         self._begun = {source: set(source.begun()) for source in sources}
-        self._counts = _Counts(taken={str(source.path): 0 for source in sources})
+        self._before, self._taken = 0, {str(source.path): 0 for source in sources}
+        self._damaged: dict[int, str] = {}  # sample → what is wrong with it, in the last store
 
     def _with_versions(self, store: Store) -> Store:
         """Record which versions made the samples that will be taken; return the store opened again.
@@ -220,8 +212,7 @@ class _Merge:
 
     def run(self, bar: Progress) -> MergeSummary:
         """Take the samples of all shards."""
-        store, counts = self.store, self._counts
-        missing: list[int] = []
+        store, missing = self.store, list[int]()
         begun = set(store.begun()).union(*self._begun.values())
         for number in range(store.shards):
             held, before = set[int](), set[int]()
@@ -232,19 +223,19 @@ class _Merge:
             missing += [i for i in store.shard(number) if i not in held]
             for i in store.shard(number):
                 bar.advance(i in held and i not in before)
-        lost = sorted(set(counts.damaged).intersection(missing))
+        lost = sorted(set(self._damaged).intersection(missing))
         if lost:
             raise VbnfaultError(
                 f"{store.path}: {len(lost)} samples ({spans(lost)}) are damaged in every store that holds them, "
-                f"the first with: {counts.damaged[lost[0]]}; all others are merged, and the build command "
+                f"the first with: {self._damaged[lost[0]]}; all others are merged, and the build command "
                 "makes these again"
             )
         return MergeSummary(
             path=store.path,
             samples=store.samples,
             finished=store.samples - len(missing),
-            before=counts.before,
-            taken=counts.taken,
+            before=self._before,
+            taken=self._taken,
             missing=tuple(missing),
             digest=self._digests.of(store) if self._digests.complete else None,
             moved=self._move,
@@ -254,7 +245,7 @@ class _Merge:
         """Take the samples of a shard that the store lacks; return those that it holds then, and held before."""
         digests = dict(store_module.examine_shard(self.store, number).digests)
         before = set(digests)
-        self._counts.before += len(digests)
+        self._before += len(digests)
         for source in self.sources:
             finished = {i for i, done in source.done(number).items() if done}
             if not finished - digests.keys():
@@ -262,7 +253,7 @@ class _Merge:
             checked = store_module.examine_shard(source, number)
             for problem in checked.problems:
                 if not problem.unfinished:
-                    self._counts.damaged |= dict.fromkeys(problem.samples, f"{source.path}: {problem.sentence}")
+                    self._damaged |= dict.fromkeys(problem.samples, f"{source.path}: {problem.sentence}")
             new = {i: digest for i, digest in checked.digests.items() if i not in digests}
             if not new:
                 continue
@@ -272,7 +263,7 @@ class _Merge:
             else:
                 self._add(number, source, new, digests)
             digests |= new
-            self._counts.taken[str(source.path)] += len(new)
+            self._taken[str(source.path)] += len(new)
         self._digests.add(digests)
         for source in self.sources if self._move else ():
             if number in self._begun[source] and _holds_no_other(source, number, digests):
