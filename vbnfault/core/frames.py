@@ -110,6 +110,17 @@ def boresight_angle_deg(roll_deg: F64 | float, pitch_deg: F64 | float) -> F64:
     return np.degrees(np.arccos(np.clip(np.cos(np.radians(roll_deg)) * np.cos(np.radians(pitch_deg)), -1, 1)))
 
 
+def matrix_of(w: float, x: float, y: float, z: float) -> F64:
+    """Return the rotation matrix of a unit quaternion, float64[3, 3]."""
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
 def quaternion(matrix: F64) -> F64:
     """Return the unit quaternion (w, x, y, z), w ≥ 0, of a rotation matrix, float64[4]."""
     from scipy.spatial.transform import Rotation

@@ -20,6 +20,7 @@ from pydantic import Field, model_validator
 from ..core import tables
 from ..core.errors import InputError, shown, under_key
 from ..core.files import column_files, file_contents
+from ..core.frames import matrix_of
 from ..core.tables import Table
 from .flights import AnyFlight, frames_of
 from .motion import between_frames
@@ -198,20 +199,12 @@ class Trajectory:
 
     def pose(self, index: int) -> FlownPose:
         """Return one row, counted from 0."""
-        w, x, y, z = self.camera_from_T[index]
-        camera_from_T = np.array(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-            ]
-        )
         sequence, frame = place_in_sequence(self.frames, index)
         return FlownPose(
             name=self.name[index],
             julian_date=float(self.julian_date[index]),
             camera_position_T_m=self.camera_position_T_m[index],
-            T_from_C=camera_from_T.T,
+            T_from_C=matrix_of(*self.camera_from_T[index]).T,
             sun_direction_T=self.sun_direction_T[index],
             sun_distance_au=float(self.sun_distance_au[index]),
             sequence=sequence,

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError, shown
+from ..frames import matrix_of
 from . import path_checks, user_files
 
 F64 = NDArray[np.float64]
@@ -381,14 +382,7 @@ class _Gltf:
         x, y, z, w = self.reals(node.get("rotation", [0, 0, 0, 1]), 4, f"{where}.rotation")
         scale = self.reals(node.get("scale", [1, 1, 1]), 3, f"{where}.scale")
         matrix = np.eye(4)
-        turn = np.array(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-                [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-                [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-            ]
-        )
-        matrix[:3, :3] = turn * scale
+        matrix[:3, :3] = matrix_of(w, x, y, z) * scale
         matrix[:3, 3] = self.reals(node.get("translation", [0, 0, 0]), 3, f"{where}.translation")
         return matrix
 
