@@ -15,6 +15,7 @@ import sys
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Annotated, Any
 
 import numpy as np
@@ -32,7 +33,7 @@ from .lock import locked, others_at_work, prepared_by_one
 from .processes import Pool
 from .progress import Progress, duration_text, size_text
 from .resume import check_same_scene, known_versions, with_versions_noted
-from .tasks import Run, SampleWorkers, SessionFactory
+from .tasks import Run, SampleWorker, SessionFactory
 from .work import Job, WorkerFactory, run_here
 
 
@@ -338,7 +339,7 @@ def _run(
     with run.progress:
         for line in summary.outlook():
             run.progress.say(line)
-        do_tasks(SampleWorkers(session_factory, run.path.absolute()), run, options)
+        do_tasks(partial(SampleWorker, session_factory, run.path.absolute()), run, options)
     return run
 
 

@@ -62,25 +62,14 @@ class Task:
     careful: bool = False
 
 
-@dataclass(frozen=True)
-class SampleWorkers:
-    """Make a worker of a build; the object is a function that can be pickled.
+class SampleWorker:
+    """Make the samples of tasks; the session is made when the first sample needs it.
 
-    `factory` makes the session of the worker, `path` is the store.
+    `factory` makes the session, `path` is the store.
     """
 
-    factory: SessionFactory
-    path: Location
-
-    def __call__(self) -> _SampleWorker:
-        return _SampleWorker(self)
-
-
-class _SampleWorker:
-    """Make the samples of tasks; the session is made when the first sample needs it."""
-
-    def __init__(self, source: SampleWorkers) -> None:
-        self._session, self._path = Lazy(source.factory), source.path
+    def __init__(self, factory: SessionFactory, path: Location) -> None:
+        self._session, self._path = Lazy(factory), path
 
     def do(self, task: Task, tick: Tick) -> None:
         """Do a task."""
