@@ -40,52 +40,36 @@ if TYPE_CHECKING:
     from .store import open_dataset
     from .study.run import study
 
-# public name → the module that defines it, and the name there if it is another; without one: the module itself. It
-# is loaded when the name is first used. `tests/test_api.py` compares this table with the imports above.
-_HOMES = {
-    "BuildOptions": "dataset",
-    "Calibration": "core.calibration",
-    "DiscReflectance": "reflectance",
-    "Effect": "detector.effects",
-    "Exposure": "detector.effects",
-    "Fault": "faults",
-    "FaultContext": "faults",
-    "Flare": "output.flare_images",
-    "Injected": "inject",
-    "Injector": "inject",
-    "InputError": "core.errors",
-    "Interval": "faults",
-    "Prescription": "lens",
-    "Reflectance": "reflectance",
-    "Scene": "scene.config",
-    "Sensor": "detector.sensor",
-    "Session": "pipeline",
-    "VbnfaultError": "core.errors",
-    "bounds": "faults",
+# Module → the public names that it defines. It is loaded when one of them is first used.
+_DEFINED = {
+    "core.calibration": ("Calibration",),
+    "core.errors": ("InputError", "VbnfaultError"),
+    "dataset": ("BuildOptions", "verify"),
+    "dataset.events": ("events",),
+    "dataset.retake": ("retake",),
+    "dataset.statistics": ("statistics",),
+    "detector.effects": ("Effect", "Exposure"),
+    "detector.sensor": ("Sensor", "load_sensor"),
+    "faults": ("Fault", "FaultContext", "Interval", "bounds", "choice", "flag", "number", "path", "rows", "text"),
+    "inject": ("Injected", "Injector"),
+    "lens": ("Prescription", "load_lens"),
+    "output.flare_images": ("Flare", "trace_flare"),
+    "pipeline": ("Session", "simulate"),
+    "reflectance": ("DiscReflectance", "Reflectance"),
+    "scene.config": ("Scene", "load_scene"),
+    "store": ("open_dataset",),
+}
+# Public name → its module, with the name there if it is another; with nothing behind the colon: the module itself.
+# `tests/test_api.py` compares this table with the imports above.
+_HOMES = {name: module for module, names in _DEFINED.items() for name in names} | {
     "build": "dataset:build_scene",
-    "choice": "faults",
-    "events": "dataset.events",
-    "flag": "faults",
     "export": "output.export:export_store",
     "inject": "inject:",
-    "load_lens": "lens",
-    "load_scene": "scene.config",
-    "load_sensor": "detector.sensor",
     "merge": "dataset:merge_stores",
     "navigation": "navigation:",
-    "number": "faults",
-    "open_dataset": "store",
-    "path": "faults",
     "report": "output.report:write_report",
-    "retake": "dataset.retake",
-    "rows": "faults",
-    "simulate": "pipeline",
-    "statistics": "dataset.statistics",
     "study": "study:",
-    "text": "faults",
     "torch": "torch:",
-    "trace_flare": "output.flare_images",
-    "verify": "dataset",
 }
 
 __all__ = sorted([*_HOMES, "__version__"])
