@@ -247,7 +247,7 @@ def test_ground_that_other_ground_hides_is_found_and_does_not_make_facets_coarse
     pose = aiming.aimed_view(wanted, body, site, "nadir", values | {"phase_deg": 30.0, "sun_turn_deg": 0.0}).pose
     (detail,) = ground.ground_details(wanted, body, [pose])
     assert detail.radius_m < 2 * 700 * np.tan(np.radians(FOV_DEG / 2))
-    assert detail.facet_m < 1.1 * 700 * ground.pixel_rad(wanted)
+    assert detail.facet_m < 1.1 * 700 * wanted.camera.pixel_rad
 
 
 # ------------------------------------------------------------------------------------------- stored samples

@@ -330,7 +330,7 @@ def test_terrain_is_whole_from_afar_and_shared_and_a_patch_near_the_ground(tmp_p
     rich = scene.model_copy(update={"patch": scene.patch.model_copy(update={"max_triangles": 20_000_000})})
     (middle,) = ground.ground_details(rich, body, [as_trajectory(columns_of([row("b", (0, 0, 1500.0))])).pose(0)])
     assert middle.position_T_m[2] > 450
-    assert 0.7 < middle.facet_m / (1000 * ground.pixel_rad(scene)) < 1.25
+    assert 0.7 < middle.facet_m / (1000 * scene.camera.pixel_rad) < 1.25
     # facets of two pixels, with the boulders that they can show
     wide = rich.model_copy(update={"patch": rich.patch.model_copy(update={"facet_px": 2.0})})
     (twice,) = ground.ground_details(wide, body, [as_trajectory(columns_of([row("b", (0, 0, 1500.0))])).pose(0)])
@@ -357,11 +357,11 @@ def test_the_frames_of_a_sequence_share_a_terrain_as_fine_as_each_needs(tmp_path
     limit = EdgeLimit(shared.facet_m, shared.radius_m)
     below_m = np.linalg.norm(np.array([0, 0, 500]) - np.array(shared.position_T_m))
     facet_m = limit.facet_at(np.array([[below_m, 0.0, 0.0]]))[0]
-    wanted_m = np.maximum(0.2, heights_m * ground.pixel_rad(scene))
+    wanted_m = np.maximum(0.2, heights_m * scene.camera.pixel_rad)
     assert facet_m <= wanted_m.min() * 1.001
     # from afar all of the body is seen; at its rim, 700 m from the origin, no facet is wider than a pixel
     rim_m = limit.facet_at(np.array([[700.0, 0.0, 0.0]]))[0]
-    assert rim_m <= 20e3 * ground.pixel_rad(scene)
+    assert rim_m <= 20e3 * scene.camera.pixel_rad
     far_alone = (
         session.ground_detail(0),
         ground.ground_of_sequence(scene, session.body, [session.trajectory.pose(0)]),

@@ -143,7 +143,7 @@ def _geometry(session: Session) -> list[str]:
         return _aims(session, table.aim)
     low, high = geometry.height_m
     above = "the ground below the camera" if geometry.height_reference == "local_ground" else "the site"
-    across, pixel = 2 * np.tan(np.radians(camera.fov_deg) / 2), ground.pixel_rad(scene)
+    across, pixel = 2 * np.tan(np.radians(camera.fov_deg) / 2), scene.camera.pixel_rad
     # a pose is refused if a surface is closer than the clearance, so no camera is lower than the clearance
     nearest = max(low, min(geometry.clearance_m, high))
     lines = [
@@ -196,7 +196,7 @@ def _aims(session: Session, aim: NDArray[np.uint8]) -> list[str]:
     geometry, (low, high) = scene.geometry, scene.geometry.distance_m
     counts = np.bincount(aim, minlength=len(aims.AIMS))
     mixed = ", ".join(f"{name} {count}" for name, count in zip(aims.AIMS, counts, strict=True) if count)
-    pixel = ground.pixel_rad(scene)
+    pixel = scene.camera.pixel_rad
     kept_away = aims.sun_elongation_deg(scene)
     return [
         f"aims: {mixed}; {geometry.pointing_error_deg:g} deg of pointing error about each axis, any turn about the "
@@ -248,7 +248,7 @@ def _trajectory(session: Session, table: Trajectory) -> list[str]:
         f"{table.name[count - 1]}; {_rows_of_a_site(session, table)}; "
         "poses are kept, and faults that cannot show are recorded as not injected",
         f"nearest ground: {_span(range_m.min(), range_m.max())} m from the camera{first}, "
-        f"{_span(*(ground.pixel_rad(session.scene) * range_m[[range_m.argmin(), range_m.argmax()]]))} m a pixel; "
+        f"{_span(*(session.scene.camera.pixel_rad * range_m[[range_m.argmin(), range_m.argmax()]]))} m a pixel; "
         f"phase angle at the centre of mass {_span(min(phase), max(phase))} deg",
         f"Sun: {_span(distance.min(), distance.max())} au away, dates {date.min():.5f} to {date.max():.5f} TDB",
         *_flights(session, table),
@@ -291,7 +291,7 @@ def _flights(session: Session, table: Trajectory) -> list[str]:
     flights = () if session.scene.trajectory is None else session.scene.trajectory.flight
     if not flights or table.velocity_T_m_s is None or table.rate_C_rad_s is None:
         return []
-    body, pixel = session.body, ground.pixel_rad(session.scene)
+    body, pixel = session.body, session.scene.camera.pixel_rad
     lines, start = [], 0
     for flight in flights:
         rows = np.arange(start, start + flight.sequences * flight.frames)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Annotated, Literal
 
+import numpy as np
 from pydantic import Field, model_validator
 
 from ..core import spectra
@@ -313,6 +314,13 @@ class CameraTable(Table):
             return None
         with under_key("camera.calibration"):
             return of_frame(self.calibration, self.width_px, self.height_px)
+
+    @property
+    def pixel_rad(self) -> float:
+        """Return the angle that a pixel in the middle of the frame subtends."""
+        if (calibration := self.frame_calibration) is not None:
+            return 1 / calibration.focal_length_px
+        return float(2 * np.tan(np.radians(self.fov_deg) / 2) / self.width_px)
 
     @model_validator(mode="after")
     def _known(self) -> CameraTable:

@@ -6,8 +6,6 @@ import math
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
 from ..camera import Camera, focal_length_mm
 from ..core.errors import InputError, under_key
 from ..core.files import file_contents
@@ -130,17 +128,15 @@ def _thin_lens(c: CameraTable, pixel_pitch_um: float) -> ThinLens:
     calibration = c.frame_calibration
     if calibration is None:
         focal_mm = focal_length_mm(c.fov_deg, c.width_px, pixel_pitch_um)
-        pixel_rad = 2 * float(np.tan(np.radians(c.fov_deg) / 2)) / c.width_px
     else:
         focal_mm = calibration.focal_length_px * pixel_pitch_um * 1e-3
-        pixel_rad = 1 / calibration.focal_length_px
     return ThinLens(
         focal_length_mm=focal_mm,
         f_number=THIN_LENS["f_number"] if c.f_number is None else c.f_number,
         transmission=THIN_LENS["transmission"] if c.transmission is None else c.transmission,
         focus_distance_m=_focus_distance_m(c),
         halo=_halo(c.point_spread),
-        pixel_rad=pixel_rad,
+        pixel_rad=c.pixel_rad,
         calibration=calibration,
     )
 

@@ -145,14 +145,6 @@ def shape_model(body: Body) -> TerrainMesh:
     return render.TerrainMesh(body.vertices_m.astype(np.float32), body.faces, smooth)
 
 
-def pixel_rad(scene: Scene) -> float:
-    """Return the angle that a pixel in the middle of the frame subtends."""
-    calibration = scene.camera.frame_calibration
-    if calibration is not None:
-        return 1 / calibration.focal_length_px
-    return float(2 * np.tan(np.radians(scene.camera.fov_deg) / 2) / scene.camera.width_px)
-
-
 def in_frame(camera: CameraTable, points_C: F64, part: float = 1.0) -> NDArray[np.bool_]:
     """Return which points float64[n, 3] lie in the frame, or in the middle `part` of its sides, bool[n]."""
     size_px = np.array([camera.width_px, camera.height_px])
@@ -194,7 +186,7 @@ def _whole_body(scene: Scene, body: Body, pose: FlownPose) -> GroundDetail | Non
     than `_FEWEST_PX` pixels wide, the terrain stays as it is at this distance, or as fine as it may be.
     """
     nearest_m = float(_distances_m(body, pose).min())
-    pixel, budget = pixel_rad(scene), _EVEN_FRACTION * scene.patch.max_triangles * _TRIANGLE
+    pixel, budget = scene.camera.pixel_rad, _EVEN_FRACTION * scene.patch.max_triangles * _TRIANGLE
     few_px_m = float(np.ptp(body.vertices_m, axis=0).max()) / (_FEWEST_PX * pixel)
     wanted_m, close_m = (
         max(scene.patch.facet_m, scene.patch.facet_px * pixel * _rounded(distance))
@@ -227,7 +219,7 @@ def _around(scene: Scene, seen: Sequence[_Seen]) -> GroundDetail:
         spread = points[np.linspace(0, len(points) - 1, min(len(points), _ORIGINS)).astype(int)]
         origin = min(spread, key=needed_radius_m)
         radius_m = needed_radius_m(origin)
-    facet_m = max(scene.patch.facet_m, scene.patch.facet_px * pixel_rad(scene) * _rounded(least_m))
+    facet_m = max(scene.patch.facet_m, scene.patch.facet_px * scene.camera.pixel_rad * _rounded(least_m))
     return _detail(scene, origin, facet_m, max(radius_m, scene.patch.radius_m))
 
 
