@@ -392,6 +392,7 @@ def test_what_the_kernels_do_not_hold_is_said_in_a_sentence(folder: Path) -> Non
     cases = [
         (lambda: spice.sun_position_J_au(str(COMET), far), r"Sun from 1000012 at JD 2456174\.\d+ .*no position"),
         (lambda: spice.sun_position_J_au("NOBODY", ET_S), "Sun from NOBODY at .*no body of that name"),
+        (lambda: spice.sun_position_J_au("SUN", ET_S), "Sun from SUN at .*: is 0 au away .*from 0.01 to 1000 au"),
         (lambda: spice.J_from_T("NOFRAME", ET_S), "frame NOFRAME at .*: the kernels define no such frame"),
         (lambda: spice.J_from_T("IAU_EROS", ET_S), "frame IAU_EROS at "),
         (lambda: spice.J_from_T("TEST_BUS", ET_S + 5000), "frame TEST_BUS at .*: the kernels hold no attitude"),

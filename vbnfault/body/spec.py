@@ -110,7 +110,7 @@ class PatchSpec:
         rounded waves.
     airfall
         How much more dust covers low and level ground, and how much less high and steep ground, than the relief
-        alone would let lie there; 0: no more.
+        alone would let lie there; 0: no more. Cover goes beyond bare and full ground by up to twice this factor.
     largest_boulder_m
         Diameter of the largest boulder.
     fractured

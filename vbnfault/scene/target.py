@@ -228,7 +228,7 @@ class PatchTable(Table):
         description="part of the variance of relief over 20 m that is of planes which meet in edges; 0: none",
     )
     airfall: float = Field(
-        0.0, ge=0, le=5, description="how much more dust covers low and level ground than high and steep ground"
+        0.0, ge=0, le=3, description="how much more dust covers low and level ground than high and steep ground"
     )
     craters_per_km2: float = Field(60.0, ge=0, le=1e5, description="of 10 m or more; 600 at most without regolith")
     boulders: bool = Field(True, description="whether boulders lie on the ground")

@@ -179,11 +179,14 @@ def sun_position_J_au(target: str, et_s: float) -> F64:
     Raises
     ------
     InputError
-        The body is unknown, or the kernels hold no position at the epoch.
+        The body is unknown, or the kernels hold no position at the epoch, or one that no scene may have.
     """
     purpose = f"Sun from {target} at {_epoch(et_s)}"
     position_km = _ask(purpose, "position_km", "SUN", et_s, J_FRAME, str(target))
-    return np.asarray(position_km, dtype=np.float64) / KM_PER_AU
+    sun_J_au = np.asarray(position_km, dtype=np.float64) / KM_PER_AU
+    if not 0.01 <= (distance_au := float(np.linalg.norm(sun_J_au))) <= 1000:
+        raise InputError(f"{purpose}: is {distance_au:.4g} au away by the kernels; must be from 0.01 to 1000 au.")
+    return sun_J_au
 
 
 def J_from_T(frame: str, et_s: float) -> F64:
