@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from .store import open_dataset
     from .study.run import study
 
-# Module → the public names that it defines. It is loaded when one of them is first used.
+# This table lists by module the public names that it defines; it is loaded when one of them is first used.
 _DEFINED = {
     "core.calibration": ("Calibration",),
     "core.errors": ("InputError", "VbnfaultError"),
@@ -59,8 +59,8 @@ _DEFINED = {
     "scene.config": ("Scene", "load_scene"),
     "store": ("open_dataset",),
 }
-# Public name → its module, with the name there if it is another; with nothing behind the colon: the module itself.
-# `tests/test_api.py` compares this table with the imports above.
+# This table gives the module of each public name. Behind a colon stands the name there, if it is another; nothing
+# behind it means the module itself. `tests/test_api.py` compares the table with the imports above.
 _HOMES = {name: module for module, names in _DEFINED.items() for name in names} | {
     "build": "dataset:build_scene",
     "export": "output.export:export_store",

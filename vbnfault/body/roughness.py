@@ -31,8 +31,8 @@ _FIT_EDGES = (1.3, 1.7, 2.2, 2.9, 3.8)
 _HURST_RANGE = (0.5, 1.0)
 # A model is coarse if its mean edge is longer than this, over its mean radius: the quadric then leaves roundness
 _COARSE = 0.04
-# Deviations of a coarse model grow no more beyond the first, over its mean radius, so longer baselines do not tell
-# its exponent. It has the second as exponent if fewer than two baselines are shorter
+# Heights of a coarse model deviate no more on baselines longer than the first number times its mean radius, which
+# therefore do not tell the exponent. The second number is assumed for it if fewer than two baselines are shorter
 _LONGEST_RADII, _ASSUMED_HURST = 0.35, 0.8
 # Least cosine between the normals of a vertex and of the window's centre; steeper vertices belong to another side.
 _FACING = 0.5

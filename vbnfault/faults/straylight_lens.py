@@ -193,7 +193,7 @@ class _LensStraylight(LensFault):
         return params
 
     def on_light(self, light: Electrons, params: Params, context: FaultContext) -> Electrons:
-        """Return the light, minus that which straylight is taken from, with straylight added past the rims."""
+        """Return the light less what straylight takes of it, with straylight added to the light past the rims."""
         straylight = context.once(self._light, params)
         if straylight is None:
             return light

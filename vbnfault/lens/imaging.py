@@ -356,12 +356,12 @@ class RealLens:
 
     @cached_property
     def _lit_beams(self) -> FieldBundles:
-        """Return the bundles with light."""
+        """Return the bundles of rays, by field angle, of which some pass the lens."""
         return self._beams.select(self._beams.area_mm2 > 0)
 
     @cached_property
     def _zones(self) -> FieldBundles:
-        """Return the bundles whose spots set the best focus: those with light, from the axis to the corner."""
+        """Return the bundles of rays whose spots set the best focus: lit ones from the axis to the corner."""
         return self._lit_beams.select(self._lit_beams.slope <= 1.1 * self._corner)
 
     @cached_property

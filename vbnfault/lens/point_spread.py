@@ -44,7 +44,7 @@ class FieldBundles:
     rim_mm: F64
 
     def select(self, keep: NDArray[np.bool_]) -> FieldBundles:
-        """Return some of the bundles, bool[angle]."""
+        """Return the bundles of rays at the field angles where `keep`, bool[angle], is set."""
         return FieldBundles(slope=self.slope[keep], centre_mm=self.centre_mm[keep], rim_mm=self.rim_mm[keep])
 
     @property
