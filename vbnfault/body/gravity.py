@@ -11,6 +11,7 @@ face. E and F are dyads of normals. L_e is the logarithmic term of an edge. ω_f
 
 from __future__ import annotations
 
+import functools
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -110,8 +111,7 @@ class PolyhedronGravity:
         The terms are computed on the device, and summed by numpy, whose order does not depend on threads.
         """
         be = backend()
-        here = [be.dr.opaque(be.Float64, float(x)) for x in point]
-        terms = [*_edge_terms(be, edges, here), *_face_terms(be, faces, here)]
+        terms = _terms()(edges, faces, [be.dr.opaque(be.Float64, float(x)) for x in point])
         be.dr.eval(*terms)
         be.dr.sync_thread()
         of_edges, of_faces = np.split(np.array([np.array(term, copy=False).sum() for term in terms]), 2)
@@ -124,6 +124,16 @@ class PolyhedronGravity:
         acceleration = self.evaluate(points).acceleration_m_s2
         acceleration[:, :2] += omega_rad_s**2 * points[:, :2]
         return acceleration
+
+
+@functools.lru_cache(maxsize=1)
+def _terms() -> Any:
+    """Return the function that gives the four terms of edges and those of faces.
+
+    It is traced once per mesh, since a fall asks for thousands of single points.
+    """
+    be = backend()
+    return be.dr.freeze(lambda edges, faces, here: [*_edge_terms(be, edges, here), *_face_terms(be, faces, here)])
 
 
 def _edge_terms(be: Any, table: list[Any], point: list[Any]) -> list[Any]:

@@ -266,15 +266,16 @@ def _fall_to(body: Body, start_T_m: F64, end_T_m: F64, time_s: F64) -> tuple[F64
         velocity_T_m_s = velocity_m_s - spin * _cross_pole(offsets[0])
         return np.asarray(_fall(body, start_T_m, velocity_T_m_s, last, loose=_SEARCH)[0][0] - end_T_m) / last[0]
 
-    # the motion is nearly that in even gravity, where the miss changes as the turned velocity does
-    turn = _turned(np.eye(3), -spin * last[0]).T
-    solution = root(miss_m_s, guess, jac=lambda _: turn, method="hybr", options={"xtol": 1e-7})
+    # The motion is nearly that in even gravity, where the miss changes by as much as the turned velocity does.
+    turn = _turned(np.eye(3), spin * last[0])
+    options = {"fatol": 0.1 * _MISS_M / last[0], "maxiter": 30, "jac_options": {"alpha": -1.0}}
+    solution = root(lambda change: miss_m_s(guess + change @ turn), np.zeros(3), method="broyden1", options=options)
     if not np.linalg.norm(solution.fun) * last[0] < _MISS_M:
         raise InputError(
             f"{FLIGHTS}: no free fall from one end to the other takes {last[0]:g} s; choose a shorter period_s or "
             "fewer frames"
         )
-    return _fall(body, start_T_m, solution.x - spin * _cross_pole(offsets[0]), time_s)
+    return _fall(body, start_T_m, guess + solution.x @ turn - spin * _cross_pole(offsets[0]), time_s)
 
 
 def _towards_sun(case: _Case, time_s: float) -> F64:
