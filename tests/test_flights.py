@@ -182,6 +182,23 @@ def test_a_hop_on_flat_ground_is_a_parabola() -> None:
     np.testing.assert_allclose(launch + rise * down, level / time_s, atol=tolerance * rise)
 
 
+def test_a_fall_to_a_place_is_found_by_few_trial_falls(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The even gravity of the middle is right to a tenth here, so each trial leaves a tenth of the miss or less.
+
+    From some metres to a millimetre that takes five trials, and the fall itself is one more.
+    """
+    falls = []
+
+    def counted(*arguments: Any, **keys: Any) -> Any:
+        falls.append(arguments)
+        return fall(*arguments, **keys)
+
+    fall = flights._fall
+    monkeypatch.setattr(flights, "_fall", counted)
+    fly(scene_of(flight("relocation", sequences=2)), rock())
+    assert 2 * 3 <= len(falls) <= 2 * 6
+
+
 def test_a_descent_has_its_heights_and_its_site() -> None:
     flown = fly(scene_of(flight("descent", height_m=180, aside_m=30, latitude_deg=[-40, 40], sequences=3)), rock())
     for first in (0, 5, 10):
