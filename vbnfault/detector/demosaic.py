@@ -314,19 +314,13 @@ def _bilinear(raw: F32, pattern: Pattern) -> list[F32]:
 def _normalised(raw: F32, pattern: Pattern, channel: str) -> F32:
     """Return one channel at every pixel by normalised convolution, float32[y, x]; measured values are kept."""
     plane = plane_of(raw, pattern, channel)
-    index = pattern.index(channel)
-    reach, scale = _normaliser(pattern, raw.shape, index)
+    reach, scale = _normaliser(pattern, raw.shape, pattern.index(channel))
     if reach == 0:
         return plane
     tent = _tent(reach)
     out = cv2.sepFilter2D(plane, -1, tent, tent, borderType=cv2.BORDER_CONSTANT)
     out *= scale
-    rows, columns = pattern.shape
-    for y in range(rows):
-        for x in range(columns):
-            if pattern.tile[y][x] == index:  # measured values are kept exactly
-                out[y::rows, x::columns] = raw[y::rows, x::columns]
-    return out
+    return plane_of(raw, pattern, channel, out)
 
 
 def _tent(reach: int) -> F32:

@@ -106,9 +106,9 @@ def sample(planes: F32, pattern: Pattern) -> F32:
     return out
 
 
-def plane_of(raw: NDArray[Any], pattern: Pattern, channel: str) -> F32:
-    """Return one channel of a mosaic [y, x] as float32[y, x], with 0 at the pixels of other channels."""
-    out = np.zeros(raw.shape, dtype=np.float32)
+def plane_of(raw: NDArray[Any], pattern: Pattern, channel: str, others: F32 | None = None) -> F32:
+    """Return one channel of a mosaic [y, x] as float32[y, x]; pixels of other channels keep `others`, or are 0."""
+    out = np.zeros(raw.shape, dtype=np.float32) if others is None else others
     index = pattern.index(channel)
     rows, columns = pattern.shape
     for y in range(rows):
