@@ -34,17 +34,27 @@ _AXES: dict[str, tuple[int, ...]] = {"rows": (0,), "columns": (1,), "both": (0, 
 
 
 @dataclass(frozen=True, kw_only=True)
-class GainUpset(Fault):
-    """Multiply the signal of the raw mosaic by the gain that a flipped bit makes."""
+class _RegisterUpset(Fault):
+    """Change the whole raw mosaic; by default, move its pixels."""
 
     fault = "register_upset"
-    model = "gain"
-    default = True
-    after = "broken_lines"
     step = "raw"
     needs_mosaic = True
     localised = False
     effect_mask = True
+
+    def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
+        """Return the mosaic whose pixels are moved."""
+        return quantity.with_array(self.moved(quantity.array, params))
+
+
+@dataclass(frozen=True, kw_only=True)
+class GainUpset(_RegisterUpset):
+    """Multiply the signal of the raw mosaic by the gain that a flipped bit makes."""
+
+    model = "gain"
+    default = True
+    after = "broken_lines"
 
     code: int = number(
         24, limits=(1, 65535), integer=True, doc="gain register before, such as 1.5 in steps of 1/16; assumed"
@@ -66,18 +76,13 @@ class GainUpset(Fault):
 
 
 @dataclass(frozen=True, kw_only=True)
-class WindowUpset(Fault):
+class WindowUpset(_RegisterUpset):
     """Shift the raw mosaic by a power of two rows or columns."""
 
-    fault = "register_upset"
     model = "window"
-    step = "raw"
     severity = Severity(
         key="bit", low=1, high=13, drawn=lambda params, shape, focal_px: math.log2(abs(params["shift_px"]))
     )
-    needs_mosaic = True
-    localised = False
-    effect_mask = True
 
     lines: str = choice("drawn", ("drawn", "rows", "columns"), doc="whose first address is wrong; drawn: either")
     bit: Interval = bounds(
@@ -91,25 +96,16 @@ class WindowUpset(Fault):
         shift = 1 << min(self.bit.integer(rng), highest)
         return {"lines": lines, "shift_px": shift if rng.random() < 0.5 else -shift}
 
-    def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
-        """Return the shifted mosaic."""
-        return quantity.with_array(self.moved(quantity.array, params))
-
     def moved(self, layer: NDArray[Any], params: Params) -> NDArray[Any]:
         """Return a layer of the mosaic, [y, x], shifted."""
         return np.roll(layer, params["shift_px"], _AXES[params["lines"]])
 
 
 @dataclass(frozen=True, kw_only=True)
-class FlipUpset(Fault):
+class FlipUpset(_RegisterUpset):
     """Mirror the raw mosaic."""
 
-    fault = "register_upset"
     model = "flip"
-    step = "raw"
-    needs_mosaic = True
-    localised = False
-    effect_mask = True
 
     lines: str = choice(
         "drawn",
@@ -121,10 +117,6 @@ class FlipUpset(Fault):
         """Return what comes in the opposite order."""
         drawn = list(_AXES)[int(rng.integers(len(_AXES)))]
         return {"lines": drawn if self.lines == "drawn" else self.lines}
-
-    def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
-        """Return the mirrored mosaic."""
-        return quantity.with_array(self.moved(quantity.array, params))
 
     def moved(self, layer: NDArray[Any], params: Params) -> NDArray[Any]:
         """Return a layer of the mosaic, [y, x], mirrored."""
