@@ -10,6 +10,7 @@ from ..core import frames, spectra
 from ..core.errors import under_key
 from ..core.files import file_contents, spice
 from ..render.description import Sunlight
+from ..scene import redraw
 from ..scene.config import Scene
 from ..scene.surroundings import OrbitTable, SpiceTable, SunTable
 from ..scene.target import BodyTable
@@ -159,7 +160,5 @@ def attitude_references(scene: Scene) -> tuple[str, str]:
     """Return the references of attitudes ("sun", "nadir" or "centre"): Sun-facing stratum, Sun-averted stratum."""
     if scene.is_flown or scene.is_aimed:  # no bounds of the attitude; it is stored relative to the Sun
         return "sun", "sun"
-    facing, averted = scene.geometry.sun_facing, scene.geometry.sun_averted
-    assert facing is not None
-    assert averted is not None
+    facing, averted = redraw.strata(scene)
     return facing.reference, averted.reference
