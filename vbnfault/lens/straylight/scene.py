@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core import spectra
+from ...core import spectra, sundisc
 from ...core.spectra import Bands
 from ..imaging import Lens
 from ..paraxial import paraxial_properties
@@ -147,10 +147,8 @@ class PointSources:
         point.
         """
         offsets = disc_samples(_DISC_RINGS) if radius_rad * focal_px > cls.block else np.zeros((1, 2))
-        axis = direction_C / np.linalg.norm(direction_C)
-        first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
-        first /= np.linalg.norm(first)
-        points = axis + np.tan(radius_rad) * offsets @ np.stack([first, np.cross(axis, first)])
+        *across, axis = sundisc.axes(direction_C)
+        points = axis + np.tan(radius_rad) * offsets @ np.stack(across)
         near = (points[:, 2] > 0) & (np.hypot(points[:, 0], points[:, 1]) < reach * np.abs(points[:, 2]))
         x, y = (points[near, k] / points[near, 2] for k in (0, 1))
         return cls(x=tuple(x.tolist()), y=tuple(y.tolist()), focal_px=focal_px), 1 / len(offsets)
