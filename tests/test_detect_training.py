@@ -12,6 +12,7 @@ import sys
 import threading
 from collections.abc import Callable
 from functools import partial
+from hashlib import sha256
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -261,6 +262,8 @@ def test_onnx_gives_what_torch_gives(path: str, trained: Path, tmp_path: Path) -
     steep = torch.load(out / WEIGHTS)
     steep["masks.weight"] *= 100
     torch.save(steep, out / WEIGHTS)
+    changed = json.loads((out / MODEL).read_text()) | {"weights_sha256": sha256(weights(out)).hexdigest()}
+    (out / MODEL).write_text(json.dumps(changed))
     record = train([path], out, TrainOptions(**SMALL), onnx=True)  # of a finished training
     assert record["onnx"]["largest_difference"] <= ONNX_WITHIN
     assert torch.equal(torch.load(out / WEIGHTS)["masks.weight"], steep["masks.weight"])
@@ -574,7 +577,13 @@ def test_what_is_no_model_is_refused_in_one_sentence(trained: Path, tmp_path: Pa
     torch.save({"a": torch.zeros(1)}, out / WEIGHTS)
     with pytest.raises(InputError, match="its weights are not those of unet"):
         load_detector(out)
-    for text in ("{", "[]", json.dumps({"format": 99, "classes": ["a"]})):
+    damaged = bytearray(weights(trained))
+    damaged[len(damaged) // 2] ^= 0x40  # of a number, which PyTorch reads as it is
+    (out / WEIGHTS).write_bytes(damaged)
+    with pytest.raises(InputError, match=r"weights\.pt: is damaged or was exchanged: its SHA-256 is not the"):
+        load_detector(out)
+    without = {key: value for key, value in json.loads((out / MODEL).read_text()).items() if key != "options"}
+    for text in ("{", "[]", json.dumps({"format": 99, "classes": ["a"]}), json.dumps(without)):
         (out / MODEL).write_text(text)
         with pytest.raises(InputError, match=r"is no model\.json of this vbnfault; its format must be 1"):
             load_detector(out)

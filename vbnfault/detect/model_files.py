@@ -50,9 +50,9 @@ def finish(out: Path, network: nn.Module, record: Mapping[str, Any], *, onnx: bo
         "machine": f"{platform.machine()}, {torch.get_num_threads()} threads of PyTorch, {os.cpu_count()} cores",
     }
     with writing(out, within=True):
-        write_whole(own(out / WEIGHTS), file.getvalue())
         if onnx:
             made["onnx"] = {"file": ONNX, "largest_difference": export_onnx(network, own(out / ONNX))}
+        write_whole(own(out / WEIGHTS), file.getvalue())
         draw_training(made, own(out / FIGURE))
         write_whole(own(out / CARD), card(made))
         write_json(own(out / MODEL), made)

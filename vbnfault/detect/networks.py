@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import InputError, shown
+from ..core.files.user_files import sha256_of_input
 from .prediction import Prediction
 
 try:
@@ -32,6 +33,7 @@ STRIDE_PX = 32  # sides of an image are padded to a multiple: the U-Net needs on
 LEVELS = 5
 MODEL, WEIGHTS, CHECKPOINT = "model.json", "weights.pt", "checkpoint.pt"
 FORMAT = 1
+_OF_MODEL = {"architecture": str, "classes": list, "options": dict, "weights_sha256": str}  # in `model.json`
 _HIDDEN = 64
 # Widths of the U-Net at full size, 1/2, … 1/16. Lines and defects of one pixel need the full size, where a channel
 # costs most; flares and blur need the coarse maps. 0.5 million parameters; 120 ms of processor time train it with
@@ -349,6 +351,8 @@ def load_detector(path: str | Path, device: str | None = None) -> TrainedDetecto
         network.load_state_dict(read_weights(file))
     except (RuntimeError, TypeError, AttributeError):
         raise InputError(f"{file}: its weights are not those of {record['architecture']}") from None
+    if sha256_of_input(file, "weights") != record["weights_sha256"]:  # PyTorch reads damaged numbers as they are
+        raise InputError(f"{file}: is damaged or was exchanged: its SHA-256 is not the weights_sha256 of {MODEL}")
     return TrainedDetector(network, record["classes"], device, record["options"]["masks"])
 
 
@@ -362,6 +366,9 @@ def read_model(path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: {why if path.exists() else 'no such model'}")
     with contextlib.suppress(ValueError, OSError):
         record = json.loads(file.read_text(encoding="utf-8"))
-        if isinstance(record, dict) and record.get("format") == FORMAT and record.get("classes"):
-            return record
-    raise InputError(f"{file}: is no model.json of this vbnfault; its format must be {FORMAT}")
+        is_ours = isinstance(record, dict) and record.get("format") == FORMAT
+        if is_ours and all(record.get(key) and type(record[key]) is kind for key, kind in _OF_MODEL.items()):
+            return record  # type: ignore[no-any-return]
+    raise InputError(
+        f"{file}: is no model.json of this vbnfault; its format must be {FORMAT}, with {', '.join(_OF_MODEL)}"
+    )

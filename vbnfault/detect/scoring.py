@@ -6,8 +6,6 @@ pages read the few samples again that they show.
 
 from __future__ import annotations
 
-import hashlib
-import json
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -171,12 +169,10 @@ def _samples(store: Store, model: Any, options: ScoreOptions, split: str) -> Sam
     if not path.is_dir():
         raise InputError(f"{path}: there is no such folder; a model is a folder with {MODEL_FILE}, or one of masks")
     if (path / MODEL_FILE).is_file():
-        from .networks import load_detector  # only this needs PyTorch
+        from .networks import load_detector, read_model  # only this needs PyTorch
 
         detector = load_detector(path)  # refuses a damaged file
-        record = (path / MODEL_FILE).read_bytes()
-        digest = json.loads(record).get("weights_sha256") or hashlib.sha256(record).hexdigest()
-        return Samples(store, OfImages(detector, digest), options, indices)
+        return Samples(store, OfImages(detector, read_model(path)["weights_sha256"]), options, indices)
     columns = Columns(store)
     splits = columns["split"][np.searchsorted(columns.samples, indices)].tolist()
     masks = MaskFolder(path, store, indices.tolist(), splits, options.masks or FOOTPRINT)
