@@ -210,9 +210,11 @@ class Development:
 
     def _lacking(self, draws: Draws, name: str, *, noisy: bool) -> RGBI:
         """Return the image without one fault of a local detector, before the faults that act on finished images."""
+        part, camera = self._part(draws, name), self.exposure.camera
+        if not noisy:  # each level takes less time than to compare its signal
+            return camera.detector.develop(part, camera.exposure_s, None)
         whole = self.signal(draws, acting_at(draws, "electrons")).merged, self._before_readout(draws, noisy)
-        camera, noise = self.exposure.camera, self.noise if noisy else None
-        return camera.detector.develop(self._part(draws, name), camera.exposure_s, noise, base=whole)
+        return camera.detector.develop(part, camera.exposure_s, self.noise, base=whole)
 
     def read_out(self, image: RGBI, draws: Draws) -> RGBI:
         """Return the image with the drawn faults that act on the finished image."""
@@ -300,8 +302,8 @@ class Development:
             with_it = self.image(draws, noisy=False).array
             lacking = self.image(others, noisy=False, keep_signals=name in self._twins).array
             return masks.effect(with_it, lacking, least_dn)
-        before = self._lacking(draws, name, noisy=False)
         with_it = self.image(draws, noisy=False).array
+        before = self._lacking(draws, name, noisy=False)
         return masks.effect(with_it, self.read_out(before, others).array, least_dn)
 
     def effects_on(self, rows: slice, draws: Draws, least_dn: Mapping[str, float]) -> dict[str, Mask]:
