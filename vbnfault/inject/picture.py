@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..camera import Camera
 from ..core.errors import InputError
-from ..core.process.llvm import backend, evaluated, on_device
+from ..core.process.llvm import backend, evaluated, flat, on_device
 from ..core.quantities import LUMINANCE, RGBI, Electrons
 from ..detector.demosaic import interpolate
 from ..detector.interface import with_luminance
@@ -146,11 +146,13 @@ class Picture:
         numbers, response = self.numbers, self.response
         change = change.reshape(numbers.shape)
         if numbers.dtype in (np.uint8, np.uint16) and response.table is None:
-            be, light = backend(), response.of_image(numbers, lambda n: response.light(n).astype(np.float32))
-            moved = on_device(change)
-            value = be.dr.round(response.numbers(on_device(light) + moved, be.dr))
-            value = be.dr.select(moved != 0, be.dr.clip(value, 0, self._top_dn), on_device(numbers))
-            return evaluated(value).astype(numbers.dtype).reshape(numbers.shape)
+            be, moved = backend(), on_device(change)
+            light = on_device(response.light(np.arange(np.iinfo(numbers.dtype).max + 1)))
+            kind, wide = (be.UInt8, np.uint8) if numbers.dtype == np.uint8 else (be.UInt32, np.uint32)
+            code = be.UInt32(kind(flat(numbers.astype(wide, copy=False))))
+            value = be.dr.round(response.numbers(be.dr.gather(be.Float, light, code) + moved, be.dr))
+            value = be.dr.select(moved != 0, be.dr.clip(value, 0, self._top_dn), be.Float(code))
+            return evaluated(kind(value)).astype(numbers.dtype).reshape(numbers.shape)
         changed = change != 0
         out = numbers.copy()
         out[changed] = self._rounded(response.numbers(response.light(numbers[changed]) + change[changed]))
