@@ -201,7 +201,7 @@ class _LensStraylight(LensFault):
         if not straylight.scene_added:
             veil = sums(light.array) * straylight.scene_lost
             plane = _in_frame(veil_per_px(_sensor_grid(context).shape, context.camera.focal_length_px), context)
-            past = past + plane[..., None] * veil.astype(np.float32)
+            past = past + cv2.merge([plane * level for level in veil.astype(np.float32)]).reshape(past.shape)
         if light.past_rims is not None:
             past = times(light.past_rims, straylight.direct_left) + past
         return replace(light, array=times(light.array, 1 - straylight.scene_lost), past_rims=past)
