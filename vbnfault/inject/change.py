@@ -55,8 +55,9 @@ def struck(
 
         def moved(more: Electrons) -> F32:
             """Return what the faults make of more light, float32[y, x, channel]."""
-            light = before.with_array(before.array + more.array)
-            return of(light).signal(draws, optical).merged.array - shared
+            light = before.with_array(cv2.add(before.array, more.array).reshape(shared.shape))
+            made = of(light).signal(draws, optical).merged.array
+            return cv2.subtract(made, shared).reshape(shared.shape)
 
         noise = _missing_noise(picture, change, picture.collected(after), moved, rng)
         change, after = change + noise, after + (picture.seen(noise).array if noise.any() else 0)
