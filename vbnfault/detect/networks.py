@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -204,9 +205,11 @@ def _torchvision() -> Any:
 def read_weights(path: Path, what: str = "weights") -> Any:
     """Return the content of a file of PyTorch, in which nothing but tensors and plain data is read.
 
-    Raises InputError if the file cannot be read or holds anything else.
+    Raises InputError if the file cannot be read, is damaged or holds anything else.
     """
     try:
+        if zipfile.is_zipfile(path) and zipfile.ZipFile(path).testzip():  # PyTorch does not look
+            raise ValueError("the check sum of its numbers is wrong")
         return torch.load(path, map_location="cpu", weights_only=True)
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
@@ -351,8 +354,8 @@ def load_detector(path: str | Path, device: str | None = None) -> TrainedDetecto
         network.load_state_dict(read_weights(file))
     except (RuntimeError, TypeError, AttributeError):
         raise InputError(f"{file}: its weights are not those of {record['architecture']}") from None
-    if sha256_of_input(file, "weights") != record["weights_sha256"]:  # PyTorch reads damaged numbers as they are
-        raise InputError(f"{file}: is damaged or was exchanged: its SHA-256 is not the weights_sha256 of {MODEL}")
+    if sha256_of_input(file, "weights") != record["weights_sha256"]:
+        raise InputError(f"{file}: was exchanged: its SHA-256 is not the weights_sha256 of {MODEL}")
     return TrainedDetector(network, record["classes"], device, record["options"]["masks"])
 
 
