@@ -195,6 +195,7 @@ def test_a_fall_to_a_place_is_found_by_few_trial_falls(monkeypatch: pytest.Monke
 
     fall = flights._fall
     monkeypatch.setattr(flights, "_fall", counted)
+    monkeypatch.setattr(flights, "_flown", {})  # flights of other tests are not known
     fly(scene_of(flight("relocation", sequences=2)), rock())
     assert 2 * 3 <= len(falls) <= 2 * 6
 
