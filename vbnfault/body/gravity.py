@@ -130,7 +130,7 @@ class PolyhedronGravity:
 def _terms() -> Any:
     """Return the function that gives the four terms of edges and those of faces.
 
-    It is traced once per mesh, since a fall asks for thousands of single points.
+    Tracing is done once, for all meshes, since a fall asks for thousands of single points.
     """
     be = backend()
     return be.dr.freeze(lambda edges, faces, here: [*_edge_terms(be, edges, here), *_face_terms(be, faces, here)])

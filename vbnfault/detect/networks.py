@@ -208,7 +208,7 @@ def read_weights(path: Path, what: str = "weights") -> Any:
     Raises InputError if the file cannot be read, is damaged or holds anything else.
     """
     try:
-        if zipfile.is_zipfile(path) and zipfile.ZipFile(path).testzip():  # PyTorch does not look
+        if zipfile.is_zipfile(path) and zipfile.ZipFile(path).testzip():  # PyTorch checks no sums
             raise ValueError("the check sum of its numbers is wrong")
         return torch.load(path, map_location="cpu", weights_only=True)
     except OSError as error:
