@@ -169,6 +169,25 @@ def test_a_pair_that_is_damaged_or_gone_is_rendered_again(
     assert json.dumps(again["statistics"]) == json.dumps(found["statistics"])  # NaN differs from itself
 
 
+def test_processes_give_the_pairs_that_one_gives(
+    frames: Path, tmp_path: Path, result: tuple[dict[str, Any], Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found, out = result
+    shutil.copytree(out / "pairs", tmp_path / "pairs")
+    for k in (1, 2, 6):
+        (tmp_path / f"pairs/frame_{k}.json").unlink()
+    monkeypatch.setattr(Replay, "pair", lambda *_: pytest.fail("a frame was rendered in this process"))
+    options = fit_passport.PassportOptions(part="all", mendings=0, draws=1, workers=2)
+    steps: list[tuple[int, int]] = []
+    again = fit_passport.passport(
+        frames, "rosetta67p", tmp_path, options, overrides=SMALL, advance=lambda *step: steps.append(step)
+    )
+    assert json.dumps(again["frames"]) == json.dumps(found["frames"])
+    assert json.dumps(again["statistics"]) == json.dumps(found["statistics"])
+    assert [done for done, _ in steps] == list(range(len(steps)))
+    assert FRAMES < len(steps) <= steps[0][1] + 1
+
+
 @pytest.mark.parametrize("folder", ["", "../", "deeper/", "..\\"])
 def test_names_that_lead_out_of_the_folder_are_refused(frames: Path, tmp_path: Path, folder: str) -> None:
     """Pairs have the names of their frames, and would be written beside them."""

@@ -136,10 +136,10 @@ def add_relief(
     )
     if spec.regolith is not None:
         return _of_regolith(body, mesh, noise, (order, rank), (up, elevation), spec)
+    model_slope = _slope_deg(points, normals, faces, up)[order]
     scale: Float64 | float = spec.relief
     if spec.intermittency:
-        slope = _slope_deg(points, normals, faces, up)[order]
-        scale = spec.relief * _unevenness(body, noise, slope, spec.intermittency)[rank]
+        scale = spec.relief * _unevenness(body, noise, model_slope, spec.intermittency)[rank]
 
     # Roughness differs between regions. Far away, facets show few octaves, and evenly rough ground would look like
     # orange peel.
@@ -153,7 +153,6 @@ def add_relief(
     def slope_of(height: Float32) -> Float32:
         return _slope_deg(raised(height), normals, faces, up)[order]
 
-    model_slope = _slope_deg(points, normals, faces, up)[order]
     pits = (1 - smooth_step(26.0, 42.0, model_slope)) * noise.craters(spec.craters_per_km2)
     if spec.fractured is None:
         broad = _terraced(noise, swell) + pits
@@ -248,20 +247,24 @@ def _vertical(body: Body, site: Site, points: Float64) -> tuple[Float64, Float64
     place, gravity, level = (
         np.concatenate(both) for both in zip(body.places, body.sampled(site.position_T_m[None]), strict=True)
     )
-    gradient = _gradients(place, gravity)
-    points_T_m = points + site.position_T_m
-    distance, near = cKDTree(place).query(points_T_m, k=min(_GRAVITY_PLACES, len(place)))
-    distance = np.maximum(distance, 1e-3)
-    weight = (1 / distance[:, :-1] - 1 / distance[:, -1:]) ** 2 + 1e-12 / distance[:, :-1] ** 2
-    weight /= weight.sum(axis=1)[:, None]
-    pull, elevation = np.zeros_like(points), np.zeros(len(points))
-    for k in range(weight.shape[1]):
-        g, off = gravity[near[:, k]], points_T_m - place[near[:, k]]
-        bend = np.einsum("ni,nij->nj", off, gradient[near[:, k]])
-        rise = -np.einsum("ni,ni->n", g + 0.5 * bend, off) / body.mean_gravity_m_s2
-        pull += weight[:, k, None] * (g + bend)
-        elevation += weight[:, k] * (level[near[:, k]] + rise)
-    return -pull / np.maximum(np.sqrt(np.einsum("ni,ni->n", pull, pull)), 1e-30)[:, None], elevation
+    gradient, tree = _gradients(place, gravity), cKDTree(place)
+
+    def interpolated(points_T_m: Float64) -> tuple[Float64, Float64]:
+        distance, near = tree.query(points_T_m, k=min(_GRAVITY_PLACES, len(place)))
+        distance = np.maximum(distance, 1e-3)
+        weight = (1 / distance[:, :-1] - 1 / distance[:, -1:]) ** 2 + 1e-12 / distance[:, :-1] ** 2
+        weight /= weight.sum(axis=1)[:, None]
+        pull, elevation = np.zeros_like(points_T_m), np.zeros(len(points_T_m))
+        for k in range(weight.shape[1]):
+            g, off = gravity[near[:, k]], points_T_m - place[near[:, k]]
+            bend = np.einsum("ni,nij->nj", off, gradient[near[:, k]])
+            rise = -np.einsum("ni,ni->n", g + 0.5 * bend, off) / body.mean_gravity_m_s2
+            pull += weight[:, k, None] * (g + bend)
+            elevation += weight[:, k] * (level[near[:, k]] + rise)
+        return -pull / np.maximum(np.sqrt(np.einsum("ni,ni->n", pull, pull)), 1e-30)[:, None], elevation
+
+    up, elevation = in_blocks(interpolated, points + site.position_T_m)
+    return up, elevation
 
 
 def _gradients(place_m: Float64, gravity: Float64) -> Float64:

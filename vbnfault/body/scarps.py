@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 
 from .body import Body
 from .fields import GRADIENT_STD, Points
-from .geometry import Float64, Int32, mean_edge_m, vertex_normals
+from .geometry import Float64, Int32, in_blocks, mean_edge_m, vertex_normals
 from .noise import noise_key
 from .roughness import smoothed
 
@@ -69,15 +69,21 @@ def form(body: Body, points_T_m: Float64) -> Form:
         values = _at_vertices(body, edge)
         _measured.clear()
         _measured[body.content_hash] = values
-    distance, near = cKDTree(body.vertices_m).query(points_T_m, k=_NEAREST)
-    # measured from the nearest vertex, so that the weights never all vanish
-    weight = np.exp(-0.5 * (distance**2 - distance[:, :1] ** 2) / (_WIDTH * edge) ** 2)
-    weight /= weight.sum(axis=1)[:, None]
-    mean = np.zeros((len(points_T_m), values.shape[1]))
-    for k in range(_NEAREST):
-        mean += weight[:, k, None] * values[near[:, k]]
-    length = np.sqrt(np.einsum("ni,ni->n", mean[:, :3], mean[:, :3]))
-    return Form(up=mean[:, :3] / np.maximum(length, 1e-9)[:, None], crest=mean[:, 3], rough=mean[:, 4])
+    tree = cKDTree(body.vertices_m)
+
+    def interpolated(points: Float64) -> tuple[Float64, Float64]:
+        distance, near = tree.query(points, k=_NEAREST)
+        # measured from the nearest vertex, so that the weights never all vanish
+        weight = np.exp(-0.5 * (distance**2 - distance[:, :1] ** 2) / (_WIDTH * edge) ** 2)
+        weight /= weight.sum(axis=1)[:, None]
+        mean = np.zeros((len(points), values.shape[1]))
+        for k in range(_NEAREST):
+            mean += weight[:, k, None] * values[near[:, k]]
+        length = np.sqrt(np.einsum("ni,ni->n", mean[:, :3], mean[:, :3]))
+        return mean[:, :3] / np.maximum(length, 1e-9)[:, None], mean[:, 3:]
+
+    up, others = in_blocks(interpolated, points_T_m)
+    return Form(up=up, crest=others[:, 0], rough=others[:, 1])
 
 
 def _at_vertices(body: Body, edge_m: float) -> Float64:

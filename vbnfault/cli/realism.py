@@ -45,6 +45,7 @@ def passport(
         number(1, 1000, "Factor on the detector's gain that the camera has; may be repeated.", unset="1"),
     ] = None,
     mend_poses: Annotated[int, whole(0, 5, "How often each pose is mended by its frame.")] = 1,
+    workers: Annotated[int, whole(1, MOST_PROCESSES, "Number of processes that compare frames.")] = 2,
     threads: Annotated[int | None, whole(1, MOST_PROCESSES, "Render threads.", unset="every core")] = None,
     settings: Annotated[list[str] | None, replaced("scene", "body.shape=comet.obj")] = None,
 ) -> None:
@@ -55,7 +56,12 @@ def passport(
     from ..fit.passport import passport as compare
 
     options = PassportOptions(
-        part=part, kept_back=kept_back, gains=tuple(gain or (1.0,)), mendings=mend_poses, threads=threads
+        part=part,
+        kept_back=kept_back,
+        gains=tuple(gain or (1.0,)),
+        mendings=mend_poses,
+        workers=workers,
+        threads=threads,
     )
     with advancing("frames and classifiers") as advance:
         result = compare(frames, scene, out, options, overrides=overrides(settings), poses=poses, advance=advance)

@@ -167,6 +167,20 @@ class Job:
         )
 
 
+class SingleItems(Job):
+    """Hand out tasks of one item each, which has their number; if one fails, the others are done."""
+
+    most_failures = None
+
+    def items(self, number: int) -> Sequence[int]:
+        """Return the item of a task."""
+        return (number,)
+
+    def task(self, number: int, skip: frozenset[int] = frozenset(), *, careful: bool = False) -> int:
+        """Return the number of a task."""
+        return number
+
+
 class Queue:
     """Assign tasks so that a worker stays with one lead, such as a site, whose costly data it keeps.
 

@@ -14,6 +14,7 @@ import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path, PureWindowsPath
 from typing import Any, Literal
 
@@ -29,9 +30,12 @@ from ..core.figures import inline_svg, panels, svg_text
 from ..core.files.images import encoded
 from ..core.files.whole_files import own, own_folder, write_json, write_whole
 from ..core.html_page import image_url, number_text, write_page
-from ..scene.config import load_scene
-from ..scene.trajectory import load_trajectory
-from .frames import read_frame
+from ..dataset.build import BuildOptions, do_tasks
+from ..dataset.progress import Progress
+from ..dataset.work import SingleItems, Tick, attempt
+from ..scene.config import Scene, load_scene
+from ..scene.trajectory import Trajectory, load_trajectory
+from .frames import F32, read_frame
 from .replay import Replay
 from .two_samples import FEWEST_FRAMES, PLACES, kinds, two_sample_test
 
@@ -139,6 +143,8 @@ class PassportOptions:
         As of `replay.Replay`.
     draws
         Of the classifiers' patches.
+    workers, threads
+        Number of processes that compare frames, and render threads of each; by default all cores.
     """
 
     part: Part = "shown"
@@ -146,6 +152,7 @@ class PassportOptions:
     gains: tuple[float, ...] = (1.0,)
     mendings: int = 1
     draws: int = 4
+    workers: int = 1
     threads: int | None = None
 
 
@@ -195,13 +202,11 @@ def passport(
         raise InputError(f"{frames}: has no frame in the part {options.part}; of {len(table)} rows none is left")
     images = {row: read_frame(frames, table.name[row]) for row in rows}
     loaded = load_scene(scene, dict(overrides or {}))
-    replay = Replay(loaded, table, gains=options.gains, mendings=options.mendings, threads=options.threads)
+    make = partial(_Comparison, frames, loaded, table, out, options)
+    comparison = make()
     for row in rows:
         with in_file(str(frames / table.name[row])):
-            replay.check(images[row])
-    # the scene names its files, whose contents count
-    files = replay.session.body.content_hash, replay.session.base_camera.detector.description
-    resolved = json.dumps([replay.scene.resolved(), files], sort_keys=True, default=str)
+            comparison.replay.check(images[row])
     own_folder(out)
     own_folder(out / PAIRS)
     draws = len(PLACES) * options.draws if len(rows) >= FEWEST_FRAMES else 0
@@ -211,25 +216,15 @@ def passport(
         advance(next(steps), len(rows) + draws)
 
     step()
-    figures, settings = {}, {}
-    for row in rows:
-        name, pose = table.name[row], table.pose(row)
-        key = [resolved, *(repr(np.asarray(value).tolist()) for value in vars(pose).values())]
-        key += [
-            hashlib.sha256(images[row].tobytes()).hexdigest(),
-            repr((options.gains, options.mendings)),
-            __version__,
-        ]
-        identity = hashlib.sha256("\n".join(key).encode()).hexdigest()
-        kept = _kept(out, name, identity)
-        if kept is None:
-            pair = replay.pair(row, images[row])
-            kept = {"identity": identity, "figures": pair.figures, "settings": pair.settings}
-            for which, one in (("real", pair.real), ("rendered", pair.rendered)):
-                write_whole(own(out / PAIRS / f"{name}_{which}.png"), encoded(one.image.astype(np.uint8), ".png"))
-            write_json(own(out / PAIRS / f"{name}.json"), kept)
-        figures[name], settings[name] = kept["figures"], kept["settings"]
+    left = [row for row in rows if comparison.kept(row) is None]
+    for _ in range(len(rows) - len(left)):
         step()
+    grounds = [comparison.replay.session.ground_detail(row) for row in left]
+    job = _Frames(out, _Steps(step), {row: grounds.index(one) for row, one in zip(left, grounds, strict=True)})
+    do_tasks(make, job, BuildOptions(workers=options.workers, threads=options.threads), lambda: comparison)
+    job.raise_failures(of=f" of {len(rows)}")
+    found = {table.name[row]: comparison.kept(row) or {} for row in rows}
+    figures, settings = ({name: one[part] for name, one in found.items()} for part in ("figures", "settings"))
     pairs = [(name, _written(out, name, "real"), _written(out, name, "rendered")) for name in figures]
     told, pictures = (
         two_sample_test([pair[1:] for pair in pairs], draws=options.draws, advance=step) if draws else ({}, {})
@@ -250,6 +245,78 @@ def passport(
     write_json(own(out / FILE), result)
     _write_page(out, result, pairs, pictures)
     return result
+
+
+class _Comparison:
+    """Compare frames in one process, each by its row of the table."""
+
+    def __init__(self, frames: Path, scene: Scene, table: Trajectory, out: Path, options: PassportOptions) -> None:
+        self._frames, self._table, self._out, self._options = frames, table, out, options
+        self.replay = Replay(scene, table, gains=options.gains, mendings=options.mendings, threads=options.threads)
+        # the scene names its files, whose contents count
+        files = self.replay.session.body.content_hash, self.replay.session.base_camera.detector.description
+        self._resolved = json.dumps([self.replay.scene.resolved(), files], sort_keys=True, default=str)
+
+    def do(self, task: int, tick: Tick) -> None:
+        """Compare a frame, and write the pair."""
+        if attempt(task, self._compared, tick):
+            tick(task, "built", "")
+
+    def _compared(self, row: int) -> bool:
+        name, image = self._table.name[row], read_frame(self._frames, self._table.name[row])
+        with in_file(str(self._frames / name)):
+            pair = self.replay.pair(row, image)
+        for which, one in (("real", pair.real), ("rendered", pair.rendered)):
+            write_whole(own(self._out / PAIRS / f"{name}_{which}.png"), encoded(one.image.astype(np.uint8), ".png"))
+        kept = {"identity": self._identity(row, image), "figures": pair.figures, "settings": pair.settings}
+        write_json(own(self._out / PAIRS / f"{name}.json"), kept)
+        return True
+
+    def _identity(self, row: int, image: F32) -> str:
+        """Return the sha256 (hex) of all that determines what becomes of a frame."""
+        key = [
+            self._resolved,
+            *(repr(np.asarray(value).tolist()) for value in vars(self._table.pose(row)).values()),
+            hashlib.sha256(image.tobytes()).hexdigest(),
+            repr((self._options.gains, self._options.mendings)),
+            __version__,
+        ]
+        return hashlib.sha256("\n".join(key).encode()).hexdigest()
+
+    def kept(self, row: int) -> dict[str, Any] | None:
+        """Return what an earlier run left of a frame; None if it was of something else, or if a part is no more."""
+        name = self._table.name[row]
+        try:
+            found = json.loads((self._out / PAIRS / f"{name}.json").read_text(encoding="utf-8"))
+            for which in ("real", "rendered"):
+                _written(self._out, name, which)
+        except (OSError, ValueError, InputError):
+            return None
+        identity = self._identity(row, read_frame(self._frames, name))
+        if not isinstance(found, dict) or found.get("identity") != identity:
+            return None
+        if not all(isinstance(found.get(part), dict) for part in ("figures", "settings")):
+            return None
+        figures = {name: math.nan if value is None else value for name, value in found["figures"].items()}
+        return {**found, "figures": figures}
+
+
+class _Frames(SingleItems):
+    """Hand out the frames of a passport, those of one terrain to one process."""
+
+    noun, task_noun, item_noun = "passport", "frame", "frame"
+
+
+class _Steps(Progress):
+    """Pass each finished frame on to who shows the progress."""
+
+    def __init__(self, step: Callable[[], None]) -> None:
+        super().__init__(0, shown=False)
+        self._step = step
+
+    def advance(self, built: bool) -> None:
+        """Count a frame."""
+        self._step()
 
 
 def statistics(figures: Sequence[Mapping[str, float]]) -> list[Statistic]:
@@ -308,22 +375,6 @@ def _chosen(names: Sequence[str], options: PassportOptions) -> list[int]:
     return [
         row for row in range(len(names)) if options.part == "all" or (row in kept) == (options.part == "kept_back")
     ]
-
-
-def _kept(out: Path, name: str, identity: str) -> dict[str, Any] | None:
-    """Return what an earlier run left of a frame, or None if it was of something else, or if a part is no more."""
-    try:
-        found = json.loads((out / PAIRS / f"{name}.json").read_text(encoding="utf-8"))
-        for which in ("real", "rendered"):
-            _written(out, name, which)
-    except (OSError, ValueError, InputError):
-        return None
-    if not isinstance(found, dict) or found.get("identity") != identity:
-        return None
-    if not all(isinstance(found.get(part), dict) for part in ("figures", "settings")):
-        return None
-    figures = {name: math.nan if value is None else value for name, value in found["figures"].items()}
-    return {**found, "figures": figures}
 
 
 def _written(out: Path, name: str, which: str) -> NDArray[np.uint8]:

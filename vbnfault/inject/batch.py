@@ -33,7 +33,7 @@ from ..dataset import build
 from ..dataset.from_scene import with_card
 from ..dataset.identity import IMAGES, is_exact, planned, store_spec, with_contents
 from ..dataset.progress import Progress, size_text
-from ..dataset.work import Job, Tick, attempt
+from ..dataset.work import SingleItems, Tick, attempt
 from ..pipeline import Session
 from ..pipeline.record import proposal
 from ..scene import plan
@@ -252,19 +252,10 @@ class _Worker:
             tick(task, "built", "")
 
 
-class _Images(Job):
+class _Images(SingleItems):
     """Hand out the images of a batch; a damaged one is reported, and the others are made."""
 
     noun, task_noun, item_noun = "batch", "image", "image"
-    most_failures = None
-
-    def items(self, number: int) -> Sequence[int]:
-        """Return the image of a task."""
-        return (number,)
-
-    def task(self, number: int, skip: frozenset[int] = frozenset(), *, careful: bool = False) -> int:
-        """Return the number of an image."""
-        return number
 
 
 # --- a store beside them ------------------------------------------------------------------------------------------
