@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -161,20 +162,43 @@ def test_a_frame_that_the_body_fills_tells_nothing_of_the_sky() -> None:
     assert np.isnan([*fit_frames.sky_figures(full, full.lit).values()]).all()
 
 
-def test_a_noisy_frame_is_rendered_with_the_higher_gain() -> None:
+@pytest.mark.parametrize(
+    ("power", "table"),
+    [
+        (2, ((0.7, 1.0), (1.25, 1.0), (1.6, 1.4), (2.2, 1.4), (3.0, 1.4), (9.0, 2.5))),
+        (1, ((0.7, 1.0), (1.1, 1.0), (1.25, 1.4), (1.7, 1.4), (2.2, 2.5), (3.0, 2.5))),
+    ],
+    ids=["readout", "photons"],
+)
+def test_a_noisy_frame_is_rendered_with_the_higher_gain(
+    power: int, table: tuple[tuple[float, float], ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Variance in digital numbers goes with the gain's square, or with the gain itself where it is of photons."""
     body, rng = disc(80, 80), np.random.default_rng(3)
 
-    def look_at(deviation: float) -> fit_frames.Look:
-        sky = 8 + deviation * rng.normal(size=body.shape) + np.arange(len(body)) % 3 - 1  # columns are no noise
-        return fit_frames.look(np.where(body > 40, body, sky))
+    def image(variance: float) -> np.ndarray:
+        sky = 8 + variance**0.5 * rng.normal(size=body.shape)
+        sky += np.arange(len(body)) % 3 - 1  # columns are no noise
+        return np.where(body > 40, body, sky)
 
-    for variance, gain in ((0.7, 1.0), (1.25, 1.0), (1.6, 1.4), (2.2, 1.4), (3.0, 1.4), (9.0, 2.5)):
-        one = look_at(variance**0.5)
+    def rendered(self: fit_replay.Replay, row: int, trajectory: Any, settings: dict[str, float]) -> np.ndarray:
+        tried[settings["gain"]] = image(settings["gain"] ** power)
+        return tried[settings["gain"]]
+
+    monkeypatch.setattr(fit_replay.Replay, "_raw", rendered)
+    replay = object.__new__(fit_replay.Replay)
+    replay.display = fit_replay.Display(bias_dn=0, top_dn=255, stretch=1.0, step=1e-3)
+    for variance, gain in table:
+        one, plain = fit_frames.look(image(variance)), image(1.0)
         # of 19,000 differences, each with two neighbours, the variance has a deviation of 1.3 %; spots of 4 levels
         # are left out, which cuts the tails of strong noise
         assert variance > 1 or fit_replay.noise_variance(one, 1.0) == pytest.approx(variance, rel=4 * 0.013)
-        assert fit_replay.nearest_gain(one, look_at(1.0), (1.0, 1.4, 2.5), 1.0) == gain
-    assert fit_replay.nearest_gain(look_at(3.0), look_at(1.0), (1.0,), 1.0) == 1
+        for gains, nearest in (((1.0, 1.4, 2.5), gain), ((1.0,), 1.0)):
+            replay.gains, tried = gains, {1.0: plain}
+            found, raw = replay._nearest_gain(0, None, one, plain, 1, {})  # type: ignore[arg-type]
+            assert found == nearest
+            assert raw is tried[nearest]
+            assert len(tried) == 1 or variance > 1.15  # noise as of the first gain costs no rendering
 
 
 def test_the_noise_of_a_stretched_frame_is_that_of_its_light() -> None:

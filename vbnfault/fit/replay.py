@@ -192,11 +192,8 @@ class Replay:
             raw = self._raw(row, trajectory, settings | {"gain": self.gains[0]})
         if real.smeared:
             raw = self._smeared(row, trajectory, real, raw, factor, settings)
+        gain, raw = self._nearest_gain(row, trajectory, real, raw, factor, settings)
         before = look(self.display.developed(raw, factor))
-        gain = nearest_gain(real, before, self.gains, self.display.stretch)
-        if gain != self.gains[0]:
-            raw = self._raw(row, trajectory, settings | {"gain": gain})
-            before = look(self.display.developed(raw, factor))
         shift = shift_between(real, before, search_px=search_px)
         native = round(factor * shift[0]), round(factor * shift[1])
         rendered = look(self.display.developed(shifted(raw, native), factor))
@@ -248,6 +245,29 @@ class Replay:
             raw = self._raw(row, trajectory, settings | {"gain": self.gains[0]})
         return raw
 
+    def _nearest_gain(
+        self, row: int, trajectory: Trajectory, real: Look, raw: NDArray[Any], factor: int, settings: dict[str, Any]
+    ) -> tuple[float, NDArray[Any]]:
+        """Return the gain with which the noise of the sky is nearest to the frame's, and its raw image.
+
+        `raw` has the first of the gains. How noise grows with the gain depends on how much of it is of photons, so
+        another gain is tried where half of what it changes of photons alone, the least, would be too little.
+        """
+        wanted, tried = noise_variance(real, self.display.stretch), {self.gains[0]: raw}
+
+        def lacks(gain: float) -> float:
+            """Return the logarithm of the factor that the variance lacks with a gain that was tried."""
+            image = look(self.display.developed(tried[gain], factor))
+            return float(np.log(wanted / noise_variance(image, self.display.stretch)))
+
+        nearest = self.gains[0]
+        for gain in () if real.clipped else self.gains[1:]:
+            step = np.log(gain / nearest)
+            if lacks(nearest) * step > 0.5 * step**2:
+                tried[gain] = self._raw(row, trajectory, settings | {"gain": gain})
+                nearest = min(tried, key=lambda gain: abs(lacks(gain)))
+        return nearest, tried[nearest]
+
     def _raw(self, row: int, trajectory: Trajectory, settings: dict[str, Any]) -> NDArray[Any]:
         camera = self.scene.camera.model_copy(update=settings)
         self.session.scene = self.scene.model_copy(update={"camera": camera})
@@ -291,20 +311,6 @@ def smear(one: Look, stretch: float) -> float:
     if len(np.unique(body[columns])) < 2:
         return 0.0
     return max(float(np.polyfit(body[columns], sky[columns] / rows[columns], 1)[0]), 0.0)
-
-
-def nearest_gain(real: Look, rendered: Look, gains: Sequence[float], stretch: float) -> float:
-    """Return the gain whose noise in the sky is nearest to the frame's.
-
-    Its variance goes with the gain's square, a little less where it is of photons. `rendered` has the first of the
-    gains; levels are light to the power `stretch`.
-    """
-    if len(gains) == 1 or real.clipped:
-        return gains[0]
-    ratio = noise_variance(real, stretch) / noise_variance(rendered, stretch)
-    if not ratio > 0:
-        return gains[0]
-    return min(gains, key=lambda gain: abs(np.log(ratio * (gains[0] / gain) ** 2)))
 
 
 def noise_variance(one: Look, stretch: float) -> float:
