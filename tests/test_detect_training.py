@@ -560,6 +560,34 @@ def test_wrong_places_are_refused_in_one_sentence(path: str, trained: Path, tmp_
     (tmp_path / "model" / CHECKPOINT).write_bytes(b"torn")
     with pytest.raises(InputError, match="is no file of a checkpoint that PyTorch reads safely"):
         train([path], tmp_path / "model", TrainOptions(**SMALL))
+    (tmp_path / "model" / CHECKPOINT).write_bytes(b"")
+    with pytest.raises(InputError, match=r"that PyTorch reads safely: it ends too early$"):
+        train([path], tmp_path / "model", TrainOptions(**SMALL))
+
+
+def test_fields_of_other_types_are_refused_in_one_sentence(
+    path: str, trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a checkpoint, and of `model.json`, which its owner may have edited."""
+    out, options = tmp_path / "model", TrainOptions(**SMALL)
+    monkeypatch.setattr(training._Run, "_train_epoch", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    with pytest.raises(Interrupted):
+        train([path], out, options)
+    state = torch.load(out / CHECKPOINT)
+    what = state["what"]
+    for key, value in [
+        *((key, [1]) for key in state),
+        *(("what", {**what, **changed}) for changed in ({"options": None}, {"datasets": None}, {"datasets": [{}]})),
+        *(("epoch", 1), ("step", 99)),
+    ]:
+        torch.save({**state, key: value}, out / CHECKPOINT)
+        with pytest.raises(InputError, match=r"is a checkpoint of another version: .+|holds (no|a) training "):
+            train([path], out, options)
+    record = json.loads((trained / MODEL).read_text())
+    for changed in ({"datasets": None}, {"datasets": [1]}, {"epochs": None}):
+        (out / MODEL).write_text(json.dumps({**record, **changed}))
+        with pytest.raises(InputError, match=r"is no model\.json of this vbnfault|holds (no|a) training "):
+            train([path], out, options)
 
 
 def test_what_is_no_model_is_refused_in_one_sentence(trained: Path, tmp_path: Path) -> None:

@@ -75,7 +75,8 @@ def _versions() -> dict[str, str]:
 
 def check_same(out: Path, held_there: Mapping[str, Any], what: Mapping[str, Any]) -> None:
     """Raise InputError, which says what differs, unless a folder holds the training that is asked for."""
-    if not all(key in held_there for key in what):
+    is_ours = isinstance(held_there, dict) and all(type(held_there.get(key)) is type(what[key]) for key in what)
+    if not is_ours or not all(isinstance(one, dict) for one in held_there["datasets"]):
         raise InputError(f"{out}: holds no training of this vbnfault; choose another --out")
     there, here = dict(held_there["options"]), dict(what["options"])
     for key in ("architecture", "classes"):
@@ -89,7 +90,7 @@ def check_same(out: Path, held_there: Mapping[str, Any], what: Mapping[str, Any]
     kept = ("name", "checksums_sha256", "train", "val", "mirrored")
     of = [[{key: one.get(key) for key in kept} for one in held["datasets"]] for held in (held_there, what)]
     if of[0] != of[1]:
-        names = ["{name} ({train} images, {checksums_sha256:.8})".format(**one) for one in (*of[0], *of[1])]
+        names = ["{name} ({train} images, {checksums_sha256!s:.8})".format(**one) for one in (*of[0], *of[1])]
         then, now = ", ".join(names[: len(of[0])]), ", ".join(names[len(of[0]) :])
         raise InputError(f"{out}: holds a training on {then}, not on {now}; choose another --out")
 

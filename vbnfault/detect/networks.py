@@ -34,7 +34,15 @@ STRIDE_PX = 32  # sides of an image are padded to a multiple: the U-Net needs on
 LEVELS = 5
 MODEL, WEIGHTS, CHECKPOINT = "model.json", "weights.pt", "checkpoint.pt"
 FORMAT = 1
-_OF_MODEL = {"architecture": str, "classes": list, "options": dict, "weights_sha256": str}  # in `model.json`
+_OF_MODEL = {  # in `model.json`
+    "architecture": str,
+    "classes": list,
+    "options": dict,
+    "datasets": list,
+    "epochs": list,
+    "best_epoch": int,
+    "weights_sha256": str,
+}
 _HIDDEN = 64
 # Widths of the U-Net at full size, 1/2, … 1/16. Lines and defects of one pixel need the full size, where a channel
 # costs most; flares and blur need the coarse maps. 0.5 million parameters; 120 ms of processor time train it with
@@ -214,7 +222,7 @@ def read_weights(path: Path, what: str = "weights") -> Any:
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
     except Exception as error:  # the safe unpickler meets whatever bytes make of it
-        why = first_sentence(error)
+        why = first_sentence(error) or "it ends too early"
         raise InputError(f"{path}: is no file of {what} that PyTorch reads safely: {why}") from None
 
 

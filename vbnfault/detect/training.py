@@ -221,6 +221,7 @@ class _Run:
                 one["digest"] = digest(store)
             self.weights = data.pixel_weights().to(device)
         else:
+            self.weights = torch.ones(len(data.classes), device=device)
             self._restore(saved)
         self.saved_at = time.monotonic()
 
@@ -336,9 +337,9 @@ class _Run:
                 figures.add(said, {name: value.to(self.device) for name, value in batch.items()}, loss)
         return figures.values()
 
-    def _save(self) -> None:
-        """Write the checkpoint."""
-        state = {
+    def _state(self) -> dict[str, Any]:
+        """Return what a checkpoint holds."""
+        return {
             "what": self.what,
             "network": self.network.state_dict(),
             "optimizer": self.optimizer.state_dict(),
@@ -347,22 +348,34 @@ class _Run:
             "weights": self.weights,
             **{name: getattr(self, name) for name in _NUMBERS},
         }
+
+    def _save(self) -> None:
+        """Write the checkpoint."""
         file = io.BytesIO()
-        torch.save(state, file)
+        torch.save(self._state(), file)
         with writing(self.out / CHECKPOINT):
             write_whole(self.out / CHECKPOINT, file.getvalue())
         self.saved_at = time.monotonic()
 
     def _restore(self, saved: Mapping[str, Any]) -> None:
-        """Continue from a checkpoint. Raises InputError if it is of another version."""
+        """Continue from a checkpoint. Raises InputError if it is of another version or was made by hand."""
         try:
+            for name, value in self._state().items():
+                if type(saved[name]) is not type(value):
+                    raise TypeError(f"{name} is no {type(value).__name__}")
+            if [one["epoch"] for one in saved["history"]] != list(range(1, saved["epoch"] + 1)):
+                raise ValueError("history has not the epochs that are done")
+            if not 0 <= saved["step"] <= self.data.steps or saved["weights"].shape != self.weights.shape:
+                raise ValueError("step or weights do not fit the datasets")
+            if saved["best"] or saved["epoch"]:
+                self.network.load_state_dict(saved["best"])  # refuses other weights
             self.network.load_state_dict(saved["network"])
             self.optimizer.load_state_dict(saved["optimizer"])
             self.what, self.best, self.history = saved["what"], saved["best"], saved["history"]
             self.weights = saved["weights"].to(self.device)
             for name in _NUMBERS:
                 setattr(self, name, saved[name])
-        except (KeyError, RuntimeError, ValueError) as error:
+        except (AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
             file = self.out / CHECKPOINT
             raise InputError(f"{file}: is a checkpoint of another version: {first_sentence(error)}") from None
 
