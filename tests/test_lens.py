@@ -227,6 +227,10 @@ def lens_of(*rows: dict[str, Any], **more: Any) -> dict[str, Any]:
             ["surface[1]", "thickness_mm = -1.0", "0 to 1000000"],
         ),
         (lens_of(STOP, GLASS | {"thickness_mm": 0.5}, BACK), ["surface[1]", "thickness_mm = 0.5", "cross"]),
+        (
+            lens_of(STOP, GLASS | {"coating": [{"n": 1.2, "k": 7.0, "thickness_nm": 6000.0}]}, BACK),
+            ["surface[1].coating: transmits 0 of", "must be at least 1e-09"],
+        ),
         (lens_of(STOP, GLASS | {"nd": 0.9}, BACK), ["surface[1]", "nd = 0.9", "from 1 to 5"]),
         (lens_of(STOP, GLASS | {"coating": "gold"}, BACK), ["surface[1]", "'gold'", "mgf2"]),
         (lens_of(STOP, GLASS | {"coating": [{"n": 1.4}]}, BACK), ["coating[0]", "thickness_nm", "missing"]),

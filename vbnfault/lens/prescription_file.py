@@ -20,7 +20,7 @@ from ..core.errors import InputError, in_file
 from ..core.files import resources, toml_files
 from ..core.files.whole_files import write_whole
 from ..core.tables import Fraction, Table, check_spectrum
-from .coating import Layer
+from .coating import Layer, reflect_transmit
 from .glass import (
     AIR,
     CLEAR,
@@ -36,6 +36,7 @@ from .paraxial import paraxial_properties
 from .prescription import Hood, Prescription, Surface, facing_air
 from .zemax import LENS_SUFFIX, GlassCatalogue, glass_named, read_catalogue, read_lens
 
+_LEAST_PASSED = 1e-9  # by a coating: a filter for looking at the Sun passes 1e-5
 _RIM_POINTS = 65
 _SMALLEST_RADIUS_MM = 1e-9  # the squares of larger curvatures could be too large for a number
 _OF_THE_STOP = ("blades", "blade_rounding", "rotation_deg")
@@ -82,7 +83,9 @@ class SurfaceRow(Table):
         None, description="the medium by name or by a dispersion formula, in place of nd and vd"
     )
     coating: str | tuple[Layer, ...] = Field(
-        "none", description="none, mgf2, v or bbar, or layers in the order in which light from the front meets them"
+        "none",
+        description="none, mgf2, v or bbar, or layers in the order in which light from the front meets them, which "
+        f"transmit at least {_LEAST_PASSED:g} of the light",
     )
     internal_transmittance_10mm: Fraction | TransmittanceTable | None = Field(
         None, description="of 10 mm of the medium: a fraction or a table; default: the glass's own, or 1"
@@ -320,7 +323,7 @@ def _coating(given: str | tuple[Layer, ...], front: Glass, back: Glass, where: s
 
 
 def _check(lens: Prescription, source: str) -> None:
-    """Raise InputError unless the lens has its stop in one medium, ends in air, and no two surfaces cross.
+    """Raise InputError unless light passes, the stop is in one medium, air follows, and no two surfaces cross.
 
     A hood stands before the first surface and is at least as wide.
     """
@@ -339,6 +342,13 @@ def _check(lens: Prescription, source: str) -> None:
     if lens.surfaces[-1].medium.nd != 1.0:
         raise InputError(f"{source}: surface[{len(lens.surfaces) - 1}].nd: behind the last surface there is air")
     media = (AIR, *(s.medium for s in lens.surfaces))
+    for k, surface in enumerate(lens.surfaces):
+        passed = float(reflect_transmit(surface.coating, media[k].nd, media[k + 1].nd, 1.0, D_NM)[2])
+        if passed < _LEAST_PASSED:
+            raise InputError(
+                f"{source}: surface[{k}].coating: transmits {passed:.3g} of the light at {D_NM:g} nm; must be "
+                f"at least {_LEAST_PASSED:g}"
+            )
     if not media[lens.stop].same_index(media[lens.stop + 1]):
         raise InputError(f"{source}: surface[{lens.stop}].nd: the stop has the same medium on both sides")
     for k, (front, back) in enumerate(zip(lens.surfaces[:-1], lens.surfaces[1:], strict=True)):
