@@ -157,6 +157,9 @@ surface = [
 """
 
 
+NEAR_M = np.ones(1)  # of points before the focus
+
+
 def frame_of(prescription: Any) -> ImageFrame:
     lens = scaled_to_field(prescription, 40.0, 6.4)
     real = RealLens(prescription=lens, width_px=64, height_px=64, pixel_pitch_um=100.0)
@@ -174,7 +177,7 @@ def area(support: F64) -> F64:
 
 
 def test_blades_and_rims_cut_the_figure() -> None:
-    bladed = pupil_support(frame_of(parse_lens(tomllib.loads(BLADES), source="blades.toml")), np.zeros((1, 2)))
+    bladed = pupil_support(frame_of(parse_lens(tomllib.loads(BLADES), source="b.toml")), np.zeros((1, 2)), NEAR_M)
     assert bladed is not None
     # a hexagon of the area π R²: its corners at R √(2π / (3 √3)), the first at 30 degrees
     corner = np.sqrt(2 * np.pi / (3 * np.sqrt(3)))
@@ -185,7 +188,7 @@ def test_blades_and_rims_cut_the_figure() -> None:
     frame = frame_of(load_lens("biotar_100_f1p4"))
     edge = frame.slopes(np.array([64.0]), np.array([32.0]))[0][0, 0]
     slopes = np.array([[0.0, 0.0], [edge, 0.0], [0.0, edge]])
-    round_, right, below = (v[None] for v in pupil_support(frame, slopes))  # type: ignore[union-attr]
+    round_, right, below = (v[None] for v in pupil_support(frame, slopes, NEAR_M))  # type: ignore[union-attr]
     np.testing.assert_allclose(round_, 1, rtol=2e-3)
     passes = frame.lens.pupil_area_mm2([edge])[0] / frame.lens.pupil_area_mm2([0.0])[0]
     assert passes < 0.8  # the lens vignettes there
@@ -196,13 +199,24 @@ def test_blades_and_rims_cut_the_figure() -> None:
     np.testing.assert_allclose(np.roll(right, 12, axis=1), below, rtol=0.01)
 
 
+def test_points_beyond_the_focus_draw_the_pupil_turned_by_half_a_turn() -> None:
+    """A ray at P of the pupil of a thin lens ends P (1 - s/v) off the image (sensor at s, image at v)."""
+    pentagon = parse_lens(tomllib.loads(BLADES.replace("blades = 6", "blades = 5")), source="b.toml")
+    frame = frame_of(pentagon)
+    frame = replace(frame, lens=replace(frame.lens, focus_distance_m=5.0))  # type: ignore[type-var]
+    near, far = pupil_support(frame, np.zeros((2, 2)), np.array([2.0, 20.0]))  # type: ignore[misc]
+    first = round(frame.lens.real.prescription.surfaces[pentagon.stop].rotation_deg / 7.5)  # type: ignore[union-attr]
+    assert near[first] / near[first - 24] == pytest.approx(1 / np.cos(np.pi / 5), rel=0.01)  # corner over edge
+    np.testing.assert_allclose(far, np.roll(near, 24), rtol=1e-9)
+
+
 def test_an_ideal_lens_draws_discs() -> None:
     from vbnfault.lens import ThinLens
 
     thin = ImageFrame(
         lens=ThinLens(focal_length_mm=10.0, f_number=2.0), width_px=8, height_px=8, pixel_pitch_um=10.0
     )
-    assert pupil_support(thin, np.zeros((3, 2))) is None
+    assert pupil_support(thin, np.zeros((3, 2)), NEAR_M) is None
     points = streak([10.0], [10.0], radius=3.0)
     moved = replace(points, x_px=points.x_px + 2).moved(1.0, -3.0)
     assert (moved.x_px[0], moved.y_px[0]) == (13.0, 7.0)

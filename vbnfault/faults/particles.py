@@ -312,7 +312,7 @@ def _light(params: Params, context: FaultContext) -> _GrainLight | None:
     grains = _GrainsInView(*(np.asarray(params[name], dtype=np.float64) for name in _GrainsInView._fields))
     slopes = np.column_stack([grains.slope_x, grains.slope_y])
     border = camera.lens.border_px
-    streaks = _streaks(grains, context, pupil_support(context.frame, slopes)).moved(border, border)
+    streaks = _streaks(grains, context, pupil_support(context.frame, slopes, grains.depth_m)).moved(border, border)
     shape = context.shape[0] + 2 * border, context.shape[1] + 2 * border
     depth = None if context.depth_m is None else np.pad(context.depth_m, border, mode="edge")
     irradiance = grains.irradiance_W_m2 * _pupil_per_pixel(context, slopes)

@@ -1,8 +1,9 @@
 """Draw points that are out of focus and move during the exposure: discs, streaks, and streaks of discs.
 
 A point at a distance d from a lens focused at a distance g is imaged as the outline of the lens's pupil, scaled by
-f |1/d - 1/g| (f: focal length). A point that moves uniformly draws this figure along a line. The light at a pixel
-is the length of the line on which the figure covers the pixel, over the length of the line and the figure's area:
+f (1/d - 1/g) (f: focal length), so that it is turned by half a turn beyond the focus. A point that moves uniformly
+draws this figure along a line. The light at a pixel is the length of the line on which the figure covers the pixel,
+over the length of the line and the figure's area:
 
     E(p) = |{τ in [-L/2, L/2]: p - τ u in the figure}| / (L A),
 
@@ -273,11 +274,12 @@ def _lit(streaks: Streaks, point: I64, x: I64, y: I64, steps: int) -> F64:
 # --- outlines of pupils ----------------------------------------------------------------------------------------
 
 
-def pupil_support(frame: ImageFrame, slopes: F64) -> F64 | None:
+def pupil_support(frame: ImageFrame, slopes: F64, depth_m: F64) -> F64 | None:
     """Return `Streaks.support` for points at the tangents x/z and y/z, float64[n, 2]; None for an ideal lens.
 
     The outline is that of the beam of a far point; its middle is its centroid. A stop with blades cuts the beam of
-    the round stop of the same area, in every direction by the ratio of its rim to that stop's.
+    the round stop of the same area, in every direction by the ratio of its rim to that stop's. The light of points
+    beyond the focus crosses before the sensor, which turns the outline by half a turn.
     """
     if frame.lens.real is None:
         return None
@@ -290,7 +292,8 @@ def pupil_support(frame: ImageFrame, slopes: F64) -> F64 | None:
     stop = frame.lens.real.prescription.surfaces[frame.lens.real.prescription.stop]
     spread = np.sqrt(np.mean(stop.rim_mm(np.linspace(0, 2 * np.pi, 3600, endpoint=False)) ** 2))
     around = azimuth + turn[:, None]
-    distance = rim[nearest] * stop.rim_mm(around) / (spread * radius_mm)
+    crossed = np.where(depth_m > frame.lens.focus_distance_m, -1.0, 1.0)[:, None]
+    distance = crossed * rim[nearest] * stop.rim_mm(around) / (spread * radius_mm)
     x, y = distance * np.cos(around), distance * np.sin(around)
     normal = 2 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
     support = [(x * np.cos(a) + y * np.sin(a)).max(axis=1) for a in normal]
