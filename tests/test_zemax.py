@@ -279,6 +279,20 @@ def test_missing_rims_let_the_beams_of_the_file_pass(tmp_path: Path, named: str,
     assert f"DIAM of SURF {listed} from the paraxial beams of " in lens.source
 
 
+def test_an_automatic_stop_is_no_wider_than_the_beam(tmp_path: Path) -> None:
+    """OpticStudio widens it for oblique beams; the f-number stays that of ENPD or FNUM, as in optiland."""
+    wide = TRIPLET.replace("DIAM 4 0 0 0 1", "DIAM 6 0 0 0 1")
+    for text, pupil in (
+        (wide, {"entrance_pupil_diameter_mm": 10.0}),
+        (wide.replace("ENPD 10", "FNUM 5 0"), {"f_number": 5.0}),
+        (TRIPLET, {"entrance_pupil_diameter_mm": 9.468772}),
+        (wide.replace("DIAM 6 0", "DIAM 6 1"), {"entrance_pupil_diameter_mm": 1.5 * 9.468772}),
+    ):
+        lens = load_lens(written(tmp_path, text))
+        got = {name: getattr(paraxial_properties(lens), name) for name in pupil}
+        assert got == pytest.approx(pupil, rel=1e-6)
+
+
 def test_a_missing_rim_stays_within_its_ball(tmp_path: Path) -> None:
     """A paraxial beam may be wider than a ball lens in glass, whose rim then lies just inside the equator."""
     ball = "SURF 1\n CURV 0.2\n DISZ 10\n GLAS N-BK7 0 0 1.5168 64.17\nSURF 2\n CURV -0.2\n DISZ 2\n"

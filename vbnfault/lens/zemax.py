@@ -26,7 +26,8 @@ CLAP, FLAP  circular aperture, whose outer radius is then the rim; its inner rad
 GLAS        glass by name, or by nd and vd
 ==========  ==========================================================================================
 
-Rims that are missing come from paraxial beams (`_with_rims`), and `source` says so.
+Rims that are missing come from paraxial beams (`_with_rims`), and `source` says so. So does the rim of a stop whose
+automatic semi-diameter is wider than the beam that ENPD or FNUM asks for: oblique beams have widened it.
 
 A glass is looked up in the catalogues, then among the registered glasses. If it is in neither, nd and vd of its
 GLAS record serve, and `source` names it: they may be those of a glass that stood there before. Older files have 1.5
@@ -233,6 +234,7 @@ class _Surface:
     conic: float = 0.0
     thickness: float = 0.0
     semi_diameter: float = 0.0
+    automatic: bool = False
     aperture: float | None = None
     parameters: dict[float, float] = field(default_factory=dict)
     glass: Sequence[str] | None = None
@@ -252,6 +254,7 @@ class _Surface:
             self.stop = True
         elif key in _NUMBERS:
             setattr(self, _NUMBERS[key], _number(words, 1, self.where))
+            self.automatic = words[2:3] == ["0"] if key == "DIAM" else self.automatic
         elif key == "DISZ":
             self.thickness = math.inf if words[1:2] == ["INFINITY"] else _number(words, 1, self.where)
         elif key in ("CLAP", "FLAP"):
@@ -395,8 +398,6 @@ def _with_rims(
         indices = _index(before, catalogues), _index(after, catalogues)
         matrix = gap(surface.thickness) @ refraction(*indices, surface.curvature) @ matrix
         before = after
-    if not missing:
-        return ""
     # a ray's height at each surface is `height` · its height at the first one + `slope` · its slope before that
     height, slope = np.array(rows).T
     stop = next(k for k, surface in enumerate(surfaces[1:]) if surface.stop)
@@ -406,12 +407,16 @@ def _with_rims(
         pupil = slope[stop] / height[stop]  # place of the entrance pupil behind the first vertex
         marginal = height if math.isinf(far) else (height * far + slope) / (far + pupil)  # of a pupil of radius 1
         given = {key: _number(head[key], 1, where) if key in head else 0.0 for key in ("ENPD", "FNUM")}
+        asked, cause = (given["ENPD"] / 2, "ENPD") if given["ENPD"] > 0 else (efl / given["FNUM"] / 2, "FNUM")
+        own = surfaces[1 + stop]
+        if own.automatic and own.aperture is None and 0 < asked * abs(marginal[stop]) < rims[stop]:
+            rims[stop], missing = 0, sorted({*missing, stop})
+        if not missing:
+            return ""
         if rims[stop] > 0:
             radius, cause = rims[stop] / abs(marginal[stop]), "the stop"
-        elif given["ENPD"] > 0:
-            radius, cause = given["ENPD"] / 2, "ENPD"
-        elif given["FNUM"] > 0:
-            radius, cause = efl / given["FNUM"] / 2, "FNUM"
+        elif 0 < asked < math.inf:
+            radius = asked
         else:
             radius, cause = np.min((rims / abs(marginal))[rims > 0], initial=math.inf), "the other rims"
         chief = _field_slope(head, far, efl) * (slope - pupil * height)
