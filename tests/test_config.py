@@ -275,6 +275,22 @@ def test_resolved_scene_is_a_scene_again() -> None:
         assert parse_scene(plain, source="again") == scene
 
 
+@pytest.mark.parametrize(
+    ("body", "render", "airfall", "albedos"),
+    [  # cover of dust from -2 to 1 + 2 times the airfall
+        ("reflectance = 0.1\nphotometry = {dust_contrast = 0.5}", "", 3.0, "from -0.2 to 0.45"),
+        ("reflectance = 0.1\nphotometry = {dust_contrast = -0.9}", "", 1.0, "from -0.17 to 0.28"),
+        ("reflectance = 0.5\nphotometry = {dust_contrast = 1.5}", "", 0.0, "from 0.5 to 1.25"),
+        ("reflectance = 0.1\nphotometry = {dust_slope_per_100nm = -0.2}", "band_max_nm = 2000", 0.0, "from -0."),
+    ],
+)
+def test_dust_leaves_no_negative_albedo(
+    tmp_path: Path, body: str, render: str, airfall: float, albedos: str
+) -> None:
+    text = f"{TITLE}[body]\n{body}\n[patch]\npreset = 'none'\nairfall = {airfall}\n[render]\n{render}\n"
+    assert f"the ground would have albedos {albedos}" in refusal(text.encode(), tmp_path)
+
+
 def test_overrides_replace_the_file(tmp_path: Path) -> None:
     path = write(tmp_path, TITLE + "[camera]\nfov_deg = 30\nwidth_px = 64")
     scene = load_scene(path, {"camera.fov_deg": 40, "dataset.split.train": 0.7, "title": "other"})

@@ -139,6 +139,11 @@ class Reflectance(Table):
         `reflectance` float64[band] in [0, 1] is `body.reflectance` there: the normal reflectance at zero phase.
         """
 
+    def contrast_of_dust(self, wavelength_nm: F64) -> F64:
+        """Return the reflectance of dust-covered over bare ground minus 1, float64 like `wavelength_nm`."""
+        slope = self.dust_slope_per_100nm * (wavelength_nm - REFERENCE_NM) / 100
+        return (1 + self.dust_contrast) * (1 + slope) - 1
+
     @property
     def keys_of_67p(self) -> tuple[str, ...]:
         """Return the keys whose values were measured at 67P, for a warning where the body is another one."""

@@ -12,9 +12,10 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 from pydantic import Field, model_validator
 
-from ..core import tables
+from ..core import spectra, tables
 from ..core.errors import InputError, in_file, shown, under_key
 from ..core.files import path_checks, resources, toml_files
 from ..core.quantities import SOFT_KINDS
@@ -113,6 +114,24 @@ class Scene(Table):
             raise ValueError(
                 f"motion.shutter = 'rolling': spacecraft.model = {self.spacecraft.model!r}: does not apply beside "
                 "a spacecraft, which moves with the camera; must be 'global'"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _dust_reflects(self) -> Scene:
+        """Check that ground with the least and the most dust and airfall has an albedo from 0 to 1."""
+        photometry, airfall, given = self.body.photometry, self.patch.airfall, self.body.reflectance
+        if self.patch.regolith is not None:
+            return self
+        nm = spectra.band_nodes_nm(self.render.band_min_nm, self.render.band_max_nm, self.render.bands)
+        bare = spectra.reflectance(given.model_dump() if isinstance(given, Table) else given, nm)
+        relative = 1 + np.outer([-2 * airfall, 0, 1, 1 + 2 * airfall], photometry.contrast_of_dust(nm))
+        albedo = bare * relative if photometry.scales_reflectance else relative.clip(max=1)
+        if albedo.min() < 0 or albedo.max() > 1:
+            raise ValueError(
+                f"body.photometry.dust_contrast = {photometry.dust_contrast:g}, dust_slope_per_100nm = "
+                f"{photometry.dust_slope_per_100nm:g} and patch.airfall = {airfall:g}: the ground would have "
+                f"albedos from {albedo.min():.3g} to {albedo.max():.3g}; must be from 0 to 1: lower one of them"
             )
         return self
 

@@ -58,12 +58,11 @@ def dust_contrast(scene: Scene) -> F64 | None:
 
     Of regolith: the scale by which its albedo varies, the same in all bands.
     """
-    table, wavelength = scene.body.photometry, wavelengths_nm(scene)
+    wavelength = wavelengths_nm(scene)
     if scene.patch.regolith is not None:
         scale = scene.patch.regolith.albedo_contrast
         return np.full(len(wavelength), scale) if scale else None
-    slope = table.dust_slope_per_100nm * (wavelength - REFERENCE_NM) / 100
-    contrast = (1 + table.dust_contrast) * (1 + slope) - 1
+    contrast = scene.body.photometry.contrast_of_dust(wavelength)
     return contrast if np.any(contrast) else None
 
 
