@@ -47,6 +47,9 @@ def test_statistics_are_those_of_the_arrays(data: st.Store) -> None:
         "mean": pytest.approx(0.035, rel=1e-12),
         "max": 0.06,
     }
+    for name, has_mean in (("roll_deg", False), ("sun_azimuth_deg", False), ("sun_elevation_deg", True)):
+        of_angle = numbers["ranges"][name]["all"]  # 359° and 1° have no mean of 180°
+        assert (of_angle["min"] is not None, of_angle["mean"] is not None) == (True, has_mean)
     val = np.flatnonzero(split == "val")
     assert numbers["ranges"]["exposure_s"]["val"]["min"] == 0.01 * (val[0] + 1)
     fault = data.spec.faults[0]

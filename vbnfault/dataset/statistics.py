@@ -36,6 +36,7 @@ _RANGED = (
     "samples_per_pixel",
     "noise_fraction_p99",
 )
+_WRAPPING = frozenset(("sun_azimuth_deg", "roll_deg", "pitch_deg", "yaw_deg"))  # 359° and 1° have no mean of 180°
 _READ = ("injected", "split", "stratum", "site", "parameters", *_RANGED)
 _SHARDS_AT_ONCE = 16
 _MOST_WORDS = 12  # different texts of a parameter that are counted
@@ -43,8 +44,12 @@ _MOST_WORDS = 12  # different texts of a parameter that are counted
 
 @dataclass
 class Range:
-    """Hold how many finite numbers there were, the least, the mean and the greatest of them."""
+    """Hold how many finite numbers there were, the least, the mean and the greatest of them.
 
+    Angles that wrap have no mean.
+    """
+
+    wraps: bool = False
     count: int = 0
     low: float = math.inf
     high: float = -math.inf
@@ -58,11 +63,16 @@ class Range:
             self.low, self.high = min(self.low, float(finite.min())), max(self.high, float(finite.max()))
             self.total += float(finite.sum())
 
+    @property
+    def mean(self) -> float | None:
+        """Return the mean; None without a number, and of angles that wrap."""
+        return self.total / self.count if self.count and not self.wraps else None
+
     def plain(self) -> dict[str, Any]:
         """Return the range as JSON-able data; `min`, `mean` and `max` are None without a number."""
         if not self.count:
             return {"count": 0, "min": None, "mean": None, "max": None}
-        return {"count": self.count, "min": self.low, "mean": self.total / self.count, "max": self.high}
+        return {"count": self.count, "min": self.low, "mean": self.mean, "max": self.high}
 
 
 @dataclass
@@ -228,7 +238,7 @@ def key_of(parameter: str, keys: Collection[str]) -> str:
 
 def _numbers(one: Range) -> list[str]:
     """Return least, mean and greatest as text."""
-    return [f"{one.low:.4g}", f"{one.total / one.count:.4g}", f"{one.high:.4g}"]
+    return [f"{one.low:.4g}", "" if one.mean is None else f"{one.mean:.4g}", f"{one.high:.4g}"]
 
 
 def _described(values: _Parameter) -> list[str]:
@@ -289,10 +299,10 @@ def statistics(path: str | os.PathLike[str] | Store) -> Statistics:
             for parameter in values.values():
                 parameter.settle()
         for name in _RANGED:
-            numbers = columns[name].astype(np.float64)
-            ranges[name].setdefault("all", Range()).add(numbers)
+            numbers, wraps = columns[name].astype(np.float64), name in _WRAPPING
+            ranges[name].setdefault("all", Range(wraps)).add(numbers)
             for of, chosen in samples_of.items():
-                ranges[name].setdefault(of, Range()).add(numbers[chosen])
+                ranges[name].setdefault(of, Range(wraps)).add(numbers[chosen])
     if not counts.samples.total() and store.lacks_done():
         raise VbnfaultError(f"{store.path}: {store.why_none_is_finished()}; the build command restores it")
     return Statistics(
