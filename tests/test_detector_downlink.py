@@ -15,7 +15,7 @@ from sensor_file import completed
 from vbnfault.core.errors import InputError
 from vbnfault.detector.chain import Device
 from vbnfault.detector.effects import Effect, Exposure
-from vbnfault.detector.effects.downlink import Companding, Compression
+from vbnfault.detector.effects.downlink import Companding, Compression, RawStep
 from vbnfault.detector.sensor import load_sensor, parse_sensor
 
 SHAPE = (96, 96)
@@ -136,6 +136,23 @@ def test_files_are_those_of_their_formats(monkeypatch: pytest.MonkeyPatch) -> No
             # codes above the highest count as that one; two inverse cosine transforms of libjpeg may round apart
             other = np.minimum(np.asarray(image.open(io.BytesIO(data))).astype(int), 255)
             assert np.abs(other - arrived[k // 2 :: 2, k % 2 :: 2]).max() <= 1
+
+
+def test_what_faults_make_of_raw_numbers_has_the_codes_of_companding() -> None:
+    """A fault that leaves a pixel alone changes nothing there; without faults or companding all stays as it is."""
+    law, every = Companding(levels_dn=(10, 20, 100, 3800)), np.arange(4096, dtype=np.uint16).reshape(64, 64)
+    sensor = load_sensor("generic_cmos")
+    sensor = replace(sensor, readout=replace(sensor.readout, bits=12, dnl_lsb_rms=0.0), effects=(law,))
+
+    def dark(raw: NDArray[Any]) -> NDArray[Any]:
+        return np.where(np.arange(64)[:, None] < 32, raw, raw - 7)  # fewer than the least code holds
+
+    exposure = Exposure(device=Device(sensor, 1, shape=every.shape), exposure_s=0.01, noise=None, acts={})
+    restored = law.apply(every, exposure)
+    np.testing.assert_array_equal(RawStep().apply(restored.copy(), exposure), restored)
+    faulty = RawStep().apply(restored.copy(), replace(exposure, acts={"raw": (dark,)}))
+    np.testing.assert_array_equal(faulty[:32], restored[:32])
+    assert set(np.unique(faulty)) <= {10, 20, 100, 3800}
 
 
 def test_codes_of_companding_are_what_is_compressed() -> None:

@@ -1,7 +1,8 @@
 """Define what happens to raw DN on board before they are sent: companding to fewer codes, and lossy compression.
 
 The chain goes on with the DN that the ground restores. Bits that are lost on the way (the fault `transmission`) are
-lost in restored lines: real packets hold codes, so that one error spreads over more pixels than here.
+lost in restored lines: real packets hold codes, so that one error spreads over more pixels than here. What faults
+make of restored DN is companded again, for no other DN can arrive.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
 from ...core.errors import VbnfaultError
-from .contract import Effect, Exposure
+from .contract import Effect, Exposure, FaultStep
 from .output import Raw
 
 if TYPE_CHECKING:
@@ -133,6 +134,18 @@ class Compression(Effect):
         if not done:
             raise VbnfaultError(f"effects.compression: OpenCV {cv2.__version__} cannot encode {self.codec}")
         return np.asarray(cv2.imdecode(data, cv2.IMREAD_UNCHANGED))[:height, :width]
+
+
+class RawStep(FaultStep):
+    """Let faults act on the raw DN, which stay DN of the codes of `companding`, where the sensor has it."""
+
+    name = "raw"
+    after = "compression"
+
+    def apply(self, signal: Raw, exposure: Exposure) -> Raw:
+        """Return the restored DN with the faults of this step."""
+        acted, companding = super().apply(signal, exposure), _companding(exposure.sensor)
+        return companding.apply(acted, exposure) if companding and exposure.acts.get(self.name) else acted
 
 
 def _companding(sensor: Sensor) -> Companding | None:

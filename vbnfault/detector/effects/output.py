@@ -12,7 +12,7 @@ from pydantic import Field, field_validator
 
 from ..individual import StuckPixels
 from ..readout import ReadoutIndividual, analogue_dn, clip_full_well, convert
-from .contract import F32, Effect, Exposure, FaultStep
+from .contract import F32, Effect, Exposure
 
 Raw = NDArray[np.uint16]
 _Electrons = Annotated[float, Field(gt=0, le=1e9)]
@@ -102,13 +102,6 @@ class StuckPixelLevels(Effect):
         """Return raw DN, uint16[y, x]; the input is changed."""
         show_stuck(signal, exposure.device.individual.stuck, exposure.sensor.readout.top_dn)
         return signal
-
-
-class RawStep(FaultStep):
-    """Let faults act on the raw DN."""
-
-    name = "raw"
-    after = "compression"
 
 
 def _with_offsets(exposure: Exposure) -> ReadoutIndividual:
