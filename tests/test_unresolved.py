@@ -16,6 +16,7 @@ from test_render import scene as render_scene
 
 from vbnfault import pipeline, render
 from vbnfault.body import ellipsoid
+from vbnfault.core.calibration import Calibration
 from vbnfault.core.quantities import BODY, splat
 from vbnfault.render.description import RenderInput, View
 
@@ -111,6 +112,26 @@ def test_the_centre_of_light_is_that_of_the_body() -> None:
     assert spread.sum() == pytest.approx(weights.sum(), rel=1e-5)
     x, y = (spread.sum(axis=axis) @ (np.arange(PIXELS) + 0.5) / spread.sum() - PIXELS / 2 for axis in (0, 1))
     np.testing.assert_allclose([x, y], [3.27, -8.61], atol=0.005)
+
+
+def test_distortion_leaves_the_brightness_of_a_body_as_it_is() -> None:
+    """Each pixel has the light that its own rays have, though pixels of the close-up lie across its border."""
+    focal_px, middle_px = 1 / PIXEL_RAD, PIXELS / 2
+    distorted = Calibration(
+        width_px=PIXELS,
+        height_px=PIXELS,
+        fx=focal_px,
+        fy=focal_px,
+        cx=middle_px,
+        cy=middle_px,
+        coefficients=(-3e4,),
+    )
+    of = seen(60.0, 0.0, projection=distorted)
+    assert render.close_up(surface(), of.view) is not None
+    image, rays = render.radiance(surface(), of).array[4], render.direct(surface(), of).array[4]
+    bright = rays > 0.6 * rays.max()
+    assert bright.sum() > 1000
+    assert np.abs(image[bright] / rays[bright] - 1).max() < 0.05
 
 
 def test_defocus_spreads_the_light_and_keeps_it() -> None:

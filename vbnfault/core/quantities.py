@@ -102,6 +102,10 @@ class FineLight:
         float64[point, 2]: tangents x/z and y/z in C.
     power
         float32[band, point]: radiance times projected solid angle, the irradiance on a plane across the boresight.
+    depth_m
+        float64[point]: depth in C of what sends the light, NaN of parts of the camera's own spacecraft.
+    side_px
+        float64[point]: side of the square that a point stands for, in pixels of a pinhole; 0: it is a point.
     rows, columns
         Window of the render's pixels that holds all of the light.
     mean
@@ -110,6 +114,8 @@ class FineLight:
 
     slopes: F64
     power: F32
+    depth_m: F64
+    side_px: F64
     rows: slice
     columns: slice
     mean: F32
@@ -121,6 +127,8 @@ class FineLight:
         slopes: F64,
         area_px: F64,
         radiance: F32,
+        depth_m: F64,
+        side_px: F64,
         intrinsics: F64,
         shape: tuple[int, int],
         projection: Any = None,
@@ -135,6 +143,8 @@ class FineLight:
             float64[point]: area of each point in pixels of a pinhole with these intrinsics.
         radiance
             float32[band, point].
+        depth_m, side_px
+            As in the class.
         intrinsics
             fx, fy, cx and cy in pixels.
         projection
@@ -144,25 +154,29 @@ class FineLight:
         # cos⁴θ / (fx fy) is the projected solid angle of a pixel
         solid_sr = 1 / (intrinsics[0] * intrinsics[1] * (1 + (slopes**2).sum(axis=1)) ** 2)
         power = light * solid_sr.astype(np.float32)
-        pixels = slopes * intrinsics[:2] + intrinsics[2:]
+        pixels, side = slopes * intrinsics[:2] + intrinsics[2:], side_px
         if projection is not None:
             towards = _forward(slopes)
             pixels = projection.pixel_of(towards)
             facing = 1 if projection.foreshortens else 1 / np.sqrt(1 + (slopes**2).sum(axis=1))
-            light = (light * (solid_sr / (facing * projection.solid_angle_sr(towards)))).astype(np.float32)
-        column, row = np.floor(pixels).astype(np.int64).T
-        inside = (column >= 0) & (column < shape[1]) & (row >= 0) & (row < shape[0])
-        column, row, values = column[inside], row[inside], light[:, inside]
-        rows, columns = ((int(v.min()), int(v.max()) + 1) if len(v) else (0, 1) for v in (row, column))
-        height, width = rows[1] - rows[0], columns[1] - columns[0]
-        index = (row - rows[0]) * width + column - columns[0]
-        mean = np.stack([np.bincount(index, band, height * width) for band in values])
+            stretch = solid_sr / (facing * projection.solid_angle_sr(towards))
+            light, side = (light * stretch).astype(np.float32), side_px * np.sqrt(stretch)
+        low, high = (np.floor(pixels + sign * side[:, None] / 2).astype(np.int64) for sign in (-1, 1))
+        inside = ((high >= 0) & (low < shape[::-1])).all(axis=1)
+        columns, rows = (
+            (max(int(a.min()), 0), min(int(b.max()) + 1, size)) if len(a) else (0, 1)
+            for a, b, size in zip(low[inside].T, high[inside].T, shape[::-1], strict=True)
+        )
+        window, corner = (rows[1] - rows[0], columns[1] - columns[0]), np.array([columns[0], rows[0]])
+        mean = [splat(pixels[inside] - corner, band, window, side[inside]) for band in light[:, inside]]
         return cls(
             slopes=slopes,
             power=power,
+            depth_m=depth_m,
+            side_px=side_px,
             rows=slice(*rows),
             columns=slice(*columns),
-            mean=mean.reshape(-1, height, width).astype(np.float32),
+            mean=np.stack(mean),
         )
 
     @property
@@ -185,6 +199,8 @@ class FineLight:
         return FineLight(
             slopes=np.concatenate([self.slopes, other.slopes]),
             power=np.concatenate([self.power, other.power], axis=1),
+            depth_m=np.concatenate([self.depth_m, other.depth_m]),
+            side_px=np.concatenate([self.side_px, other.side_px]),
             rows=rows,
             columns=columns,
             mean=mean,
@@ -212,13 +228,23 @@ def _forward(slopes: F64) -> F64:
     return np.column_stack([slopes, np.ones(len(slopes))])
 
 
-def splat(pixels: F64, weights: F64, shape: tuple[int, int]) -> F32:
+_LEAST_SIDE_PX = 1e-9
+_ROUNDED = 1e-9
+
+
+def splat(pixels: F64, weights: F64, shape: tuple[int, int], side_px: F64 | None = None) -> F32:
     """Return weights, float64[point], on the four pixels around each position x, y, float32[height, width].
 
-    Sum and centroid of the weights are kept, also from one pixel to the next.
+    Each is spread over a square of the side `side_px` float64[point], from 0 to 1; default: 1, which keeps the
+    centroid of the weights, also from one pixel to the next. The sum is kept.
     """
-    first = np.floor(pixels - 0.5).astype(np.int64)
-    x, y = (pixels - 0.5 - first).T
+    side = np.ones((len(pixels), 1)) if side_px is None else np.clip(side_px, _LEAST_SIDE_PX, 1)[:, None]
+    first = np.floor(pixels - side / 2).astype(np.int64)
+    part = np.clip((pixels + side / 2 - first - 1) / side, 0, 1)
+    if side_px is not None:  # squares that meet the border of a pixel do not cross it by rounding
+        part[part < _ROUNDED] = 0
+        part[part > 1 - _ROUNDED] = 1
+    x, y = part.T
     out = np.zeros(shape[0] * shape[1])
     for right, across in ((0, 1 - x), (1, x)):
         for down, along in ((0, 1 - y), (1, y)):

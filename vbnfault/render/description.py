@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from ..core.calibration import Calibration
 from ..core.sundisc import Pinhole
@@ -15,6 +16,7 @@ from ..reflectance import BandReflectance
 F64 = NDArray[np.float64]
 
 _BORDER = 65  # positions along a side of the frame of a camera with distortion
+_ROUNDS = 3  # each reduces the error of a line's time by the motion in px a line, which is far below 1
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -92,6 +94,57 @@ class View:
             self.projection.directions_of(np.stack(np.broadcast_arrays(x_px, y_px), axis=-1)), -1, 0
         )
         return x, y, z
+
+    def seen_later(self, slopes: F64, depth_m: F64, time_s: F64) -> F64:
+        """Return the tangents in C at which the camera sees points of the ground after a time, float64[point, 2].
+
+        Parameters
+        ----------
+        slopes
+            float64[point, 2]: their tangents before.
+        depth_m, time_s
+            float64[point]: depths before, and times. Where the depth is NaN, a point moves with the camera.
+        """
+        if self.motion is None:
+            return slopes
+        velocity_C_m_s = self.L_from_C.T @ self.motion.velocity_L_m_s
+        before = np.column_stack([slopes, np.ones(len(slopes))]) * depth_m[:, None]
+        turn = Rotation.from_rotvec(-np.outer(time_s, self.motion.rate_C_rad_s))
+        x, y, z = turn.apply(before - np.outer(time_s, velocity_C_m_s)).T
+        return np.where(np.isnan(depth_m)[:, None], slopes, np.stack([x / z, y / z], axis=1))
+
+    def seen_by_lines(self, slopes: F64, depth_m: F64) -> F64:
+        """Return the tangents at which the lines of a rolling shutter see points of the ground, float64[point, 2].
+
+        `slopes` are the tangents from the camera's pose, `depth_m` are as in `seen_later`.
+        """
+        seen = slopes
+        for _ in range(_ROUNDS if self._rolls else 0):
+            seen = self.seen_later(slopes, depth_m, self._line_time_s(seen))
+        return seen
+
+    def stretch(self, slopes: F64, depth_m: F64) -> F64:
+        """Return by how much longer than a line points of the ground are exposed, float64[point].
+
+        It is above 1 where they move with the lines of a rolling shutter, which stretches their image as much.
+        `slopes` are the tangents at which the lines see them, `depth_m` are as in `seen_later`.
+        """
+        if not self._rolls or self.motion is None:
+            return np.ones(len(slopes))
+        step_s = np.full(len(slopes), np.abs(self.motion.line_s).sum())
+        moved_s = self._line_time_s(self.seen_later(slopes, depth_m, step_s)) - self._line_time_s(slopes)
+        return np.asarray(1 / (1 - moved_s / step_s))
+
+    @property
+    def _rolls(self) -> bool:
+        """Return whether the camera moves and exposes line after line."""
+        return self.motion is not None and bool(self.motion.line_s.any())
+
+    def _line_time_s(self, slopes: F64) -> F64:
+        """Return the times at which pixels of a moving camera are exposed, float64[point], by tangents in C."""
+        position = self.pixel_map.pixel_of(np.column_stack([slopes, np.ones(len(slopes))]))
+        assert self.motion is not None
+        return np.asarray((position - np.array([self.width_px, self.height_px]) / 2) @ self.motion.line_s)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -88,12 +88,24 @@ class CloseUp:
         """Return x and y of its first and its last corner in the frame, float64[2] each."""
         return self.first / self.per_px, (self.first + _ACROSS) / self.per_px
 
+    @property
+    def depth_m(self) -> float:
+        """Return the depth of the body's middle along the boresight of the frame's camera."""
+        return float((self.ground.centre_m - self.frame.position_L_m) @ self.frame.L_from_C[:, 2])
+
     @cached_property
     def slopes(self) -> F64:
-        """Return the tangents x/z and y/z in C of its pixels from the frame's camera, float64[y, x, 2]."""
+        """Return the tangents x/z and y/z in C at which the frame's camera sees its pixels, float64[y, x, 2]."""
         x, y = ((start + np.arange(_ACROSS) + 0.5) / self.per_px for start in self.first)
         fx, fy, cx, cy = self.frame.intrinsics
-        return np.stack(np.meshgrid((x - cx) / fx, (y - cy) / fy), axis=-1)
+        slopes = np.stack(np.meshgrid((x - cx) / fx, (y - cy) / fy), axis=-1)
+        return self.frame.seen_by_lines(slopes.reshape(-1, 2), self._depths_m).reshape(slopes.shape)
+
+    @property
+    def _depths_m(self) -> F64:
+        """Return the depth of the body's middle for each pixel, float64[pixel]."""
+        depth_m = (self.ground.centre_m - self.frame.position_L_m) @ self.frame.L_from_C[:, 2]
+        return np.full(_ACROSS**2, float(depth_m))
 
     @cached_property
     def _lens_m(self) -> F64:
@@ -114,16 +126,20 @@ class CloseUp:
 
     def light(self, radiance: Radiance) -> FineLight:
         """Return the light of the close-up, whose radiance is given, in the frame."""
-        frame, slopes = self.frame, self.slopes.reshape(-1, 2)
+        frame, slopes, depth_m = self.frame, self.slopes.reshape(-1, 2), self._depths_m
         values = (radiance.array * self.unhidden).reshape(len(radiance.array), -1)
         lit = values.any(axis=0)
         # defocus shifts the light of each point of the aperture
-        depth_m = float((self.ground.centre_m - frame.position_L_m) @ frame.L_from_C[:, 2])
-        slopes = (slopes + self._lens_m * (1 / frame.focus_distance_m - 1 / depth_m))[lit]
+        # each pixel of a close-up lies within one pixel of a pinhole that stands still
+        within = frame.projection is None and frame.motion is None
+        area_px = self.per_px**-2.0 * frame.stretch(slopes, depth_m)
+        slopes = slopes + self._lens_m * (1 / frame.focus_distance_m - 1 / depth_m[:, None])
         return FineLight.of(
-            slopes=slopes,
-            area_px=np.full(len(slopes), self.per_px**-2.0),
+            slopes=slopes[lit],
+            area_px=area_px[lit],
             radiance=values[:, lit],
+            depth_m=depth_m[lit],
+            side_px=np.full(np.count_nonzero(lit), 0 if within else 1 / self.per_px),
             intrinsics=frame.intrinsics,
             shape=(frame.height_px, frame.width_px),
             projection=frame.projection,
@@ -230,6 +246,8 @@ def thin_parts(surface: TerrainMesh, scene: RenderInput) -> FineLight | None:
         slopes=(slopes + lens_m * (1 / view.focus_distance_m - 1 / points[:, 2:]))[lit],
         area_px=area_px[lit],
         radiance=radiance[:, lit],
+        depth_m=np.full(np.count_nonzero(lit), np.nan),
+        side_px=np.zeros(np.count_nonzero(lit)),
         intrinsics=view.intrinsics,
         shape=(view.height_px, view.width_px),
         projection=view.projection,
