@@ -392,16 +392,46 @@ def test_air_and_light_between_surfaces_move_with_the_ground() -> None:
     assert true[:, border].sum() > 0
 
 
-def test_a_body_of_few_pixels_keeps_its_light() -> None:
-    """It stays where it is at mid-exposure, once."""
-    values = dict(zip(MOTION, [2e3, 0, 0, 0, 0, 0], strict=True))
+def body_of_few_pixels(scene: dict[str, Any], velocity: Any = (0, 0, 0), rate: Any = (0, 0, 0)) -> SampleSpec:
+    """Return the sample of a camera that looks at the ball from so far that it is 6 px wide."""
+    values = dict(zip(MOTION, [*velocity, *rate], strict=True))
     table = row("a", (0.0, 0.0, 2000.0), (0.8, 0.0, 0.6), **values)
     poses = columns_of([table]) | {name: [table[name]] for name in MOTION}
-    spec = vbnfault.Session(config.parse_scene(SCENE, source="test"), poses=poses).spec(0)
+    return vbnfault.Session(config.parse_scene(scene, source="test"), poses=poses).spec(0)
+
+
+def test_a_body_of_few_pixels_keeps_its_light() -> None:
+    spec = body_of_few_pixels(SCENE, (2e3, 0, 0))
     rendered = render_view(spec, resolve(spec))
     assert not rendered.shows_ground
     moved = motion.move(spec, rendered, meter(spec, rendered)).light.rendered.array
     assert moved.sum() == pytest.approx(rendered.light.rendered.array.sum(), rel=1e-4)
+
+
+def test_a_body_of_few_pixels_is_blurred_as_its_sub_frames_are() -> None:
+    px_s = 8 * PIXEL_RAD / EXPOSURE_S
+    scene = {**SCENE, "render": {"bands": 2}}
+    spec = body_of_few_pixels(scene, (800 * px_s, 0, 0), (0, 0.8 * px_s, 0.3 * px_s))
+    moved, true, still = moved_and_brute(spec, 16)
+    assert np.abs(still - true).max() > 0.5 * true.max()
+    assert np.abs(moved - true).max() < 0.05 * true.max()
+
+
+def test_lines_of_a_rolling_shutter_see_a_body_of_few_pixels_where_its_truth_is() -> None:
+    line_s = 1e-4
+    spec = body_of_few_pixels({**SCENE, "motion": {"shutter": "rolling", "line_time_s": line_s}})
+    assert spec.flown is not None
+    turned = spec.flown.T_from_C @ Rotation.from_rotvec([15 * PIXEL_RAD, 0, 0]).as_matrix()
+    rate = np.array([1.0, 3.0, 0.0]) * PIXEL_RAD / (15 * line_s)
+    spec = replace(spec, flown=replace(spec.flown, T_from_C=turned, rate_C_rad_s=rate))
+    rendered = render_view(spec, resolve(spec))
+    assert not rendered.shows_ground
+    still = replace(spec, flown=replace(spec.flown, rate_C_rad_s=np.zeros(3)))
+    lit, truth = rendered.light.rendered.array[0], rendered.truth.semantic == BODY
+    before = render_view(still, resolve(still)).truth.semantic == BODY
+    places = [ndimage.center_of_mass(image.astype(float)) for image in (lit > 0, truth, before)]
+    assert np.hypot(*np.subtract(places[2], places[1])) > 2
+    np.testing.assert_allclose(places[0], places[1], atol=0.4)
 
 
 def test_a_monochrome_camera_moves() -> None:

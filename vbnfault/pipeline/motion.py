@@ -4,7 +4,7 @@ The view is rendered once, at the middle of each pixel's exposure, and its light
 of pixels, so that no interpolation blurs it. New rays, spread over the exposure, go only where ground appears or
 hides: at steps of the motion, and at the border of the frame.
 
-The light of every piece of ground stays that of mid-exposure, and so does a body of few pixels.
+The light of every piece of ground stays that of mid-exposure. A body of few pixels moves as its middle does.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ..core.quantities import BODY, SPACECRAFT, Radiance, Truth
+from ..core.quantities import BODY, SPACECRAFT, FineLight, Radiance, Truth
 from ..render.description import CameraMotion, RenderInput, View
 from .noise_budget import green_per_second, sensor_noise_e
 from .spec import Rendering, SampleSpec, SceneExposure, SceneLight
@@ -33,6 +33,8 @@ _STEPS = (16, 1024)
 _FINE_PX = 5.0  # a longer path needs half as many steps for each further pixel
 _STRIP_PX = 128  # rows of pixels whose cells are carried at a time
 _ROUNDS = 2  # in which the place is found from which light comes
+_POINTS = 1 << 20  # of fine light that is spread along its paths, at most
+_GOLDEN = 0.5 * (5**0.5 - 1)
 # Pixels whose paths depart by more than this from those around, up to either end, may hide one another.
 _APART_PX, _APART_OF_LENGTH = 0.12, 0.02
 _FARTHEST_PX = 64  # from such a step, within which pixels get new rays
@@ -81,7 +83,8 @@ def move(spec: SampleSpec, rendering: Rendering, exposure: SceneExposure) -> Sce
         wanted = max(_NEW_RAYS * rendering.samples_per_pixel, _LEAST_RAYS_PER_PX) / appearing.mean()
         _trace(spec, rendering.scene, appearing, moved, weights, seconds, wanted)
     if light.fine is not None:
-        moved = light.fine.added_to(moved)
+        fine = _swept(light.fine, view, seconds)
+        light, moved = replace(light, fine=fine), fine.added_to(moved)
     radiance = light.with_array(moved)
     if light.sun is not None:
         beyond = replace(truth, depth_m=np.full_like(truth.depth_m, np.inf), semantic=np.zeros_like(truth.semantic))
@@ -257,6 +260,33 @@ def _without_fine(light: Radiance) -> F32:
     """Return radiance float32[band, y, x] without the Sun and without fine light."""
     array = light.array if light.sun is None else light.array - light.sun
     return array if light.fine is None else light.fine.removed_from(array)
+
+
+def _swept(fine: FineLight, view: View, exposure_s: float) -> FineLight:
+    """Return fine light spread along its paths over the exposure; that of the spacecraft stays."""
+    count, half_s = len(fine.slopes), np.full(len(fine.slopes), exposure_s / 2)
+    if not count:
+        return fine
+    path = view.seen_later(fine.slopes, fine.depth_m, half_s) - view.seen_later(fine.slopes, fine.depth_m, -half_s)
+    length_px = float(np.hypot(*(path * view.intrinsics[:2]).T).max())
+    steps = int(np.clip(np.ceil(_STEPS_PER_PX * length_px) + 1, 1, max(_POINTS // count, 1)))
+    # points that lie in one pixel are there at different times, so that their paths are even
+    part = (np.arange(steps)[:, None] + np.arange(count) * _GOLDEN % 1) / steps - 0.5
+    time_s = part * exposure_s * view.stretch(fine.slopes, fine.depth_m)
+    before, depth_m = np.tile(fine.slopes, (steps, 1)), np.tile(fine.depth_m, steps)
+    after = view.seen_later(before, depth_m, time_s.ravel())
+    # irradiance across the line of sight is kept, and a pixel of a pinhole sees cos³θ / (fx fy)
+    secant2, before2 = (1 + (slopes**2).sum(axis=1) for slopes in (after, before))
+    return FineLight.of(
+        slopes=after,
+        area_px=view.intrinsics[:2].prod() * secant2**1.5 * np.sqrt(before2) / steps,
+        radiance=np.tile(fine.power, steps),
+        depth_m=depth_m,
+        side_px=np.tile(fine.side_px, steps),
+        intrinsics=view.intrinsics,
+        shape=(view.height_px, view.width_px),
+        projection=view.projection,
+    )
 
 
 def _coloured(planes: F32, paths: Paths, steps_per_px: float = 1.0) -> F32:
