@@ -441,6 +441,13 @@ def test_unusable_files(tmp_path: Path, name: str, content: bytes, sentence: str
         read_image(tmp_path / name)
 
 
+def test_packed_bits_are_refused_since_they_would_be_written_as_whole_bytes(tmp_path: Path) -> None:
+    rows = iter([bytes(20 * 32 * 12 // 8)])
+    tifffile.imwrite(tmp_path / "packed.tif", rows, shape=(20, 32), dtype=np.uint16, bitspersample=12)
+    with pytest.raises(InputError, match=r"packed.tif: .*packed bits; save it as plain grey"):
+        read_image(tmp_path / "packed.tif")
+
+
 @pytest.mark.parametrize(
     ("keys", "sentence"),
     [

@@ -55,10 +55,10 @@ def tiff_pixels(data: bytes, most_values: int) -> tuple[F32, F32 | None]:
 def tiff_numbers(data: bytes, most_values: int) -> NDArray[Any]:
     """Return the numbers of a TIFF file as stored, [y, x, sample] of 8 to 64 bits.
 
-    Raises InputError as `tiff_pixels`, and for a palette.
+    Raises InputError as `tiff_pixels`, and for a palette, inverted grey and packed bits.
     """
     with _usable_page(data, most_values) as page:
-        if page.photometric in (_WHITE_IS_0, _PALETTE) or page.bitspersample < 8:
+        if page.photometric in (_WHITE_IS_0, _PALETTE) or page.bitspersample not in (8, 16, 32, 64):
             raise InputError(
                 "is a TIFF file with a palette, inverted grey or packed bits; save it as plain grey or RGB"
             )
