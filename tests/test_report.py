@@ -22,7 +22,7 @@ from vbnfault.core.errors import InputError
 from vbnfault.core.html_page import number_text
 from vbnfault.output.contact_sheet import film_strips
 from vbnfault.output.report import MOST_READ, MOST_SHOWN, write_report
-from vbnfault.output.report.charts import bin_edges, histogram
+from vbnfault.output.report.charts import _limits, bin_edges, histogram
 from vbnfault.output.report.measure import Drawn, key_bounds, key_unit, read_drawn, read_pixels, read_scalars
 from vbnfault.output.report.page import pick
 from vbnfault.store import codec
@@ -230,6 +230,13 @@ def test_a_histogram_has_few_bins_for_few_values_and_one_for_each_of_few_whole_n
     edges = bin_edges(np.geomspace(1, 100, 500), 1, 100, True)
     assert len(edges) == 25
     np.testing.assert_allclose(np.diff(np.log10(edges)), 2 / 24)
+
+
+def test_each_of_few_whole_numbers_has_a_bin_of_its_own() -> None:
+    for most in (1, 4, 23):
+        values = np.arange(most + 1.0)
+        low, high = _limits(values, [(0.0, float(most))], False)
+        assert np.histogram(values, bin_edges(values, low, high, False))[0].tolist() == [1] * (most + 1)
 
 
 def test_a_histogram_says_how_many_values_it_has_and_where_all_are_equal() -> None:

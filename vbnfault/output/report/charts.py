@@ -150,6 +150,8 @@ def _limits(values: F64, bounds: Sequence[tuple[float, float]], logarithmic: boo
     low, high = min(float(values.min()), *ends, math.inf), max(float(values.max()), *ends, -math.inf)
     if logarithmic:
         return (low / 1.2, high * 1.2) if high > low else (low / 2, high * 2)
+    if 0 < high - low < _BINS and all(np.all(x == np.round(x)) for x in (values, low, high)):
+        return low - 0.5, high + 0.5  # each whole number is the centre of a bin
     return (low, high) if high > low else (low - (abs(low) * 0.1 or 0.5), high + (abs(high) * 0.1 or 0.5))
 
 
