@@ -232,11 +232,13 @@ def test_a_histogram_has_few_bins_for_few_values_and_one_for_each_of_few_whole_n
     np.testing.assert_allclose(np.diff(np.log10(edges)), 2 / 24)
 
 
-def test_each_of_few_whole_numbers_has_a_bin_of_its_own() -> None:
-    for most in (1, 4, 23):
-        values = np.arange(most + 1.0)
-        low, high = _limits(values, [(0.0, float(most))], False)
-        assert np.histogram(values, bin_edges(values, low, high, False))[0].tolist() == [1] * (most + 1)
+@pytest.mark.parametrize(("most", "in_a_bin"), [(1, 1), (4, 1), (23, 1), (30, 3), (255, 11)])
+def test_bins_hold_equally_many_whole_numbers(most: int, in_a_bin: int) -> None:
+    values = np.arange(most + 1.0)
+    low, high = _limits(values, [(0.0, float(most))], False)
+    counts = np.histogram(values, bin_edges(values, low, high, False))[0].tolist()
+    assert counts[:-1] == [in_a_bin] * (len(counts) - 1)
+    assert sum(counts) == most + 1
 
 
 def test_a_histogram_says_how_many_values_it_has_and_where_all_are_equal() -> None:

@@ -112,7 +112,7 @@ def histogram(
     edges = bin_edges(given, low, high, logarithmic)
     has_zeros = logarithmic and positive.size < given.size
     with plain_panel((240.0, 72.0), 10.0 + 10.0 * len(rails)) as (figure, axes):
-        axes.set_xlim(low, high)
+        axes.set_xlim(low, edges[-1])
         (set_log if logarithmic else set_linear)(axes.xaxis, *((low, high) if logarithmic else ()))
         axes.spines["left"].set_visible(False)
         axes.set_yticks([])
@@ -150,16 +150,20 @@ def _limits(values: F64, bounds: Sequence[tuple[float, float]], logarithmic: boo
     low, high = min(float(values.min()), *ends, math.inf), max(float(values.max()), *ends, -math.inf)
     if logarithmic:
         return (low / 1.2, high * 1.2) if high > low else (low / 2, high * 2)
-    if 0 < high - low < _BINS and all(np.all(x == np.round(x)) for x in (values, low, high)):
-        return low - 0.5, high + 0.5  # each whole number is the centre of a bin
+    if high > low and all(np.all(x == np.round(x)) for x in (values, low, high)):
+        return low - 0.5, high + 0.5  # so that no whole number is at the edge of a bin
     return (low, high) if high > low else (low - (abs(low) * 0.1 or 0.5), high + (abs(high) * 0.1 or 0.5))
 
 
 def bin_edges(values: F64, low: float, high: float, logarithmic: bool) -> F64:
-    """Return the edges of the bins: fewer for few values, and one bin for each of few whole numbers."""
-    whole = not logarithmic and 2 <= high - low <= _BINS and bool(np.all(values == np.round(values)))
-    bins = max(1, math.ceil(high - low)) if whole else max(6, min(_BINS, round(2 * math.sqrt(len(values)))))
-    return np.geomspace(low, high, bins + 1) if logarithmic else np.linspace(low, high, bins + 1)
+    """Return the edges of the bins: fewer for few values; whole numbers have bins that hold equally many."""
+    bins = max(6, min(_BINS, round(2 * math.sqrt(len(values)))))
+    if logarithmic:
+        return np.geomspace(low, high, bins + 1)
+    if high - low < 2 or np.any(values != np.round(values)):
+        return np.linspace(low, high, bins + 1)
+    width = 1 if high - low <= _BINS else math.ceil((high - low) / bins)
+    return np.asarray(low + width * np.arange(math.ceil((high - low) / width) + 1.0))
 
 
 def _draw_values(axes: Axes, k: int, values: F64, edges: F64, has_zeros: bool) -> float:
