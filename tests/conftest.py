@@ -313,6 +313,17 @@ def small_scene(**tables: dict[str, Any]) -> dict[str, Any]:
     return scene
 
 
+def verified_store(scene: Any, out: Path, **options: Any) -> Any:
+    """Build the store of a scene, which may be plain data, verify it, and return it open."""
+    from vbnfault import dataset, store
+    from vbnfault.scene.config import parse_scene
+
+    parsed = parse_scene(scene, source="test") if isinstance(scene, dict) else scene
+    dataset.build_scene(parsed, out, source="test", progress=False, **options)
+    assert dataset.verify(out).problems == []
+    return store.open_store(out)
+
+
 @pytest.fixture(scope="session")
 def s3_server() -> Iterator[Any]:
     """A server of S3 on this machine, started once."""

@@ -8,15 +8,13 @@ from typing import Any, get_args
 
 import numpy as np
 import pytest
-from conftest import small_scene
+from conftest import small_scene, verified_store
 from numpy.typing import NDArray
 
-from vbnfault import dataset, store
 from vbnfault.core.files import resources, toml_files
 from vbnfault.detector import load_sensor
 from vbnfault.detector.chain import Device
 from vbnfault.detector.effects import Exposure, acts_always, is_packaged, registry
-from vbnfault.scene.config import parse_scene
 
 OWN = {name: cls for name, cls in registry().items() if is_packaged(cls) and not acts_always(cls)}
 # Values of each key that differ from those of the first table of its effect.
@@ -55,10 +53,7 @@ def raw_of(folder: Path, name: str, effects: dict[str, Any]) -> NDArray[Any]:
         dataset={"samples": 1, "sites": 1, "layers": ["raw"], "shard_samples": 1},
         camera={"width_px": 48, "height_px": 40, "detector": sensor_file(folder, name, effects)},
     )
-    out = folder / f"{name}.zarr"
-    dataset.build_scene(parse_scene({**scene, "faults": {}}, source="test"), out, source="test")
-    opened = store.open_store(out)
-    assert store.examine(opened, expected=dataset.planned(opened.attributes, opened.spec.faults)).problems == []
+    opened = verified_store({**scene, "faults": {}}, folder / f"{name}.zarr")
     stored = opened.attributes["detector"]["sensor"]["effects"]
     assert [effect["name"] for effect in stored] == list(effects)
     return opened.read_sample(0).layers["raw"]
@@ -103,9 +98,6 @@ def test_masks_hold_what_compression_spreads(tmp_path: Path) -> None:
         plan={"faulty_fraction": 1.0},
     )
     faults = {"broken_pixels": {"model": "hot_pixels", "growth_factor": 1e5, "least_dn": 20.0}}
-    out = tmp_path / "a.zarr"
-    dataset.build_scene(parse_scene({**scene, "faults": faults}, source="test"), out, source="test")
-    opened = store.open_store(out)
-    layers = opened.read_sample(0).layers
+    layers = verified_store({**scene, "faults": faults}, tmp_path / "a.zarr").read_sample(0).layers
     assert layers["mask_effect"][0].sum() > 64  # blocks of 8 x 8 pixels of each colour
     assert not (layers["mask_effect"] & ~layers["mask"]).any()

@@ -11,10 +11,10 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from conftest import small_scene
+from conftest import small_scene, verified_store
 from numpy.typing import NDArray
 
-from vbnfault import dataset, store
+from vbnfault import store
 from vbnfault.core.errors import InputError
 from vbnfault.core.files import resources, toml_files
 from vbnfault.core.quantities import DEAD, HOT, RTS, STUCK
@@ -24,7 +24,6 @@ from vbnfault.detector.dark import arrhenius_factor
 from vbnfault.detector.measured import as_measured
 from vbnfault.detector.operation import amplified, binned
 from vbnfault.detector.sensor import parse_sensor
-from vbnfault.scene.config import parse_scene
 
 SHAPE = (48, 64)
 ZERO = np.zeros(SHAPE, np.float32)
@@ -449,11 +448,7 @@ def built(folder: Path, **camera: Any) -> store.Store:
             **camera,
         },
     )
-    out = folder / f"{len(list(folder.iterdir()))}.zarr"
-    dataset.build_scene(parse_scene({**table, "faults": {}}, source="test"), out, source="test")
-    opened = store.open_store(out)
-    assert store.examine(opened, expected=dataset.planned(opened.attributes, opened.spec.faults)).problems == []
-    return opened
+    return verified_store({**table, "faults": {}}, folder / f"{len(list(folder.iterdir()))}.zarr")
 
 
 def test_a_scene_takes_the_device_and_its_identity_the_files(tmp_path: Path, frames: dict[str, Any]) -> None:

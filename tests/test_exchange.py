@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import small_scene
+from conftest import small_scene, verified_store
 from scipy import stats
 
-from vbnfault import dataset, store
 from vbnfault.body import choose_sites
 from vbnfault.core import frames
 from vbnfault.core.errors import InputError
@@ -169,10 +168,7 @@ def test_the_samples_of_a_shard_exchange_positions_and_views_so_that_all_can_be_
 def test_the_fault_matrix_is_exact_also_where_the_paper_is_taken_literally(
     literal: dict[str, Any], tmp_path: Path
 ) -> None:
-    out = tmp_path / "s.zarr"
-    dataset.build_scene(small(**literal, dataset={"samples": 24}), out, source="test", progress=False)
-    assert dataset.verify(out).problems == []
-    opened = store.open_store(out)
+    opened = verified_store(small(**literal, dataset={"samples": 24}), tmp_path / "s.zarr")
     commanded = [json.loads(str(text))["injected"] for text in np.asarray(opened.read("proposal"))]
     injected = np.asarray(opened.read("injected"))
     names = np.array(opened.spec.faults)

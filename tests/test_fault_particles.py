@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import small_scene
+from conftest import small_scene, verified_store
 from numpy.typing import NDArray
 from scipy import stats
 from test_faults_kit import flat_electrons, make, make_context, rng
@@ -24,7 +24,7 @@ from vbnfault.faults.particles import _Population, diffracted
 from vbnfault.lens import RealLens, ThinLens, load_lens, scaled_to_field
 from vbnfault.pipeline import Session
 from vbnfault.scene import config
-from vbnfault.store import open_store
+from vbnfault.store import open_dataset
 
 F64 = NDArray[np.float64]
 
@@ -418,8 +418,6 @@ def test_bad_input_is_one_sentence(table: dict[str, Any], message: str) -> None:
 
 def test_through_the_store_and_back(tmp_path: Any) -> None:
     """The stored mask is the effect, and the stored parameters draw the stored grains again."""
-    import vbnfault
-
     scene = small_scene(
         dataset={"samples": 4, "sites": 1, "layers": ["clean", "without_particles", "mask_effect"]},
         plan={"faulty_fraction": 1.0, "classes_per_sample": [1, 1]},
@@ -427,11 +425,9 @@ def test_through_the_store_and_back(tmp_path: Any) -> None:
     scene["faults"] = {"particles": {"model": "debris", "density_per_m3": 3.0, "phase_slope_mag_deg": 0.0}}
     parsed = config.parse_scene(scene, source="test")
     out = tmp_path / "store.zarr"
-    vbnfault.build(parsed, out, workers=1)
-    assert vbnfault.verify(out).problems == []
-    store = open_store(out)
+    store = verified_store(parsed, out)
     session = Session(parsed)
-    data = vbnfault.open_dataset(out)
+    data = open_dataset(out)
     assert data["injected"].sel(fault="particles").values.any()
     for index in np.flatnonzero(data["injected"].sel(fault="particles").values):
         sample = store.read_sample(int(index))

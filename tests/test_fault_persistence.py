@@ -9,15 +9,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import small_scene
+from conftest import small_scene, verified_store
 from scipy.integrate import quad
 from test_faults_kit import make, make_context, noisy, rng, with_mosaic
 
-from vbnfault import dataset, store
 from vbnfault.core.quantities import Charge
 from vbnfault.faults import FaultContext
 from vbnfault.faults.persistence import power_integral
-from vbnfault.scene.config import parse_scene
 
 SIZE = 64
 
@@ -106,10 +104,7 @@ def test_faults_of_earlier_exposures_and_of_the_link_reach_the_store(
         camera={"width_px": 48, "height_px": 40, "detector": "generic_cmos"},
         plan={"faulty_fraction": 1.0},
     )
-    out = tmp_path / "a.zarr"
-    dataset.build_scene(parse_scene({**scene, "faults": {name: table}}, source="test"), out, source="test")
-    opened = store.open_store(out)
-    assert store.examine(opened, expected=dataset.planned(opened.attributes, opened.spec.faults)).problems == []
+    opened = verified_store({**scene, "faults": {name: table}}, tmp_path / "a.zarr")
     for k in range(2):
         sample = opened.read_sample(k)
         assert sample.scalars["injected"].all()

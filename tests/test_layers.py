@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import small_scene
+from conftest import small_scene, verified_store
 from test_faults_contract import MODELS
 from test_faults_kit import flat_electrons, make_context, with_mosaic
 
-from vbnfault import dataset, store
+from vbnfault import dataset
 from vbnfault.core.errors import InputError
 from vbnfault.core.quantities import SOFT_KINDS, soft_kind
 from vbnfault.faults import Fault, from_dict, registry
@@ -52,13 +52,8 @@ def test_every_optional_layer_is_built_verified_and_read_back(world: str, tmp_pa
         camera={"width_px": 64, "height_px": 48, **detector},
         plan={"faulty_fraction": 0.5, "classes_per_sample": [len(faults), len(faults)]},
     )
-    scene = config.parse_scene({**table, "faults": faults}, source="test")
     out = tmp_path / "s.zarr"
-    dataset.build_scene(scene, out, source="test")
-    opened = store.open_store(out)
-    expected = dataset.planned(opened.attributes, opened.spec.faults)
-    report = store.examine(opened, expected=expected, exact=dataset.is_exact(opened.attributes))
-    assert report.problems == []
+    opened = verified_store({**table, "faults": faults}, out)
     assert set(layers) - {"clean"} <= set(opened.spec.layers)
     with xarray.open_zarr(out) as data:
         injected = data["injected"].to_pandas()

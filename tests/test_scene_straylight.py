@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import needs_llvm, small_scene
+from conftest import needs_llvm, small_scene, verified_store
 from lens_kit import paraxial_ghosts, sunlit
 from numpy.typing import NDArray
 from test_faults_kit import flat_electrons, make_context
@@ -608,8 +608,7 @@ def test_a_store_holds_the_straylight_of_the_scene(tmp_path: Path, singlet_file:
     table["faults"] = {"straylight": {"model": "traced", "sources": "scene", "lens": str(singlet_file)}}
     scene = config.parse_scene(table, source="test")
     out = tmp_path / "scene.zarr"
-    assert vbnfault.build(scene, out, progress=False).built == 1
-    assert vbnfault.verify(out).problems == []
+    verified_store(scene, out)
     data = vbnfault.open_dataset(out)
     frame = vbnfault.Session(scene).frame(0)
     stored, sample = data.isel(sample=0), to_sample(frame)

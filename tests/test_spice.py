@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import tomli_w
-from conftest import small_scene
+from conftest import small_scene, verified_store
 from test_cli import run
 
 import vbnfault
@@ -498,8 +498,7 @@ def test_a_coma_follows_the_date_of_each_sample(folder: Path, tmp_path: Path) ->
     table["dataset"] |= {"samples": 2, "shard_samples": 2, "layers": ["clean", "radiance", "semantic"]}
     scene = config.parse_scene({**table, "coma": keys}, source="test")
     out = tmp_path / "coma.zarr"
-    vbnfault.build(scene, out, workers=1)
-    assert vbnfault.verify(out).problems == []
+    verified_store(scene, out)
     data = vbnfault.open_dataset(out)
     light, date = data["radiance"][1].values, float(data["julian_date"][1])
     assert np.array_equal(light, Session(scene).simulate(1).layers["radiance"])
