@@ -267,6 +267,19 @@ def calls_of(action: Callable[[], Any]) -> int:
     return calls
 
 
+def recorded_calls(monkeypatch: pytest.MonkeyPatch, owner: Any, name: str) -> list[tuple[Any, ...]]:
+    """Record the positional arguments of each call of a function, or of a class's method, which acts as before."""
+    calls: list[tuple[Any, ...]] = []
+    original = getattr(owner, name)
+
+    def recorded(*given: Any, **more: Any) -> Any:
+        calls.append(given)
+        return original(*given, **more)
+
+    monkeypatch.setattr(owner, name, recorded)
+    return calls
+
+
 def deny(monkeypatch: pytest.MonkeyPatch, *paths: Path) -> None:
     """Have the system refuse to open, list or look below `paths`; for a user other than root, `chmod` would do."""
 

@@ -12,11 +12,24 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from conftest import recorded_calls
 
-from vbnfault.body import Body, check_mesh, choose_sites, embedded_nucleus, load_body, load_shape, local_level
-from vbnfault.body.geometry import face_normals_areas, signed_volume
+import vbnfault
+from vbnfault.body import (
+    Body,
+    check_mesh,
+    choose_sites,
+    ellipsoid,
+    embedded_nucleus,
+    load_body,
+    load_shape,
+    local_level,
+)
+from vbnfault.body.geometry import face_normals_areas, mean_edge_m, signed_volume, vertex_normals
 from vbnfault.body.noise import gradient_noise
+from vbnfault.body.roughness import deviogram, sharpened
 from vbnfault.core.errors import InputError
+from vbnfault.dataset.identity import scene_identity
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
@@ -373,22 +386,15 @@ def test_sites_lie_on_gentle_ground_and_keep_when_the_list_grows() -> None:
 
 def test_a_site_is_drawn_when_it_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     """A session of 10,000 sites starts at once: gravity is evaluated for the sites that are visited alone."""
-    body, points = load_body(), 0
-    evaluate = body.gravity.evaluate
-
-    def counted(points_m: np.ndarray) -> object:
-        nonlocal points
-        points += len(np.atleast_2d(points_m))
-        return evaluate(points_m)
-
-    monkeypatch.setattr(body.gravity, "evaluate", counted)
+    body = load_body()
+    evaluated = recorded_calls(monkeypatch, body.gravity, "evaluate")
     sites = choose_sites(body, 10_000, seed=0)
-    assert (len(sites), points) == (10_000, 0)
+    assert (len(sites), evaluated) == (10_000, [])
     site = sites[9_876]
-    drawn = points
+    drawn = len(evaluated)
     assert drawn > 0
     assert sites[9_876] is site
-    assert points == drawn  # kept
+    assert len(evaluated) == drawn  # kept
     alone = choose_sites(load_body(), 9_877, seed=0)[-1]
     np.testing.assert_array_equal(alone.position_T_m, site.position_T_m)
     np.testing.assert_array_equal(alone.T_from_L, site.T_from_L)
@@ -413,3 +419,70 @@ def test_ground_that_is_nowhere_level_is_refused_with_its_reason(
     with pytest.raises(InputError) as caught:
         choose_sites(body, 4, seed=1, max_slope_deg=slope_deg)[2]
     assert [words for words in ["brick: none of 1000", "site 2", *must_say] if words not in str(caught.value)] == []
+
+
+# --- relief that a smoothed shape model has lost: how much is restored, where, and by which rule ------------------
+
+
+SPHERE, FACES = ellipsoid((1000.0, 1000.0, 1000.0), 0.0)
+
+
+def wavy(wavelength_m: float, height_m: float) -> np.ndarray:
+    """Return the sphere with waves along z."""
+    wave = np.cos(2 * np.pi * SPHERE[:, 2] / wavelength_m)
+    return SPHERE * (1 + height_m * wave / 1000.0)[:, None]
+
+
+def test_waves_are_amplified_by_the_stated_gain() -> None:
+    """In a band around the equator, where the waves run along the surface and the sphere is level along them."""
+    edge = mean_edge_m(SPHERE, FACES)
+    band = np.abs(SPHERE[:, 2]) < 250
+    for edges in (6.0, 12.0):
+        wavelength = edges * edge
+        before = wavy(wavelength, 2.0)
+        after = sharpened(before, FACES, 1.0)
+        flat = sharpened(SPHERE, FACES, 1.0)
+        wave = np.cos(2 * np.pi * SPHERE[band, 2] / wavelength)
+        heights = np.linalg.norm(after[band], axis=1) - np.linalg.norm(flat[band], axis=1)
+        seen = (heights @ wave) / (wave @ wave) / 2.0
+        square = (0.7 * 2 * np.pi / edges) ** 2
+        assert seen == pytest.approx(1 + (square / (1 + square)) ** 2, rel=0.08)
+
+
+def test_no_gain_changes_nothing() -> None:
+    assert sharpened(SPHERE, FACES, 0.0) is SPHERE
+
+
+def test_auto_continues_the_roughness_of_a_smoothed_model(real_shape: Path) -> None:
+    """67p_18k.obj is smoothed. Its volume, 18.41 km³, hardly changes, towards the published ones (18.56, 18.8)."""
+    body = load_body(real_shape)
+    sharp = load_body(real_shape, sharpen="auto")
+    edge = mean_edge_m(body.vertices_m, body.faces)
+    short = deviogram(body.vertices_m, body.vertex_normals, edge * np.array([1.3]))[0]
+    normals = vertex_normals(sharp.vertices_m, sharp.faces)
+    restored, long = deviogram(sharp.vertices_m, normals, edge * np.array([1.3, 3.8]))
+    assert restored == pytest.approx(long * 1.3 / 3.8, rel=0.1)
+    assert restored > 1.3 * short
+    assert body.volume_m3 < sharp.volume_m3 < 18.6e9
+
+
+def test_a_shape_is_scaled_about_its_origin_to_the_volume_that_is_asked_for() -> None:
+    body, larger = load_body(), load_body(volume_m3=8 * load_body().volume_m3)
+    np.testing.assert_allclose(larger.vertices_m, 2 * body.vertices_m, rtol=1e-12)
+    scene = vbnfault.load_scene("paper67p", {"body.volume_km3": 18.8})
+    session = vbnfault.Session(scene)
+    assert session.body.volume_m3 == pytest.approx(18.8e9, rel=1e-9)
+    assert scene_identity(session)["body"]["volume_km3"] == 18.8
+    assert "volume_km3" not in scene_identity(vbnfault.Session(vbnfault.load_scene("paper67p")))["body"]
+    with pytest.raises(vbnfault.InputError, match=r"volume_km3 = 5: semi_axes_m sets the volume"):
+        vbnfault.load_scene("paper67p", {"body.volume_km3": 5.0, "body.shape": "ellipsoid"})
+
+
+def test_a_shape_file_is_needed() -> None:
+    with pytest.raises(vbnfault.InputError, match=r"sharpen = 1.5: needs a shape file"):
+        vbnfault.load_scene("paper67p", {"body.sharpen": 1.5})
+    plain = vbnfault.Session(vbnfault.load_scene("paper67p")).body
+    auto = vbnfault.Session(vbnfault.load_scene("paper67p", {"body.sharpen": "auto"})).body
+    assert auto.content_hash == plain.content_hash
+    with pytest.raises(vbnfault.InputError, match=r"sharpen"):
+        vbnfault.load_scene("paper67p", {"body.sharpen": 5.0, "body.shape": "x.obj"})

@@ -1,8 +1,10 @@
-"""The fuzz command itself: that it notices what it looks for."""
+"""The fuzz notices what it looks for, and commands that are killed resume to one digest."""
 
 from __future__ import annotations
 
 import random
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -54,3 +56,21 @@ def test_damage_is_keyed_and_never_nothing() -> None:
     assert table == {"a": {"b": [1, 2.5, "text"]}, "c": True}
     data = bytes(range(256))
     assert sum(fuzz_inputs.flipped(data, random.Random(k), data) != data for k in range(200)) > 180
+
+
+# --- some rounds of kills: builds, merges and exports that are killed and resumed have one digest -----------------
+
+
+HERE = Path(__file__).resolve().parent
+
+
+def test_killed_commands_resume_to_one_digest() -> None:
+    """Other ways take longer; test_build_dask, test_object_store, test_retake, test_shard_range have them."""
+    ways = ["process", "merge", "bucket", "export"]
+    options = ["--each", "1", "--steps", "1", "--samples", "8", "--ways", *ways]
+    command = [sys.executable, "-m", "tests.tools.kills", *options]
+    done = subprocess.run(command, cwd=HERE.parent, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "one digest" in done.stdout
+    table = done.stdout.split("digests\n")[1].splitlines()[: len(ways)]
+    assert [int(line[34:40]) for line in table] == [1] * len(ways), done.stdout

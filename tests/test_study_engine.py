@@ -9,7 +9,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 import study_kit as kit
 import xarray
+from conftest import Called
 
 import vbnfault
 from vbnfault.core.errors import InputError, VbnfaultError
@@ -523,3 +524,42 @@ def test_distributions_go_to_values_and_back() -> None:
     assert normal.values(normal.nominal()) == pytest.approx(1.0)
     assert list(categorical.values([0.0, 0.34, 0.99, 1.0])) == ["x", 2.5, "z", "z"]
     np.testing.assert_allclose(categorical.points(), [1 / 6, 0.5, 5 / 6])
+
+
+# --- the command --------------------------------------------------------------------------------------------------
+
+
+def test_a_dry_run_says_how_much_a_study_evaluates_and_writes_nothing(
+    tmp_path: Path, call: Callable[..., Called]
+) -> None:
+    out = tmp_path / "out"
+    code, said, errors = call("study", "flare_textures", "--out", out, "--dry-run", "--set", "design.n=8")
+    assert (code, errors, out.exists()) == (0, "", False)
+    lines = said.splitlines()
+    assert lines[1] == ("latin_hypercube, n = 8: 8 points × 20 views × 1 seed × 3 models = 480 evaluations")
+    assert lines[2].startswith("factors: sun.distance_au (au), ")
+    assert "straylight_total_e (electrons), " in lines[3]
+    assert lines[4].startswith("warning: design.n = 8: below n = 16 ")
+
+
+@pytest.mark.parametrize(
+    ("setting", "sentence"),
+    [
+        ("design.n=9", "design.n = 9: must be a power of two with method = 'sobol', such as 8 or"),
+        ("desing.n=8", "desing: unknown key (did you mean design?)"),
+        ("factor[4].high=-0.5", "factor[4].low = -0.03, high = -0.5: bounds reversed or equal"),
+        ("factor.4.key=lens.coating.thicknes", "did you mean lens.coating.thickness?"),
+        ("factor[15].low=1", "factor[15].low = 1: factor is a list; its entries are 0 to 14"),
+        ("metrics.names[0]=straylight_total", "did you mean straylight_total_e?"),
+        ("scene.samples=[999]", "scene.samples: sample 999: must be below dataset.samples = "),
+        ("scene.plan.sun_facing_nominal_fraction=1.0", "plan.sun_facing_nominal_fraction"),
+    ],
+)
+def test_what_is_wrong_is_one_sentence(
+    setting: str, sentence: str, tmp_path: Path, call: Callable[..., Called]
+) -> None:
+    words = ("study", "flare_lens", "--out", tmp_path / "out", "--dry-run", "--set", setting)
+    code, said, errors = call(*words)
+    assert (code, said) == (2, "")
+    (line,) = errors.splitlines()
+    assert sentence in line
