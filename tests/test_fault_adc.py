@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
-from test_faults_kit import make, make_context, rng, with_mosaic
+from test_faults_kit import make, mosaic_context, rng
 
-from vbnfault.detector import load_sensor
 from vbnfault.detector.readout import convert
 from vbnfault.faults import FaultContext
 
@@ -25,8 +23,7 @@ NOTHING: dict[str, Any] = {
 
 
 def context(**readout: Any) -> FaultContext:
-    made = load_sensor("generic_cmos").readout
-    return with_mosaic(make_context(SIZE, architecture="cmos"), readout=replace(made, **readout))
+    return mosaic_context(SIZE, readout=readout)
 
 
 def readout_of(where: FaultContext, **params: Any) -> Any:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
-from test_faults_kit import flat_electrons, make, make_context, noisy, rng, with_mosaic
+from test_faults_kit import flat_electrons, make, mosaic_context, noisy, rng
 
 from vbnfault.core.quantities import Charge, Electrons
 from vbnfault.faults import FaultContext
@@ -16,11 +15,8 @@ FULL_WELL_E = 40_000.0
 
 
 def context(architecture: str = "full_frame_ccd", drain: float = 0.0) -> FaultContext:
-    c = with_mosaic(make_context(64, architecture=architecture, exposure_s=0.01))
-    detector: Any = c.camera.detector
-    transfer = replace(detector.sensor.transfer, antiblooming=drain, parallel_traps=())
-    sensor = replace(detector.sensor, transfer=transfer)
-    return replace(c, camera=replace(c.camera, detector=replace(detector, sensor=sensor)))
+    transfer = {"antiblooming": drain, "parallel_traps": ()}
+    return mosaic_context(64, architecture, camera={"exposure_s": 0.01}, transfer=transfer)
 
 
 def test_a_column_by_hand() -> None:

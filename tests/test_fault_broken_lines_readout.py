@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
-from test_faults_kit import flat_electrons, make, make_context, noisy, rng, with_mosaic
+from test_faults_kit import flat_electrons, make, mosaic_context, noisy, rng
 
 from vbnfault.core.quantities import ARCHITECTURES, RawMosaic
-from vbnfault.detector import load_sensor
 from vbnfault.detector.readout import node_of
 from vbnfault.faults import FaultContext
 from vbnfault.faults.broken_lines_readout import ONE_WAY, POSSIBLE
@@ -20,9 +18,7 @@ NOTHING: dict[str, Any] = {"lines": [], "register": None, "node": -1}
 
 
 def context(architecture: str = "cmos", nodes: int = 1, **camera: Any) -> FaultContext:
-    name = "generic_cmos" if architecture == "cmos" else "generic_ccd"
-    readout = replace(load_sensor(name).readout, nodes=nodes)
-    return with_mosaic(make_context(SIZE, architecture=architecture, **camera), readout=readout)
+    return mosaic_context(SIZE, architecture, camera=camera, readout={"nodes": nodes})
 
 
 def fault(**keys: Any) -> Any:

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from conftest import small_scene
-from test_faults_kit import make, make_context, rng, with_mosaic
+from conftest import small_scene, verified_store
+from test_faults_kit import make, mosaic_context, rng
 
-from vbnfault import dataset, store
 from vbnfault.core.quantities import Electrons
 from vbnfault.faults import FaultContext
 from vbnfault.pipeline import Session
@@ -22,15 +20,10 @@ SIZE = 64
 
 
 def context(architecture: str = "full_frame_ccd", direction: str = "up", **transfer: Any) -> FaultContext:
-    c = with_mosaic(make_context(SIZE, architecture=architecture, readout_direction=direction, exposure_s=0.01))
-    detector: Any = c.camera.detector
+    camera = {"readout_direction": direction, "exposure_s": 0.01}
     # without the dark current of charge under way, which fills traps before light does
-    sensor = replace(
-        detector.sensor,
-        transfer=replace(detector.sensor.transfer, **transfer),
-        individual=replace(detector.sensor.individual, dark_current_e_s=0.0),
-    )
-    return replace(c, camera=replace(c.camera, detector=replace(detector, sensor=sensor)))
+    dark = {"dark_current_e_s": 0.0}
+    return mosaic_context(SIZE, architecture, camera=camera, transfer=transfer, individual=dark)
 
 
 def collected(c: FaultContext, params: dict[str, Any]) -> np.ndarray:
@@ -134,11 +127,7 @@ def test_the_masks_of_a_store_hold_the_trails(tmp_path: Path) -> None:
         "broken_pixels": {"model": "hot_pixels", "growth_factor": 1e5, "years": 10.0},
         "cti": {"parallel_per_px": 100.0, "serial_per_px": 0.0},
     }
-    out = tmp_path / "s.zarr"
-    dataset.build_scene(config.parse_scene(table, source="test"), out, source="test")
-    opened = store.open_store(out)
-    expected = dataset.planned(opened.attributes, opened.spec.faults)
-    assert store.examine(opened, expected=expected, exact=dataset.is_exact(opened.attributes)).problems == []
+    opened = verified_store(table, tmp_path / "s.zarr")
     sample = opened.read_sample(0)
     k = opened.spec.faults.index("broken_pixels")
     assert not (sample.layers["mask_effect"][k] & ~sample.layers["mask"][k]).any()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +13,15 @@ from vbnfault.faults import Fault, FaultContext, from_dict
 from vbnfault.testing import make_context as make_context
 from vbnfault.testing import random_quantity as noisy
 from vbnfault.testing import with_mosaic as with_mosaic
+
+
+def mosaic_context(
+    size: int, architecture: str = "cmos", *, camera: Mapping[str, Any] | None = None, **parts: Mapping[str, Any]
+) -> FaultContext:
+    """A camera whose sensor has a mosaic; values replace those of parts of the sensor, as readout={"nodes": 2}."""
+    context = make_context(size, architecture=architecture, **camera or {})
+    sensor = with_mosaic(context).camera.mosaic.sensor
+    return with_mosaic(context, **{name: replace(getattr(sensor, name), **part) for name, part in parts.items()})
 
 
 def inside(fault: Fault, params: dict[str, Any], context: FaultContext) -> dict[str, Any]:
