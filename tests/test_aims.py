@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from poses_kit import C_from_T
+from scipy.spatial.transform import Rotation
 
 import vbnfault
 from vbnfault import dataset, store
@@ -376,10 +378,8 @@ def test_terrain_and_shape_model_have_no_seam(sphere: str) -> None:
             [(x - intrinsics[2]) / intrinsics[0], (y - intrinsics[3]) / intrinsics[1], np.ones_like(x)], -1
         )
         length = np.linalg.norm(rays, axis=-1)
-        w, *v = sample.scalars["camera_from_T"]
-        from scipy.spatial.transform import Rotation
-
-        towards = Rotation.from_quat([*v, w]).inv().apply((rays / length[..., None]).reshape(-1, 3))
+        turn = Rotation.from_quat(sample.scalars["camera_from_T"], scalar_first=True)
+        towards = turn.inv().apply((rays / length[..., None]).reshape(-1, 3))
         camera = sample.scalars["camera_position_T_m"]
         along = -towards @ camera
         miss = np.sqrt(np.maximum(camera @ camera - along**2, 0))
@@ -419,10 +419,7 @@ def test_a_store_is_built_resumed_extended_and_verified(sphere: str, tmp_path: P
             assert proposal["aim"] == session.plan.aim_of(index)
             assert (proposal["aim"] == "sun") == (int(data["stratum"][index]) == plan.SUN_FACING)
             # roll and pitch count from the Sun
-            w, *v = data["camera_from_T"].values[index]
-            from scipy.spatial.transform import Rotation
-
-            sun_C = Rotation.from_quat([*v, w]).apply(data["sun_direction_T"].values[index])
+            sun_C = C_from_T(data, index) @ data["sun_direction_T"].values[index]
             angle = frames.boresight_angle_deg(float(data["roll_deg"][index]), float(data["pitch_deg"][index]))
             assert angle == pytest.approx(np.degrees(np.arccos(np.clip(sun_C[2], -1, 1))), abs=1e-6)
     other = scene(sphere, geometry={"aim": None, "distance_m": [100.0, 10e3], "pointing_error_deg": 0.1})

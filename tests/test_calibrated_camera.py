@@ -15,14 +15,15 @@ import pytest
 import tomli_w
 import zarr
 from calibrations_kit import SIX, opencv_pixels
-from conftest import small_scene
+from conftest import small_scene, verified_store
 from numpy.typing import NDArray
+from poses_kit import C_from_T, projected
 from scipy.spatial.transform import Rotation
 from test_calibration import KALIBR, ROS, YAML_1_0
 from test_cli import run
 from test_render import NODES, ball, box, join, scene, sun
 
-from vbnfault import dataset, inject, render, store
+from vbnfault import inject, render, store
 from vbnfault.camera import Camera
 from vbnfault.cli.options import SceneOptions
 from vbnfault.core.calibration import Calibration
@@ -375,8 +376,7 @@ def built(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
         "particles": {},
     }
     out = tmp_path_factory.mktemp(request.param) / "store.zarr"
-    dataset.build_scene(config.parse_scene(table, source="test"), out, source="test", threads=2)
-    assert not store.examine(out).problems
+    verified_store(table, out, threads=2)
     return out
 
 
@@ -394,17 +394,12 @@ def test_a_store_keeps_the_calibration(built: Path) -> None:
     assert (cx, cy) == (table["cx"] + 0.5, table["cy"] + 0.5)
     assert group["intrinsics"].attrs["skew_px"] == 0
     assert attributes["residual_px_max"] == 0
-    matrix, nothing = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), np.zeros(3)
-    project = cv2.fisheye.projectPoints if is_fisheye else cv2.projectPoints
     for i in range(2):
         seen = group["semantic"][i] == BODY
-        w, x, y, z = group["camera_from_T"][i]
-        C_from_T = Rotation.from_quat([x, y, z, w]).as_matrix()
-        points = (group["point_T_m"][i][seen] - group["camera_position_T_m"][i]) @ C_from_T.T
+        points = (group["point_T_m"][i][seen] - group["camera_position_T_m"][i]) @ C_from_T(group, i).T
         ahead = points[:, 2] > 0.01 * np.linalg.norm(points, axis=1)
-        pixels, _ = project(points[ahead, None], nothing, nothing, matrix, group["distortion"][i])
         rows, columns = np.nonzero(seen)
-        off = np.hypot(*(pixels[:, 0] - np.column_stack([columns, rows])[ahead] - 0.5).T)
+        off = np.hypot(*(projected(group, i, points[ahead]) - np.column_stack([columns, rows])[ahead] - 0.5).T)
         assert ahead.sum() > 1000
         assert np.sqrt(np.mean(off**2)) <= 0.02
         assert off.max() <= 0.05

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from poses_kit import columns_of, row
+from poses_kit import C_from_T, columns_of, projected, row
 from scipy.spatial.transform import Rotation
 from test_calibrated_camera import TABLES
 from test_trajectory import SMALL
@@ -61,21 +61,6 @@ def poses(distance_m: float, step_deg: float) -> dict[str, list[Any]]:
         dates.append(2457000.5 + k / 1440)
     times = [60.0 * k for n in FRAMES for k in range(n)]
     return {**columns_of(table), "julian_date": dates, "sequence": [*"aaabb"], "time_s": times}
-
-
-def C_from_T(data: Any, k: int) -> F64:
-    """Return the attitude of a stored sample, float64[3, 3]."""
-    w, x, y, z = data["camera_from_T"][k].values
-    return np.asarray(Rotation.from_quat([x, y, z, w]).as_matrix())
-
-
-def projected(data: Any, k: int, in_C: F64) -> F64:
-    """Return the pixels of vectors float64[n, 3] in C, by OpenCV and what is stored."""
-    fx, fy, cx, cy = data["intrinsics"][k].values
-    matrix, nothing = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), np.zeros(3)
-    is_fisheye = data["distortion"].attrs.get("model") == "fisheye"
-    project = cv2.fisheye.projectPoints if is_fisheye else cv2.projectPoints
-    return np.asarray(project(in_C[:, None], nothing, nothing, matrix, data["distortion"][k].values)[0][:, 0])
 
 
 def centres() -> F64:

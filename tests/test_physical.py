@@ -49,7 +49,7 @@ def session(**tables: dict[str, object]) -> Session:
 
 def rotation(quaternion: np.ndarray) -> np.ndarray:
     """The matrix of a unit quaternion, w first."""
-    return Rotation.from_quat(np.roll(quaternion, -1)).as_matrix()
+    return Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
 
 
 @pytest.fixture(scope="module")

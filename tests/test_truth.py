@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 import pytest
 import zarr
-from conftest import small_scene
+from conftest import small_scene, verified_store
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
+from poses_kit import C_from_T, projected
 from test_render import UP, ball, sun, view
 
-from vbnfault import dataset, render, store
+from vbnfault import render, store
 from vbnfault.camera import Camera
 from vbnfault.core import frames
 from vbnfault.detector import ThreeColourDetector
@@ -22,7 +22,6 @@ from vbnfault.lens.adapt import stopped_down
 from vbnfault.lens.glass import D_NM
 from vbnfault.lens.mapping import chief_heights_mm, fitted
 from vbnfault.lens.prescription import Prescription
-from vbnfault.scene import config
 
 F64 = NDArray[np.float64]
 
@@ -45,10 +44,8 @@ def built(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
     )
     table["camera"]["lens"] = request.param
     table["faults"] = {"straylight": {}}
-    scene = config.parse_scene(table, source="test")
     out = tmp_path_factory.mktemp(request.param) / "store.zarr"
-    dataset.build_scene(scene, out, source="test", threads=2)
-    assert not store.examine(out).problems
+    verified_store(table, out, threads=2)
     return zarr.open_group(out, mode="r")
 
 
@@ -77,16 +74,11 @@ def test_points_reproject_through_what_is_stored(built: zarr.Group) -> None:
     off = []
     for i in range(built["semantic"].shape[0]):
         body = built["semantic"][i] == BODY
-        w, x, y, z = built["camera_from_T"][i]
-        C_from_T = Rotation.from_quat([x, y, z, w]).as_matrix()
-        in_C = (built["point_T_m"][i][body] - built["camera_position_T_m"][i]) @ C_from_T.T
+        in_C = (built["point_T_m"][i][body] - built["camera_position_T_m"][i]) @ C_from_T(built, i).T
         # depth is z along the boresight, not the range
         np.testing.assert_allclose(in_C[:, 2], built["depth_m"][i][body], rtol=1e-5)
-        fx, fy, cx, cy = built["intrinsics"][i]
-        matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-        seen, _ = cv2.projectPoints(in_C, np.zeros(3), np.zeros(3), matrix, built["distortion"][i])
         rows, columns = np.nonzero(body)
-        off.append(np.hypot(*(seen[:, 0] - np.column_stack([columns, rows]) - 0.5).T))
+        off.append(np.hypot(*(projected(built, i, in_C) - np.column_stack([columns, rows]) - 0.5).T))
     found = np.concatenate(off)
     assert len(found) > 0.3 * SIDE_PX**2
     assert np.sqrt(np.mean(found**2)) <= 0.02
@@ -105,8 +97,7 @@ def test_roll_and_pitch_count_from_what_their_attribute_names(built: zarr.Group)
         T_from_L = built["T_from_L"][i]
         sun_L = T_from_L.T @ built["sun_direction_T"][i]
         reference = sun_L if references[stratum] == "sun" else np.array([0.0, 0.0, 1.0])
-        w, x, y, z = built["camera_from_T"][i]
-        L_from_C = T_from_L.T @ Rotation.from_quat([x, y, z, w]).as_matrix().T
+        L_from_C = T_from_L.T @ C_from_T(built, i).T
         angles = (built[name][i] for name in ("roll_deg", "pitch_deg", "yaw_deg"))
         np.testing.assert_allclose(L_from_C, frames.L_from_C(reference, *angles), atol=1e-9)
     assert seen == set(names)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import small_scene
-from scipy.spatial.transform import Rotation
+from poses_kit import C_from_T
 
 import vbnfault
 from vbnfault import dataset, pipeline, render
@@ -290,16 +290,15 @@ def test_the_boresight_points_at_the_centre_of_mass_through_the_store_and_back(t
     assert np.linalg.norm(centre_T_m) > 100
     for i in range(2):
         sample = data.isel(sample=i)
-        w, x, y, z = sample["camera_from_T"].values
-        C_from_T = Rotation.from_quat([x, y, z, w]).as_matrix()
-        centre_C_m = C_from_T @ (centre_T_m - sample["camera_position_T_m"].values)
+        from_T = C_from_T(data, i)
+        centre_C_m = from_T @ (centre_T_m - sample["camera_position_T_m"].values)
         # rounding of 30 km in float64 and of the quaternion: some 1e-16 rad each
         assert np.hypot(*centre_C_m[:2]) / centre_C_m[2] < 1e-14
-        down_L = sample["T_from_L"].values.T @ C_from_T.T[:, 2]
+        down_L = sample["T_from_L"].values.T @ from_T.T[:, 2]
         assert np.degrees(np.arccos(down_L[2])) > 1  # the plumb line points elsewhere
         towards = sample["T_from_L"].values.T @ frames.unit(centre_T_m - sample["camera_position_T_m"].values)
         want = frames.L_from_C(towards, 0, 0, float(sample["yaw_deg"]), north_up=True)
-        np.testing.assert_allclose(sample["T_from_L"].values.T @ C_from_T.T, want, atol=1e-9)
+        np.testing.assert_allclose(sample["T_from_L"].values.T @ from_T.T, want, atol=1e-9)
 
 
 def test_roll_and_pitch_tilt_the_boresight_away_from_the_centre(terrain: Terrain) -> None:
