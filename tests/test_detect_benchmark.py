@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from conftest import Called
 
-from vbnfault.cli.app import app
 from vbnfault.core.errors import InputError
 from vbnfault.core.files import resources
 from vbnfault.dataset import verify
@@ -67,18 +67,17 @@ def test_every_part_of_a_packaged_benchmark_has_a_scene(name: str) -> None:
         assert (benchmark.parts[part].samples or 0) % scene.dataset.variants_per_view == 0
 
 
-def test_one_command_makes_all_parts_and_continues(file: Path, tmp_path: Path) -> None:
+def test_one_command_makes_all_parts_and_continues(file: Path, tmp_path: Path, call: Callable[..., Called]) -> None:
     out = tmp_path / "made"
-    arguments = ["bench", "--out", str(out), "--benchmark", str(file), "--fraction", "0.1"]
-    planned = CliRunner().invoke(app, [*arguments, "--dry-run"])
-    assert planned.exit_code == 0, planned.output
-    assert "nominal: no fault" in planned.output
+    arguments = ("bench", "--out", out, "--benchmark", file, "--fraction", 0.1)
+    planned = call(*arguments, "--dry-run")
+    assert planned.code == 0, planned.err
+    assert "nominal: no fault" in planned.out
     assert not out.exists()
-    first = CliRunner().invoke(app, [*arguments, "--only", "nominal"])
-    assert first.exit_code == 0, first.output
+    assert call(*arguments, "--only", "nominal").code == 0
     assert list(read_manifest(out)["parts"]) == ["nominal"]
-    both = CliRunner().invoke(app, arguments)
-    assert both.exit_code == 0, both.output
+    both = call(*arguments)
+    assert both.code == 0, both.err
     manifest = json.loads((out / "benchmark.json").read_text())
     assert list(manifest["parts"]) == ["train", "nominal"]
     for name, part in manifest["parts"].items():
@@ -87,12 +86,14 @@ def test_one_command_makes_all_parts_and_continues(file: Path, tmp_path: Path) -
         assert not report.problems
         assert report.digest == part["digest"]
         assert part["samples"] == store.samples == 4
-        assert f"{name}: 4 samples" in both.output
+        assert f"{name}: 4 samples" in both.out
     assert manifest["parts"]["train"]["purpose"] == "train"
     assert not open_store(out / "nominal.zarr").read("injected").any()
 
 
-def test_faults_are_put_into_the_images_of_a_folder(file: Path, tmp_path: Path) -> None:
+def test_faults_are_put_into_the_images_of_a_folder(
+    file: Path, tmp_path: Path, call: Callable[..., Called]
+) -> None:
     frames = tmp_path / "frames"
     frames.mkdir()
     for k in range(3):
@@ -101,12 +102,10 @@ def test_faults_are_put_into_the_images_of_a_folder(file: Path, tmp_path: Path) 
     part += 'set = {"dataset.variants_per_view" = 1}\n'
     file.write_text(FILE.replace("[parts.train]", f"{part}[parts.train]"))
     out = tmp_path / "made"
-    arguments = ["bench", "--out", str(out), "--benchmark", str(file), "--only", "mine"]
     with pytest.raises(InputError, match=r"parts.mine.frames = true: needs a folder of images \(--frames\)"):
         list(make_benchmark(file, out, only=["mine"]))
     assert [name for name, *_ in make_benchmark(file, out, fraction=0.05)] == ["train", "nominal"]
-    made = CliRunner().invoke(app, [*arguments, "--frames", str(frames)])
-    assert made.exit_code == 0, made.output
+    assert call("bench", "--out", out, "--benchmark", file, "--only", "mine", "--frames", frames).code == 0
     entry = read_manifest(out)["parts"]["mine"]
     store = open_store(out / entry["store"])
     assert entry["samples"] == store.samples == 3
@@ -134,7 +133,7 @@ def test_a_path_starts_from_the_file_of_the_benchmark(file: Path, tmp_path: Path
     assert Path(scene.trajectory.file) == table
 
 
-def test_a_model_is_scored_on_all_tests_and_listed(file: Path, tmp_path: Path) -> None:
+def test_a_model_is_scored_on_all_tests_and_listed(file: Path, tmp_path: Path, call: Callable[..., Called]) -> None:
     out, masks = tmp_path / "made", tmp_path / "nothing"
     for _ in make_benchmark(file, out, fraction=0.1):
         pass
@@ -142,9 +141,9 @@ def test_a_model_is_scored_on_all_tests_and_listed(file: Path, tmp_path: Path) -
     for k in range(4):
         cv2.imwrite(str(masks / "broken_pixels" / f"{k}.png"), np.full((64, 64), 255 * (k == 1), np.uint8))
     for name in ("first", "second", "first"):
-        scored = CliRunner().invoke(app, ["score", str(masks), str(out), "--name", name])
-        assert scored.exit_code == 0, scored.output
-        assert "nominal: false alarms: in 25.0% of 4 nominal frames" in scored.output
+        scored = call("score", masks, out, "--name", name)
+        assert scored.code == 0, scored.err
+        assert "nominal: false alarms: in 25.0% of 4 nominal frames" in scored.out
     assert (tmp_path / "nothing_on_made" / "nominal" / "score.html").is_file()
     table = read_leaderboard(out)
     assert list(table) == ["first", "second"]
@@ -152,21 +151,20 @@ def test_a_model_is_scored_on_all_tests_and_listed(file: Path, tmp_path: Path) -
     (part,) = table["first"]["parts"].values()  # the other dataset is for training
     assert part["nominal_frames_with_alarm"]["all"]["value"] == 0.25  # one of four is marked
     assert part["good_pixels_kept"]["value"] == 0.75
-    split = CliRunner().invoke(app, ["score", str(masks), str(out), "--split", "val"])
-    assert "of the tests of a benchmark, all samples are scored" in split.output + str(split.exception)
+    split = call("score", masks, out, "--split", "val")
+    assert "of the tests of a benchmark, all samples are scored" in split.said
     (tmp_path / "model").mkdir()
     (tmp_path / "model" / "model.json").write_text("{}")
-    inside = ["score", str(masks), str(out / "nominal.zarr"), "--out", str(tmp_path / "model")]
-    refused = CliRunner().invoke(app, inside)
-    assert "is a model, in which no other file may lie" in refused.output + str(refused.exception)
+    refused = call("score", masks, out / "nominal.zarr", "--out", tmp_path / "model")
+    assert "is a model, in which no other file may lie" in refused.said
     (out / "leaderboard.json").write_text("[]")
     with pytest.raises(InputError, match="is no leaderboard"):
         read_leaderboard(out)
     for _ in make_benchmark(file, tmp_path / "train", fraction=0.1, only=["train"]):
         pass
-    none = CliRunner().invoke(app, ["score", str(masks), str(tmp_path / "train")])
-    assert none.exit_code == 2 or isinstance(none.exception, InputError)
-    assert "lists no dataset for a test" in none.output + str(none.exception)
+    none = call("score", masks, tmp_path / "train")
+    assert none.code == 2
+    assert "lists no dataset for a test" in none.said
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import small_scene
+from conftest import recorded_calls, small_scene
 from test_faults_kit import flat_electrons, inside, make, make_context, rng, with_mosaic
 
 from vbnfault.core.errors import InputError
@@ -46,8 +46,7 @@ def drawn(where: FaultContext, **keys: Any) -> dict[str, Any]:
 
 
 def test_the_damage_of_a_sample_is_computed_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    calls, compute = [], broken_pixels_hot._damage
-    monkeypatch.setattr(broken_pixels_hot, "_damage", lambda *given: calls.append(1) or compute(*given))
+    calls = recorded_calls(monkeypatch, broken_pixels_hot, "_damage")
     where, fault = context(), make("broken_pixels", model="hot_pixels")
     params = fault.draw(where, rng(1))
     added(where, params)

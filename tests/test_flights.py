@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import Called
+from conftest import Called, recorded_calls
 from scipy.integrate import quad
 from scipy.optimize import brentq
 
@@ -187,14 +187,7 @@ def test_a_fall_to_a_place_is_found_by_few_trial_falls(monkeypatch: pytest.Monke
 
     From some metres to a millimetre that takes five trials, and the fall itself is one more.
     """
-    falls = []
-
-    def counted(*arguments: Any, **keys: Any) -> Any:
-        falls.append(arguments)
-        return fall(*arguments, **keys)
-
-    fall = flights._fall
-    monkeypatch.setattr(flights, "_fall", counted)
+    falls = recorded_calls(monkeypatch, flights, "_fall")
     monkeypatch.setattr(flights, "_flown", {})  # flights of other tests are not known
     fly(scene_of(flight("relocation", sequences=2)), rock())
     assert 2 * 3 <= len(falls) <= 2 * 6

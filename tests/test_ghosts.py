@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import needs_llvm, render_threads
+from conftest import needs_llvm, recorded_calls, render_threads
 from lens_kit import paraxial_ghosts, pixel_mm
 from test_lens import BACK, GLASS, STOP
 
@@ -17,7 +17,7 @@ from vbnfault.lens.glass import D_NM
 from vbnfault.lens.prescription import Prescription
 from vbnfault.lens.rays import path_of, trace
 from vbnfault.lens.straylight import ghosts, irradiance
-from vbnfault.lens.straylight.bundles import Rays, Spots, Tracer, name_of, routes
+from vbnfault.lens.straylight.bundles import Rays, Tracer, name_of, routes
 from vbnfault.lens.straylight.ghosts import boxes, lit_cells
 from vbnfault.lens.straylight.irradiance import FlareModel, disc_samples, traced_ghosts
 from vbnfault.lens.straylight.raster import _EDGE_NODES, EDGE_HIGH, EDGE_LOW, Sums, edge_profiles
@@ -342,15 +342,9 @@ def test_a_ghost_that_aberrations_spread_is_drawn_as_its_rays_fall(
     middle = np.average(place[seen], axis=0, weights=light[seen])
     from_middle = np.linalg.norm(place - middle, axis=1)
 
-    trace_, traced_ = Tracer.trace, []
-
-    def counted(self: Tracer, rays: Rays, *more: Any, **options: Any) -> Spots:
-        traced_.append(len(rays))
-        return trace_(self, rays, *more, **options)
-
-    monkeypatch.setattr(Tracer, "trace", counted)
+    traced = recorded_calls(monkeypatch, Tracer, "trace")
     picture = made.image(sun_deg, 0.0, only=ghost)[0].astype(float) * sensor.pitch_mm**2
-    assert sum(traced_) == 1  # not one for each sample of the disc
+    assert sum(len(rays) for _, rays, *_ in traced) == 1  # not one for each sample of the disc
     y, x = (np.indices(picture.shape) + 0.5 - side / 2) * sensor.pitch_mm
     # 4 %: along the rim, 73 rays across lose half a cell, 1/72 of the radius or 2.8 % of the light; and the circles
     # cut pixels of up to 4 pixels of the frame
@@ -372,17 +366,12 @@ def test_threads_do_not_change_a_bit() -> None:
 def test_parts_do_not_change_a_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     """Ghosts are drawn in parts to bound memory; each part has lattices of all sizes, as their sum would round."""
     made = model(load_lens("nikkor_35_f2p8"), bands=Bands.sunlit(np.linspace(400, 700, 2)))
-    draw, sizes, pictures = Sums.draw, [], []
-
-    def counted(self: Sums, spots: Spots, *more: Any) -> None:
-        sizes[-1].append(len(np.unique(spots.across)))
-        draw(self, spots, *more)
-
-    monkeypatch.setattr(Sums, "draw", counted)
+    drawn, sizes, pictures = recorded_calls(monkeypatch, Sums, "draw"), [], []
     for rays in (1 << 40, 1 << 14):
         monkeypatch.setattr(irradiance, "_RAYS_AT_ONCE", rays)
-        sizes.append([])
+        drawn.clear()
         pictures.append(made.image(7.0, 20.0).tobytes())
+        sizes.append([len(np.unique(spots.across)) for _, spots, *_ in drawn])
     assert sizes[0] == [2]
     assert len(sizes[1]) > 2
     assert set(sizes[1]) == {2}
@@ -461,22 +450,15 @@ def test_soft_edges() -> None:
 def test_the_brightest_ghosts_are_listed(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """They are those of the list of all ghosts, to the last digit, and each wavelength is traced once."""
     made = model(load_lens("nikkor_28_f2p8"), bands=Bands.lines(450.0, 550.0, 650.0), model=kind)
-    lattices: list[Any] = []
-    traced = type(made._tracer).trace
-
-    def counted(tracer: Tracer, rays: Rays, across: Any, *more: Any, **options: Any) -> Any:
-        lattices.append(across)
-        return traced(tracer, rays, across, *more, **options)
-
-    monkeypatch.setattr(type(made._tracer), "trace", counted)
+    traced = recorded_calls(monkeypatch, type(made._tracer), "trace")
     for worn in (0.0, 0.3):
         lens = made.worn(worn)
         every = lens.ghosts(11.0, 20.0)
         assert len(every) > 30
         assert [ghost.pair for ghost in every] == sorted(ghost.pair for ghost in every)
-        lattices.clear()
+        traced.clear()
         few = lens.ghosts(11.0, 20.0, most=6)
-        assert lattices == [13, 48, 48, 48]  # the spectra; the boxes are known
+        assert [across for _, _, across, *_ in traced] == [13, 48, 48, 48]  # the spectra; the boxes are known
         highest = sorted(every, key=lambda g: -g.peak_irradiance_fraction)[:6]
         assert few == tuple(sorted(highest, key=lambda g: g.pair))
         assert lens.ghosts(11.0, 20.0, most=1000) == every

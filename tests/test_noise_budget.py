@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from conftest import small_scene
+from conftest import recorded_calls, small_scene
 from test_light import limb
 from test_render import NODES, UP, box, join, plane, scene, view
 
@@ -213,25 +213,16 @@ def test_bits_do_not_depend_on_how_many_cells_are_held(monkeypatch: pytest.Monke
 
 def test_only_the_last_round_exceeds_the_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     """Three rounds of a view that stays too noisy: the limit twice, then twice the limit."""
-    limits = []
-    allocated = noise_budget._allocated
-
-    def noted(squares: np.ndarray, goal: np.ndarray, most: int) -> np.ndarray:
-        limits.append(most)
-        return allocated(squares, goal, most)
-
-    monkeypatch.setattr(noise_budget, "_allocated", noted)
+    allocated = recorded_calls(monkeypatch, noise_budget, "_allocated")
     session = Session(physical(render={"noise_fraction": 0.02, "max_samples_per_pixel": 64}))
     spec = session.spec(0)
     render_view(spec, resolve(spec))
-    assert limits == [64, 64, 128]
+    assert [most for *_, most in allocated] == [64, 64, 128]
 
 
 def test_the_exposure_is_foreseen_without_imaging(monkeypatch: pytest.MonkeyPatch) -> None:
     """The exposure within 3 %, though the lens images the render once a sample, for the metering."""
-    imaged = []
-    expose = Camera.expose
-    monkeypatch.setattr(Camera, "expose", lambda *inputs: imaged.append(1) or expose(*inputs))
+    imaged = recorded_calls(monkeypatch, Camera, "expose")
     session = Session(physical(camera={"exposure_max_s": 10.0}))
     for index in range(3):
         spec = session.spec(index)

@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from conftest import recorded_calls
 from poses_kit import row
 from scipy.special import ndtr
 from typer.testing import CliRunner
@@ -156,16 +157,10 @@ def test_a_pair_that_is_damaged_or_gone_is_rendered_again(
     for name, part in (("frame_2", "figures"), ("frame_3", "settings")):
         path = tmp_path / f"pairs/{name}.json"
         path.write_text(json.dumps({**json.loads(path.read_text()), part: None}))
-    rendered, pair = [], Replay.pair
-
-    def counted(self: Replay, row: int, frame: Any) -> Any:
-        rendered.append(row)
-        return pair(self, row, frame)
-
-    monkeypatch.setattr(Replay, "pair", counted)
+    rendered = recorded_calls(monkeypatch, Replay, "pair")
     options = fit_passport.PassportOptions(part="all", mendings=0, draws=1)
     again = fit_passport.passport(frames, "rosetta67p", tmp_path, options, overrides=SMALL)
-    assert rendered == [0, 1, 2, 3]
+    assert [row for _, row, _ in rendered] == [0, 1, 2, 3]
     assert json.dumps(again["statistics"]) == json.dumps(found["statistics"])  # NaN differs from itself
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import needs_llvm, small_scene, verified_store
+from conftest import needs_llvm, recorded_calls, small_scene, verified_store
 from lens_kit import paraxial_ghosts, sunlit
 from numpy.typing import NDArray
 from test_faults_kit import flat_electrons, make_context
@@ -440,18 +440,12 @@ def test_a_response_is_traced_once_and_read_by_others(
 ) -> None:
     """Bit for bit; damage is found, whichever byte it is in, and the response is traced and kept again."""
     scene = behind(singlet, 8, 30.0)
-    counted, trace = [0], ghost_response._Tracing.table
-
-    def counting(*args: Any) -> F32:
-        counted[0] += 1
-        return trace(*args)
-
-    monkeypatch.setattr(ghost_response._Tracing, "table", counting)
+    tables = recorded_calls(monkeypatch, ghost_response._Tracing, "table")
     traced = fresh(scene)
     (path,) = folder.iterdir()
     good = path.read_bytes()
     np.testing.assert_array_equal(fresh(scene), traced)
-    assert counted == [1]
+    assert len(tables) == 1
     for place in (3, 40, 300, len(good) // 2, len(good) - 5):
         damaged = bytearray(good)
         damaged[place] ^= 4
@@ -459,7 +453,7 @@ def test_a_response_is_traced_once_and_read_by_others(
         np.testing.assert_array_equal(fresh(scene), traced)
         assert "the response of ghosts kept there is damaged" in capsys.readouterr().err
         assert path.read_bytes() == good
-    assert counted == [6]
+    assert len(tables) == 6
 
 
 def test_what_changes_a_response_changes_its_key(singlet: Prescription) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import tomli_w
-from conftest import small_scene
+from conftest import recorded_calls, small_scene
 from PIL import Image
 
 from vbnfault.camera import Camera
@@ -22,7 +22,6 @@ from vbnfault.core.spectra import solar_irradiance_W_m2_nm
 from vbnfault.lens import load_lens
 from vbnfault.lens.adapt import Change, changed
 from vbnfault.lens.coating import mean_reflectance
-from vbnfault.pipeline.rendering import render_view
 from vbnfault.study import evaluate as evaluate_module
 from vbnfault.study import image_metrics, results, run
 from vbnfault.study.evaluate import SceneEvaluator
@@ -116,16 +115,8 @@ def evaluator(tmp_path_factory: pytest.TempPathFactory) -> SceneEvaluator:
 def test_the_view_is_rendered_once_and_each_factor_moves_only_its_own_stages(
     evaluator: SceneEvaluator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    renders: list[int] = []
-
-    def counted(*inputs: Any) -> Any:
-        renders.append(1)
-        return render_view(*inputs)
-
-    exposures: list[int] = []
-    expose = Camera.expose
-    monkeypatch.setattr(Camera, "expose", lambda *a, **k: exposures.append(1) or expose(*a, **k))
-    monkeypatch.setattr(evaluate_module, "render_view", counted)
+    renders = recorded_calls(monkeypatch, evaluate_module, "render_view")
+    exposures = recorded_calls(monkeypatch, Camera, "expose")
     base = evaluator.evaluate(point(NOMINAL, role="A"))
     events = evaluator.kept.events
     for key in NOMINAL:

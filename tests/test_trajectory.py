@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from conftest import recorded_calls
 from poses_kit import Rows, columns_of, row
 from scipy.spatial.transform import Rotation
 
@@ -499,9 +500,7 @@ def test_a_description_of_many_rows_makes_no_pose_of_each(
     scene = config.load_scene(
         scene_file(tmp_path, sphere, [row(f"r{k}", (0, 0, 9e3), **turned) for k in range(50)])
     )
-    made: list[int] = []
-    pose = Trajectory.pose
-    monkeypatch.setattr(Trajectory, "pose", lambda s, k: made.append(k) or pose(s, k))
+    made = recorded_calls(monkeypatch, Trajectory, "pose")
     session = pipeline.Session(scene)
     assert describe._rows_that_miss_the_body(session, session.trajectory, 50)
     assert not made

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from collections import Counter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from conftest import ALL_FAULTS, small_scene
+from conftest import ALL_FAULTS, recorded_calls, small_scene
 from poses_kit import columns_of, row
 from scipy import stats
 from synthetic import flip
@@ -18,7 +17,6 @@ import vbnfault
 from vbnfault import store
 from vbnfault.camera import Camera
 from vbnfault.core.errors import InputError
-from vbnfault.core.quantities import Radiance
 from vbnfault.core.shared_results import SharedResults
 from vbnfault.dataset.identity import scene_identity, store_spec
 from vbnfault.detector import MosaicDetector
@@ -115,19 +113,12 @@ def session() -> Session:
 def test_a_view_is_rendered_once_and_no_sample_depends_on_another(
     session: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rendered: Counter[int] = Counter()
-    render_view = stages.render_view
-
-    def counted(spec: Any, pose: Any) -> Any:
-        rendered[spec.index] += 1
-        return render_view(spec, pose)
-
-    monkeypatch.setattr(stages, "render_view", counted)
+    rendered = recorded_calls(monkeypatch, stages, "render_view")
     made = [session.frame(i) for i in range(8)]
     views = [frame.views for frame in made]
     # one render each for views 0 and 4, and one for every further view that some sample needs
-    assert rendered.keys() == {0, 4}
-    assert rendered[0] + rendered[4] == max(views[:4]) + max(views[4:])
+    assert {spec.index for spec, _ in rendered} == {0, 4}
+    assert len(rendered) == max(views[:4]) + max(views[4:])
     for first in (0, 4):
         same = [frame for frame in made[first : first + 4] if frame.views == 1]
         assert len(same) > 1
@@ -144,7 +135,7 @@ def test_a_view_is_rendered_once_and_no_sample_depends_on_another(
         assert np.array_equal(frame.images.image.array, made[k].images.image.array)
         assert np.array_equal(frame.labels.masks, made[k].labels.masks)
         assert frame.drawn == made[k].drawn
-    assert rendered.keys() == {0, 4}
+    assert {spec.index for spec, _ in rendered} == {0, 4}
 
 
 def test_a_fault_that_needs_light_is_not_drawn_in_a_dark_view(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -167,15 +158,8 @@ def test_a_fault_that_needs_light_is_not_drawn_in_a_dark_view(monkeypatch: pytes
         dark = light.rendered.with_array(np.zeros_like(light.rendered.array))
         return dataclasses.replace(rendering, light=dataclasses.replace(light, rendered=dark))
 
-    drawn: list[int] = []
-    draw_faults = injection.draw_faults
-
-    def counted(spec: Any, development: Any, commanded: Any, draws: Any, attempt: int) -> Any:
-        drawn.append(attempt)
-        return draw_faults(spec, development, commanded, draws, attempt)
-
     monkeypatch.setattr(stages, "render_view", dark_at_first)
-    monkeypatch.setattr(injection, "draw_faults", counted)
+    drawn = recorded_calls(monkeypatch, injection, "draw_faults")
 
     def made() -> Any:
         rendered.clear()
@@ -186,11 +170,11 @@ def test_a_fault_that_needs_light_is_not_drawn_in_a_dark_view(monkeypatch: pytes
 
     quick = made()
     assert (quick.views, len(rendered)) == (2, 2)
-    assert min(drawn) >= injection._DRAW_TRIES, "no draw belongs to the first view"
+    assert min(attempt for *_, attempt in drawn) >= injection._DRAW_TRIES, "no draw belongs to the first view"
     drawn.clear()
     monkeypatch.setattr(injection, "_in_vain", lambda *of: [])
     slow = made()
-    assert sorted(drawn)[: injection._DRAW_TRIES] == list(range(injection._DRAW_TRIES))
+    assert sorted(attempt for *_, attempt in drawn)[: injection._DRAW_TRIES] == list(range(injection._DRAW_TRIES))
     assert slow.drawn == quick.drawn
     assert np.array_equal(slow.images.image.array, quick.images.image.array)
     # where no other view is tried, the fault is left out and the others are drawn as ever
@@ -347,14 +331,7 @@ def test_rows_of_a_table_of_poses_are_seen_several_times() -> None:
 def test_what_the_samples_of_a_view_share_is_computed_and_compressed_once(
     session: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    exposed: list[Camera] = []
-    expose = Camera.expose
-
-    def counted(camera: Camera, radiance: Radiance, exposure_s: float) -> Any:
-        exposed.append(camera)
-        return expose(camera, radiance, exposure_s)
-
-    monkeypatch.setattr(Camera, "expose", counted)
+    exposed = recorded_calls(monkeypatch, Camera, "expose")
     samples = [to_sample(frame) for frame in map(session.frame, range(8, 12)) if frame.views == 1]
     assert len(samples) > 1
     assert len(exposed) <= 2  # one for each view that was rendered
@@ -400,14 +377,8 @@ def test_stars_and_raw_numbers_are_computed_once(monkeypatch: pytest.MonkeyPatch
         sky={"stars": "on"},
         plan={"faulty_fraction": 0.0},
     )
-    starred: list[float] = []
-    visible_stars = assemble.visible_stars
-    monkeypatch.setattr(
-        assemble, "visible_stars", lambda *of: starred.append(of[2].exposure_s) or visible_stars(*of)
-    )
-    developed: list[float] = []
-    raw = MosaicDetector.raw
-    monkeypatch.setattr(MosaicDetector, "raw", lambda detector, *of: developed.append(of[1]) or raw(detector, *of))
+    starred = recorded_calls(monkeypatch, assemble, "visible_stars")
+    developed = recorded_calls(monkeypatch, MosaicDetector, "raw")
     own = Session(config.parse_scene(scene, source="test"))
     frames = [own.frame(k) for k in range(4)]
     assert len(starred) == frames[0].views == 1
