@@ -16,18 +16,15 @@ F32 = NDArray[np.float32]
 
 
 def severity_labels(
-    store: Store,
-    samples: Sequence[int] | NDArray[np.int64],
-    classes: Sequence[str] | None = None,
-    table: SeverityTable | None = None,
+    store: Store, samples: Sequence[int] | NDArray[np.int64], classes: Sequence[str] | None = None
 ) -> F32:
     """Return the level of severity of each class in samples, float32[sample, class], 0 (absent) to 5.
 
     The level follows from the drawn value of the key by which the model becomes more severe (`Fault.severity`),
-    scaled to the width of the frames: it is linear in the logarithm of the value between the values of the table's
+    scaled to the width of the frames: it is linear in the logarithm of the value between those of the packaged
     levels, and between 0 at the model's mildest value and its first level. Values beyond the last level count as
-    that one. nan: the table has no levels of the model, or the parameters do not say the value. Other keys, such as
-    a radius, may differ from those for which the table holds; the level does not change with them.
+    that one. nan: their table has no levels of the model, or the parameters do not say the value. Other keys, such
+    as a radius, may differ from those for which the table holds; the level does not change with them.
 
     Parameters
     ----------
@@ -37,15 +34,13 @@ def severity_labels(
         Indices of finished samples.
     classes
         Fault classes; by default those of the store.
-    table
-        Levels of severity; by default the packaged ones.
 
     Raises
     ------
     VbnfaultError
         The parameters of a sample cannot be read.
     """
-    chosen, table = tuple(classes or store.spec.faults), table or Levels().table
+    chosen, table = tuple(classes or store.spec.faults), Levels().table
     wanted, reader = np.asarray(samples, dtype=np.int64), ShardReader(store, ())
     shape, out = (store.spec.height, store.spec.width), np.zeros((len(wanted), len(chosen)), np.float32)
     for number in np.unique(wanted // store.spec.shard_samples).tolist():

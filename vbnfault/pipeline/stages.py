@@ -123,9 +123,7 @@ def simulate_frame(spec: SampleSpec, run: StageRunner = run_stage, shared: Share
     return _frame(view, views, run)
 
 
-def simulate_stored_view(
-    spec: SampleSpec, pose: Pose, rendering: Rendering, views: int, run: StageRunner = run_stage
-) -> Frame:
+def simulate_stored_view(spec: SampleSpec, pose: Pose, rendering: Rendering, views: int) -> Frame:
     """Run the stages behind the render for one sample, whose view is given, and return its frame.
 
     A commanded fault that is not visible is left out, since there is no other view.
@@ -138,10 +136,8 @@ def simulate_stored_view(
         The outcomes of `resolve` and `render_view`.
     views
         Number of views that were rendered for the sample; each has its own draws of the faults.
-    run
-        Function that calls each stage.
     """
-    return _frame(_expose(spec, run, SharedViews(), pose, rendering, views), views, run)
+    return _frame(_expose(spec, run_stage, SharedViews(), pose, rendering, views), views, run_stage)
 
 
 def _frame(view: _RenderedView, views: int, run: StageRunner) -> Frame:

@@ -68,15 +68,12 @@ def cache_limit_bytes() -> int:
     return int(gib * 2**30)
 
 
-def code_hash(sources: Sequence[Path], libraries: Sequence[str] = ()) -> str:
-    """Return the sha256 (hex) of source files, the versions of numerical libraries and the platform.
-
-    `libraries` are further ones that compute the arrays.
-    """
+def code_hash(sources: Sequence[Path]) -> str:
+    """Return the sha256 (hex) of source files, the versions of numerical libraries and the platform."""
     parts = hashlib.sha256()
     for path in sources:
         parts.update(path.read_bytes())
-    versions = [importlib.metadata.version(name) for name in (*_LIBRARIES, *libraries)]
+    versions = [importlib.metadata.version(name) for name in _LIBRARIES]
     parts.update(json.dumps([versions, platform.machine(), sys.byteorder]).encode())
     return parts.hexdigest()
 

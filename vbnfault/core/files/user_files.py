@@ -80,9 +80,9 @@ def read_input(path: str | Path, what: str, *, types: Sequence[str] = (), limit_
     return data
 
 
-def check_input(path: str | Path, what: str, *, types: Sequence[str] = ()) -> None:
+def check_input(path: str | Path, what: str) -> None:
     """Check a file, as `read_input` does, that a library will read by its path. Raises InputError, InputChanged."""
-    with _opened(Path(path), what, types, LIMIT_BYTES[what]) as file:
+    with _opened(Path(path), what, (), LIMIT_BYTES[what]) as file:
         check_contents(path, what, lambda: _sha256_of(file), os.fstat(file.fileno()))
 
 
