@@ -413,8 +413,8 @@ def test_a_body_of_few_pixels_is_blurred_as_its_sub_frames_are() -> None:
     scene = {**SCENE, "render": {"bands": 2}}
     spec = body_of_few_pixels(scene, (800 * px_s, 0, 0), (0, 0.8 * px_s, 0.3 * px_s))
     moved, true, still = moved_and_brute(spec, 16)
-    assert np.abs(still - true).max() > 0.5 * true.max()
-    assert np.abs(moved - true).max() < 0.05 * true.max()
+    assert np.abs(still - true).max() > 0.3 * true.max()
+    assert np.abs(moved - true).max() < 0.01 * true.max()
 
 
 def test_lines_of_a_rolling_shutter_see_a_body_of_few_pixels_where_its_truth_is() -> None:
