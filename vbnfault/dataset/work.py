@@ -168,7 +168,7 @@ class Job:
 
 
 class SingleItems(Job):
-    """Hand out tasks of one item each, which has their number; if one fails, the others are done."""
+    """Hand out tasks of one item each, with the same number; if an item fails, the others are made."""
 
     most_failures = None
 
@@ -177,7 +177,7 @@ class SingleItems(Job):
         return (number,)
 
     def task(self, number: int, skip: frozenset[int] = frozenset(), *, careful: bool = False) -> int:
-        """Return the number of a task."""
+        """Return a task as its worker gets it: its number."""
         return number
 
 

@@ -44,7 +44,7 @@ class _RegisterUpset(Fault):
     effect_mask = True
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
-        """Return the mosaic whose pixels are moved."""
+        """Return the mosaic with its pixels moved."""
         return quantity.with_array(self.moved(quantity.array, params))
 
 

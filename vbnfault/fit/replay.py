@@ -250,15 +250,16 @@ class Replay:
     ) -> tuple[float, NDArray[Any]]:
         """Return the gain with which the noise of the sky is nearest to the frame's, and its raw image.
 
-        `raw` has the first of the gains. How noise grows with the gain depends on how much of it is of photons, so
-        another gain is tried where half of what it changes of photons alone, the least, would be too little.
+        `raw` has the first of the gains. How noise grows with the gain depends on how much of it is of photons,
+        whose noise grows least. Another gain is rendered where the frame's noise differs by more than half of that.
         """
         wanted, tried = noise_variance(real, self.display.stretch), {self.gains[0]: raw}
 
         def lacks(gain: float) -> float:
             """Return the logarithm of the factor that the variance lacks with a gain that was tried."""
             image = look(self.display.developed(tried[gain], factor))
-            return float(np.log(wanted / noise_variance(image, self.display.stretch)))
+            with np.errstate(divide="ignore", invalid="ignore"):  # a dark sky may have no noise
+                return float(np.log(np.divide(wanted, noise_variance(image, self.display.stretch))))
 
         nearest = self.gains[0]
         for gain in () if real.clipped else self.gains[1:]:

@@ -34,7 +34,7 @@ _FINE_PX = 5.0  # a longer path needs half as many steps for each further pixel
 _STRIP_PX = 128  # rows of pixels whose cells are carried at a time
 _ROUNDS = 2  # in which the place is found from which light comes
 _POINTS = 1 << 20  # of fine light that is spread along its paths, at most
-_GOLDEN = 0.5 * (5**0.5 - 1)
+_GOLDEN = 0.5 * (5**0.5 - 1)  # multiples of it, without their whole parts, spread evenly
 # Pixels whose paths depart by more than this from those around, up to either end, may hide one another.
 _APART_PX, _APART_OF_LENGTH = 0.12, 0.02
 _FARTHEST_PX = 64  # from such a step, within which pixels get new rays

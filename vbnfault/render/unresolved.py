@@ -88,11 +88,6 @@ class CloseUp:
         """Return x and y of its first and its last corner in the frame, float64[2] each."""
         return self.first / self.per_px, (self.first + _ACROSS) / self.per_px
 
-    @property
-    def depth_m(self) -> float:
-        """Return the depth of the body's middle along the boresight of the frame's camera."""
-        return float((self.ground.centre_m - self.frame.position_L_m) @ self.frame.L_from_C[:, 2])
-
     @cached_property
     def slopes(self) -> F64:
         """Return the tangents x/z and y/z in C at which the frame's camera sees its pixels, float64[y, x, 2]."""
@@ -129,10 +124,10 @@ class CloseUp:
         frame, slopes, depth_m = self.frame, self.slopes.reshape(-1, 2), self._depths_m
         values = (radiance.array * self.unhidden).reshape(len(radiance.array), -1)
         lit = values.any(axis=0)
-        # defocus shifts the light of each point of the aperture
         # each pixel of a close-up lies within one pixel of a pinhole that stands still
         within = frame.projection is None and frame.motion is None
         area_px = self.per_px**-2.0 * frame.stretch(slopes, depth_m)
+        # defocus shifts the light of each point of the aperture
         slopes = slopes + self._lens_m * (1 / frame.focus_distance_m - 1 / depth_m[:, None])
         return FineLight.of(
             slopes=slopes[lit],
