@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..output.export.regions import class_discs, region_labels
-from ..store import ShardReader, Store, StoreSpec
+from ..store import Store, StoreSpec
 from .scores import F64, ratio
 
 # The order of the counts of a sample.
@@ -99,15 +99,10 @@ def flares_of(store: Store, samples: Sequence[int] | NDArray[np.int64]) -> list[
 
     Raises InputError or VbnfaultError if the parameters of a sample are damaged, or not those of vbnfault.
     """
-    reader, out = ShardReader(store, ()), []
-    held = -1
-    for i in map(int, samples):
-        number, k = divmod(i, store.spec.shard_samples)
-        if number != held:
-            held, parameters, sun = number, *(reader.column(name, number) for name in ("parameters", "sun_xy_px"))
-        drawn = store.table(i, "parameters", parameters[k])
+    sun, out = store.read("sun_xy_px"), []
+    for i, drawn in zip(map(int, samples), store.drawn(samples), strict=True):
         discs = {
-            name: class_discs(store.spec, i, drawn, name, sun[k]) for name in drawn if name in store.spec.faults
+            name: class_discs(store.spec, i, drawn, name, sun[i]) for name in drawn if name in store.spec.faults
         }
         out.append({name: of_class for name, of_class in discs.items() if len(of_class)})
     return out

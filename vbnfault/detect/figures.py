@@ -107,12 +107,8 @@ def _time(samples: Samples, tally: Tally, injected: NDArray[np.bool_]) -> dict[s
     """Return what is seen when in the sequences of a store; None if it has none."""
     if not samples.store.spec.sequence_names:
         return None
-    sequence, time_s, texts = (samples.column(name) for name in ("sequence", "time_s", "parameters"))
-    drawn = [
-        samples.store.table(i, "parameters", text)
-        for i, text in zip(samples.indices.tolist(), texts.tolist(), strict=True)
-    ]
-    said = tally.present >= PRESENT
+    sequence, time_s = samples.column("sequence"), samples.column("time_s")
+    drawn, said = list(samples.store.drawn(samples.indices)), tally.present >= PRESENT
     frames = Frames.of(sequence.astype(np.int64), time_s, injected, said, drawn, tuple(samples.classes))
     return time_figures(frames, tuple(samples.classes), samples.options.seed)
 

@@ -59,10 +59,9 @@ def log_result(path: str, store: Store, options: ScoreOptions) -> dict[str, Any]
     log = read_log(path, store, columns)
     indices = select(store, None if options.split == ALL else options.split)
     place = np.searchsorted(columns.samples, indices)
-    sequence, time_s, texts = (columns[name][place] for name in ("sequence", "time_s", "parameters"))
+    sequence, time_s = columns["sequence"][place], columns["time_s"][place]
     injected = columns["injected"][place].astype(bool)
-    drawn = [store.table(i, "parameters", text) for i, text in zip(indices.tolist(), texts.tolist(), strict=True)]
-    held = log.held[place]
+    drawn, held = list(store.drawn(indices)), log.held[place]
     frames = Frames.of(sequence.astype(np.int64), time_s, injected, held[:, :-1], drawn, classes, held[:, -1])
     known = [(*classes, ANY)[c] for c in np.flatnonzero(np.any(log.held, axis=0))]
     return {

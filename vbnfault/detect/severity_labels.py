@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..faults import LEVELS, Levels, SeverityTable, registry
 from ..faults.fields import REFERENCE_WIDTH_PX
-from ..store import ShardReader, Store
+from ..store import Store
 
 F32 = NDArray[np.float32]
 
@@ -41,17 +41,12 @@ def severity_labels(
         The parameters of a sample cannot be read.
     """
     chosen, table = tuple(classes or store.spec.faults), Levels().table
-    wanted, reader = np.asarray(samples, dtype=np.int64), ShardReader(store, ())
-    shape, out = (store.spec.height, store.spec.width), np.zeros((len(wanted), len(chosen)), np.float32)
-    for number in np.unique(wanted // store.spec.shard_samples).tolist():
-        parameters, intrinsics = reader.column("parameters", number), reader.column("intrinsics", number)
-        first = store.shard(number).start
-        for row in np.flatnonzero(wanted // store.spec.shard_samples == number).tolist():
-            i = int(wanted[row])
-            drawn = store.table(i, "parameters", parameters[i - first])
-            focal_length_px = float(intrinsics[i - first][0])
-            out[row] = [severity_level(name, drawn.get(name), shape, focal_length_px, table) for name in chosen]
-    return out
+    shape, focal_length_px = (store.spec.height, store.spec.width), store.read("intrinsics")[:, 0]
+    levels = [
+        [severity_level(name, drawn.get(name), shape, float(focal_length_px[i]), table) for name in chosen]
+        for i, drawn in zip(samples, store.drawn(samples), strict=True)
+    ]
+    return np.array(levels, np.float32).reshape(len(levels), len(chosen))
 
 
 def severity_level(

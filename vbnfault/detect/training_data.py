@@ -171,15 +171,11 @@ class TrainingData:
             )
         self._levels = [self._severity(store) for store in opened]
         self.train = [self._samples(k, "train") for k in range(len(opened))]
-        self.val = [self._samples(k, "val") for k in range(len(opened)) if "val" in self._splits(k)]
+        self.val = [self._samples(k, "val") for k in range(len(opened)) if "val" in Columns(opened[k])["split"]]
         if not self.val:
             logging.getLogger("vbnfault").warning(
                 "no dataset has a validation split: the training does not end early, and its last weights count"
             )
-
-    def _splits(self, number: int) -> set[str]:
-        """Return the splits of the finished samples of a store."""
-        return set(Columns(self.stores[number])["split"].tolist())
 
     def _severity(self, store: Store) -> dict[int, NDArray[np.float32]]:
         """Return the levels of severity of all finished samples of a store."""

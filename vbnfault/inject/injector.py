@@ -44,6 +44,7 @@ _PATTERNS = (
     *("dose_TeV_g", "dead_fraction", "dead_fraction_yr", "stuck_fraction", "stuck_fraction_yr"),
     *("rts_fraction", "trap_fraction", "trap_fraction_TeV_g", "years"),
 )
+_NEEDS_SUN = "needs the Sun before the camera; give its position: image.sun, --sun or sun="
 _UNSEEN = (
     "changes nothing in any of its draws; it is too weak here, or other faults hide it, as by turning all white"
 )
@@ -332,7 +333,8 @@ class Injector:
     ) -> tuple[dict[str, Draw], dict[str, str]]:
         """Return draws of the commanded classes, and why the others are not in the image."""
         names = [name for name in self.faults if commanded is None or name in commanded]
-        left_out = self._impossible(names, development.context)
+        in_dark = development.context.sun_xy_px is None
+        left_out = {name: _NEEDS_SUN for name in names if in_dark and self.faults[name].needs_sun}
         possible = [name for name in names if name not in left_out]
         if not self.effects:
             return draw_faults(drawing, development, possible, {}, 0), left_out
@@ -422,11 +424,6 @@ class Injector:
         if self._shared is None or self._shared[0] != key:
             self._shared = key, SharedResults(kept=True)
         return self._shared[1]
-
-    def _impossible(self, names: Sequence[str], context: FaultContext) -> dict[str, str]:
-        """Return why some of the classes cannot act on an image."""
-        dark = [name for name in names if self.faults[name].needs_sun and context.sun_xy_px is None]
-        return dict.fromkeys(dark, "needs the Sun before the camera; give its position: image.sun, --sun or sun=")
 
 
 @lru_cache(maxsize=8)

@@ -418,7 +418,9 @@ def feature_lifetime(
     """
     if not len(images) or len(images) != len(views):
         raise InputError(f"images: {len(images)}, views: {len(views)}: must be equally many, at least 1")
-    _check_sizes(images)
+    first = intensity(images[0], "images[0]")
+    for k, image in enumerate(images[1:], start=1):
+        same_shape(first, intensity(image, f"images[{k}]"), "images[0]", f"images[{k}]")
     level = white_level(images[0]) if white is None else white
     track = corners(images[0], white=level, count=CORNERS)
     if not len(track):
@@ -436,13 +438,6 @@ def feature_lifetime(
         lifetime = lifetime + alive.astype(np.int64)
         before = after
     return FeatureLifetime(mean_views=float(lifetime.mean()), views=np.asarray(lifetime))
-
-
-def _check_sizes(images: Sequence[NDArray[Any]]) -> None:
-    """Raise InputError if an array is no image, or if the sizes differ."""
-    first = intensity(images[0], "images[0]")
-    for k, image in enumerate(images[1:], start=1):
-        same_shape(first, intensity(image, f"images[{k}]"), "images[0]", f"images[{k}]")
 
 
 def _is_right(xy: F64, true_xy: F64, shape: tuple[int, ...], tolerance_px: float) -> NDArray[np.bool_]:

@@ -102,7 +102,10 @@ def preview(
     count = sum(map(len, tiles))
     name = f"{store.path.name}: {count} of {store.samples} samples"
     sheet = np.vstack([_header(name, store.spec.faults, short, body.shape[1]), body])
-    _write_png(Path(out_png), sheet)
+    if Path(out_png).suffix.lower() != ".png":
+        raise InputError(f"{out_png}: the sheet is a PNG, so its name must end in .png")
+    with writing(out_png):
+        write_png(Path(out_png), sheet)
     return count
 
 
@@ -301,11 +304,3 @@ def _write(image: U8, text: str, position: tuple[int, int], colour: tuple[int, i
 def _text_width(text: str, scale: float) -> int:
     """Return the width of text in pixels."""
     return int(cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)[0][0])
-
-
-def _write_png(path: Path, rgb: U8) -> None:
-    """Write an RGB image. Raises InputError or VbnfaultError, see `whole_files.writing`."""
-    if path.suffix.lower() != ".png":
-        raise InputError(f"{path}: the sheet is a PNG, so its name must end in .png")
-    with writing(path):
-        write_png(path, rgb)

@@ -54,7 +54,9 @@ def metadata_problems(store: Store) -> tuple[list[str], bool]:
         is_coordinate = member.values is not None
         stored = read_document(store.files, f"{name}/{DOCUMENT}")
         if stored is None:
-            problems.append(_why_closed(store.files, name))
+            file = f"{name}/{DOCUMENT}"
+            why = f"cannot be opened, {file} is damaged" if store.files.exists(file) else "is missing"
+            problems.append(f"array {name} {why}")
             hopeless |= not is_coordinate
             continue
         differences = list(_differences(stored, documents[name]))
@@ -71,13 +73,6 @@ def metadata_problems(store: Store) -> tuple[list[str], bool]:
             sound[name] = documents[name]
             problems += [f"array {name}: {clause}" for clause in _misvalued(store.files, name, member)]
     return problems + list(_root_differences(store, sound, documents)), hopeless
-
-
-def _why_closed(files: Files, name: str) -> str:
-    """Return why the document of an array is none, as a clause."""
-    if not files.exists(f"{name}/{DOCUMENT}"):
-        return f"array {name} is missing"
-    return f"array {name} cannot be opened, {name}/{DOCUMENT} is damaged"
 
 
 def _samples_of(document: Mapping[str, Any]) -> int | None:

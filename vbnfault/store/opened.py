@@ -287,6 +287,11 @@ class Store:
                 "the build command repairs them"
             ) from None
 
+    def drawn(self, samples: Iterable[int] | NDArray[np.int64]) -> Iterator[dict[str, Any]]:
+        """Yield what was drawn for each fault of samples, by class. Raises VbnfaultError, as `read` and `table`."""
+        texts = self.read("parameters")
+        return (self.table(int(i), "parameters", texts[i]) for i in samples)
+
     def most_bytes(self, name: str) -> int:
         """Return the most bytes that the file of an array for one shard may have."""
         if name in self.spec.pixel_layers:

@@ -135,7 +135,9 @@ class Factors:
     """
 
     def __init__(self, spec: StudySpec, scene: Scene, camera: Camera, lens: Prescription) -> None:
-        self.known = known_keys(spec, scene, camera, lens)
+        of_sun = [_table_key("sun", key) for key in ("angle_deg", "azimuth_deg", "distance_au")]
+        keys = (*_scene_keys(spec, scene), *_lens_keys(lens), *_detector_keys(camera), *of_sun)
+        self.known = {key.name: key for key in keys}  # all that a factor of the study may have
         self.keys: dict[str, Key] = {}
         self._units: dict[str, str] = {}
         for i, factor in enumerate(spec.factors):
@@ -336,13 +338,6 @@ def changed_scene(
 
 
 # --- known keys --------------------------------------------------------------------------------------------------
-
-
-def known_keys(spec: StudySpec, scene: Scene, camera: Camera, lens: Prescription) -> dict[str, Key]:
-    """Return all keys that a factor of a study may have, by name."""
-    of_sun = [_table_key("sun", key) for key in ("angle_deg", "azimuth_deg", "distance_au")]
-    keys = (*_scene_keys(spec, scene), *_lens_keys(lens), *_detector_keys(camera), *of_sun)
-    return {key.name: key for key in keys}
 
 
 def _scene_keys(spec: StudySpec, scene: Scene) -> list[Key]:

@@ -324,16 +324,12 @@ def half_widths(indices: xr.Dataset) -> xr.DataArray:
 
 
 def needed_samples(n: int, reached: float, asked: float) -> int:
-    """Return the n that should reach a half-width, if `n` reached another one.
+    """Return the n, a power of two, that should reach a half-width, if `n` reached another one.
 
     Half-widths shrink as 1 / √n, or faster where surrogates get better with more samples.
     """
-    return power_of_two(n * (reached / asked) ** 2)
-
-
-def power_of_two(n: float) -> int:
-    """Return the smallest power of two that is at least `n`."""
-    return 1 << max(0, int(np.ceil(np.log2(max(n, 1.0)))))
+    needed = n * (reached / asked) ** 2
+    return 1 << max(0, int(np.ceil(np.log2(max(needed, 1.0)))))
 
 
 # --- the other designs --------------------------------------------------------------------------------------------

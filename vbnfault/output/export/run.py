@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ... import __version__
 from ...core.errors import InputError, VbnfaultError, shown
@@ -186,28 +185,13 @@ def _check_sequences(store: Store, kind: Format, fps: float | None) -> None:
 def contents_sha256(store: Store) -> str:
     """Return a digest of the stored checksums of all layers and scalars, and of the layout of the store."""
     total = hashlib.sha256(json.dumps(store.spec.data, sort_keys=True).encode())
-    for number in range(store.shards):
-        total.update(_column(store, "crc32c", number).tobytes())
+    total.update(store.read("crc32c").tobytes())
     return total.hexdigest()
-
-
-def _column(store: Store, name: str, number: int) -> NDArray[Any]:
-    """Return a scalar of a shard. Raises VbnfaultError if it cannot be read."""
-    try:
-        return store.column(name, number)
-    except (OSError, ValueError) as error:
-        raise VbnfaultError(
-            f"{store.path}: {name} of samples {store.shard(number).start}-{store.shard(number).stop - 1} cannot be "
-            f"read ({error}); the build command repairs it"
-        ) from error
 
 
 def _parts(store: Store, kind: Format, min_area_px: int, fps: float | None) -> tuple[ExportPart, ...]:
     """Return the parts of an export: of each split, in ascending order, some samples or a sequence."""
-    split = [str(name) for number in range(store.shards) for name in _column(store, "split", number)]
-    sequence = (
-        np.concatenate([_column(store, "sequence", n) for n in range(store.shards)]) if kind.by_sequence else ()
-    )
+    split, sequence = store.read("split").tolist(), store.read("sequence") if kind.by_sequence else ()
     parts: list[ExportPart] = []
     if not {*split} <= {*SPLITS}:  # only a sample that is not built has none: "" would name the root folder
         raise VbnfaultError(f"{store.path}: a split is none of {', '.join(SPLITS)}; the build command repairs it")
