@@ -95,6 +95,17 @@ def test_damage_anneals() -> None:
     assert np.median(later[both] / week[both]) == pytest.approx(0.7207, rel=0.01)
 
 
+def test_the_annealed_damage_of_the_device_does_not_become_fresh_with_the_faults_dose() -> None:
+    """A device that annealed for years gets of a dose what a device without damage gets."""
+    spec = replace(context().camera.detector.sensor.individual, years=0.0)  # type: ignore[union-attr]
+    new, flown = (context(0.1, individual=replace(spec, dose_TeV_g=d, anneal_s=1e8)) for d in (0.0, 40.0))
+    keys = {"years": 0.0, "least_dn": 0.001}
+    assert drawn(flown, **keys)["count"] == 0
+    # Each has some 700 interactions of an exponentially distributed rate: the sums differ by 5 % and more rarely.
+    sums = [added(where, drawn(where, dose_TeV_g=20.0, **keys)).sum() for where in (new, flown)]
+    assert sums[1] == pytest.approx(sums[0], rel=0.3)
+
+
 def test_stuck_pixels_show_their_level_whatever_the_light() -> None:
     where = context(0.01)
     keys = {"growth_factor": 1e3, "years": 10.0, "stuck_per_year": 1e-6, "dead_per_year": 0.0}

@@ -215,6 +215,8 @@ def _damage(params: Params, context: FaultContext) -> _Damage:
     device = detector.device
     own = device.drawn  # what was measured does not age
     old = _older(own, _ageing(own.spec, params))
+    # the fault's dose is fresh, which does not undo the annealing of the device's own
+    today = _older(own, (("anneal_s", old.spec.anneal_s),))
     exposure_s = context.camera.exposure_s
 
     # defects are listed in order of birth, so the device's own come first
@@ -223,8 +225,7 @@ def _damage(params: Params, context: FaultContext) -> _Damage:
     rts = RtsPixels(**new, reference_K=old.rts.reference_K)
     signals = rts.at(device.temperature_K)
     high = upper_fraction(signals, exposure_s, params["telegraph_seed"], context.time_s)
-    more = dark_rate_e_s(old, device.temperature_K) - dark_rate_e_s(own, device.temperature_K)
-    np.maximum(more, 0, out=more)  # annealing must not remove dark current of the device itself
+    more = dark_rate_e_s(old, device.temperature_K) - dark_rate_e_s(today, device.temperature_K)
     jumps = np.zeros(device.shape, dtype=np.float32)
     np.add.at(jumps, (rts.row, rts.column), signals.amplitude_e_s * high)
     charge = np.asarray((more + jumps) * np.float32(exposure_s), dtype=np.float32)
