@@ -20,6 +20,7 @@ from vbnfault.cli.options import SceneOptions
 from vbnfault.core.errors import InputError
 from vbnfault.core.quantities import Electrons
 from vbnfault.detector import MosaicDetector, amplified, binned, load_sensor
+from vbnfault.detector.chain import Device
 from vbnfault.detector.effects.contract import parse as parse_effects
 from vbnfault.detector.mosaic import pattern
 from vbnfault.lens import load_lens, paraxial_properties
@@ -202,6 +203,18 @@ def test_binning_keeps_the_hot_pixels_of_an_area() -> None:
             for spec, side in ((sensor, 400), (sum_of, 100))
         ]
         assert counts[0] == pytest.approx(counts[1])
+
+
+def test_binning_keeps_the_telegraph_signal_of_a_pixel() -> None:
+    """One of the n² pixels has it, so that the sum has as many electrons of it."""
+    sensor = load_sensor("generic_cmos")
+    sensor = dataclasses.replace(sensor, individual=dataclasses.replace(sensor.individual, rts_fraction=0.01))
+    one, sum_of = (
+        Device(of, 3, shape=(side, side)).individual.rts.amplitude_e_s
+        for of, side in ((sensor, 128), (binned(sensor, 4), 32))
+    )
+    assert len(sum_of) == pytest.approx(len(one), rel=0.3)
+    np.testing.assert_allclose(sum_of[:100], one[:100])
 
 
 def test_a_gain_multiplies_signal_and_hot_pixels_in_dn() -> None:

@@ -79,6 +79,7 @@ def _individual(spec: IndividualSpec, n: int) -> IndividualSpec:
         dark_nonuniformity=spec.dark_nonuniformity / n,
         hot_growth=growth,
         rts_fraction=1 - (1 - spec.rts_fraction) ** n**2,
+        rts_amplitude_nA_cm2=spec.rts_amplitude_nA_cm2 / n**2,  # one of the n² pixels has the signal
         **{key: min(getattr(spec, key) * n**2, 0.1) for key in shares},
     )
 
