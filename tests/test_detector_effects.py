@@ -258,6 +258,21 @@ def test_bias_and_temperature_drift_from_exposure_to_exposure() -> None:
     assert np.std(np.log(ratios)) == pytest.approx(0.34, rel=0.4)
 
 
+def test_the_dark_current_drifts_by_the_activation_energy_of_the_file() -> None:
+    """The logarithm of a ratio of exp(-Ea/kT) is proportional to Ea, whatever the two temperatures are."""
+    plain = load_sensor("cmv4000")
+    logs = []
+    for energy_eV in (0.5, 1.0):
+        changed = dataclasses.replace(plain.individual, dark_activation_eV=energy_eV, dark_nonuniformity=0.0)
+        warm = dataclasses.replace(plain, individual=changed, temperature_drift_K=3.0)
+        device = Device(warm, 3, shape=SHAPE)
+        acting = Exposure(device=device, exposure_s=5.0, noise=noise(1), acts={})
+        added = DarkCurrent().apply(np.zeros_like(LIGHT), acting)
+        logs.append(np.log(np.median(added / device.expected_e(np.zeros_like(LIGHT), 5.0))))
+    assert abs(logs[0]) > 0.01
+    assert logs[1] == pytest.approx(2 * logs[0], rel=1e-3)
+
+
 # --- pixels that share their signal, and a response by a table, against closed forms ------------------------------
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from ..charge import passing_dark_e
-from ..dark import Telegraph, silicon_factor
+from ..dark import Telegraph
 from ..noise import poisson
 from .contract import F32, Effect, Exposure, FaultStep
 
@@ -79,13 +81,14 @@ class ChargeStep(FaultStep):
 def dark_factor(exposure: Exposure) -> float:
     """Return the dark current of an exposure over that at the sensor's mean temperature; 1 without noise.
 
-    Undamaged and damaged pixels follow the temperature by nearly the same law, so one factor serves both.
+    Damaged pixels follow the temperature by nearly the law of silicon, so the factor of undamaged ones serves both.
     """
     mean_K, drift_K = exposure.device.temperature_K, exposure.sensor.temperature_drift_K
     rng = exposure.rng("temperature") if drift_K else None
     if rng is None:
         return 1.0
-    return silicon_factor(mean_K + drift_K * float(np.clip(rng.standard_normal(), -3, 3)), mean_K)
+    spec = replace(exposure.sensor.individual, reference_K=mean_K)
+    return spec.dark_factor(mean_K + drift_K * float(np.clip(rng.standard_normal(), -3, 3)))
 
 
 def upper_fraction(
