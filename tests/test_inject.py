@@ -193,6 +193,26 @@ def test_light_that_a_sensor_saw_halves_with_its_noise(detector: str, raw: bool,
     assert after.var() == pytest.approx(variance, rel=4 * np.sqrt(2 / after.size) + 0.01)
 
 
+@pytest.mark.parametrize("detector", ["", "cmv4000"])
+@pytest.mark.usefixtures("simple_faults")
+def test_dark_sky_over_a_black_level_keeps_mean_and_noise_of_its_light(detector: str) -> None:
+    """Numbers below black and at black are noise of the readout, too.
+
+    Bounds are four standard deviations, and 0.1 e for what the sensor's model rounds.
+    """
+    gain_dn_per_e, black_dn, white_e = 0.3, 70, 13400.0
+    camera = CAMERA | {"exposure_s": 1e-3} | ({"detector": detector} if detector else {"full_well_e": white_e})
+    rng = np.random.default_rng(0)
+    electrons = rng.poisson(5, (256, 256)) + rng.normal(0, 13, (256, 256))
+    image = np.rint(black_dn + gain_dn_per_e * electrons).astype(np.uint16)
+    keys = {"black_dn": black_dn, "white_dn": black_dn + gain_dn_per_e * white_e, "raw": bool(detector)}
+    result = vbnfault.inject(image, {"test_half": {}}, camera=camera, seed=3, image_keys=keys)
+    after = (result.image.astype(float) - black_dn) / gain_dn_per_e
+    variance = 2.5 + 13**2 + 2 / 12 / gain_dn_per_e**2
+    assert after.mean() == pytest.approx(2.5, abs=0.1 + 4 * np.sqrt(variance) / 256)
+    assert after.var() == pytest.approx(variance, rel=4 * np.sqrt(2 / after.size) + 0.01)
+
+
 def test_pixels_that_no_fault_touches_keep_their_numbers() -> None:
     rng = np.random.default_rng(1)
     for dtype in (np.uint8, np.uint16, np.float32):

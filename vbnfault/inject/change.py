@@ -59,14 +59,16 @@ def struck(
             made = of(light).signal(draws, optical).merged.array
             return cv2.subtract(made, shared).reshape(shared.shape)
 
-        noise = _missing_noise(picture, change, picture.collected(after), moved, rng)
+        below = picture.seen(picture.below) if picture.below.any() else None
+        of_below: Any = 0 if below is None else picture.in_image(moved(below) - below.array)
+        noise = _missing_noise(picture, change + of_below, picture.collected(after), moved, rng)
         change, after = change + noise, after + (picture.seen(noise).array if noise.any() else 0)
     else:
-        after, change = before.array, np.zeros_like(picture.light)
+        after, change, of_below = before.array, np.zeros_like(picture.light), 0
     inside = any(acting_at(draws, step) for step in MOSAIC_STEPS)
     if inside or (optical and development.exposure.camera.detector.mosaic is not None):
         change = picture.in_image(_through_sensor(picture, development, draws, after, rng))
-    numbers = picture.with_change(change)
+    numbers = picture.with_change(change + of_below)
     on_image = bool(acting_at(draws, "rgbi"))
     if on_image:
         shown = RGBI(array=levels(numbers, picture.response))
@@ -136,6 +138,6 @@ def _through_sensor(picture: Picture, development: Development, draws: Draws, af
     room = sample(seen.white_e - seen.array, sensor.sensor.pattern)
     full = (with_it >= sensor.device.saturated_dn) & (with_it != without)
     # light that the sensor only lets through keeps its place; what the sensor makes of it beyond is interpolated
-    optical = after - picture.electrons.array
-    beyond = np.where(full, np.maximum(change, room), change) - sample(optical, sensor.sensor.pattern)
-    return optical + picture.spread(beyond)
+    passed = sample(struck_light.array - picture.electrons.array, sensor.sensor.pattern)
+    beyond = np.where(full, np.maximum(change, room), change) - passed
+    return after - picture.electrons.array + picture.spread(beyond)

@@ -28,6 +28,8 @@ _COLOURS = ("R", "G", "B")
 # The search for the light that an image shows takes so many steps at most, and ends with one that changes it by
 # less than this over white
 _STEPS, _NEAR = 8, 1e-4
+# Light of a number at a black level above 0, over white: it shows what dims it, so that it gets noise as others do
+_FAINT = np.float32(1e-9)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -40,6 +42,9 @@ class Picture:
         The image as given, [y, x] or [y, x, channel].
     light
         Light that the numbers stand for over that of white, float32[y, x, channel of the image], not below 0.
+    below
+        How far numbers lie below black, as light over that of white, float32[y, x, channel of the image], not above
+        0. It is noise, which faults dim and blur with the light.
     white_e
         Electrons at white, float32[channel of the image]. Grey images and raw mosaics have one channel, whose white
         is the full well over the gain.
@@ -57,6 +62,7 @@ class Picture:
 
     numbers: NDArray[Any]
     light: F32
+    below: F32
     white_e: F32
     response: Response
     camera: Camera
@@ -79,10 +85,12 @@ class Picture:
         top = min(response.white_dn, np.iinfo(numbers.dtype).max if numbers.dtype.kind in "ui" else np.inf)
         bottom = min(0, response.black_dn)
         lost = response.of_image(numbers, lambda n: ((n >= top) | (n <= bottom)).astype(np.uint8))
-        light = np.atleast_3d(response.of_image(numbers, response.lit))
+        shown = np.atleast_3d(response.of_image(numbers, response.shown))
+        light = np.maximum(shown, _FAINT if response.black_dn > 0 else 0)
         return cls(
             numbers=numbers,
             light=light,
+            below=np.minimum(shown, 0),
             white_e=_white_e(light.shape[2], camera),
             response=response,
             camera=camera,

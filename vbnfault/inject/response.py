@@ -63,9 +63,9 @@ class Response:
         bright = np.maximum(code, 0.04045)
         return np.where(code <= 0.04045, code / 12.92, ((bright + 0.055) / 1.055) ** 2.4)
 
-    def lit(self, numbers: ArrayLike) -> NDArray[np.float32]:
-        """Return `light` in single precision, at least 0."""
-        return np.maximum(self.light(numbers), 0).astype(np.float32)
+    def shown(self, numbers: ArrayLike) -> NDArray[np.float32]:
+        """Return `light` in single precision."""
+        return self.light(numbers).astype(np.float32)
 
     def levels(self, numbers: ArrayLike) -> NDArray[np.uint8]:
         """Return the numbers as levels of 8 bits from black to white, uint8 in their shape."""
