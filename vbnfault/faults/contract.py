@@ -26,7 +26,7 @@ from ..detector.effects import STEPS as MOSAIC_STEPS
 from ..lens import Prescription, load_lens
 from ..lens.image_frame import DEFAULT_LENS, ImageFrame
 from .context import FaultContext, Params
-from .fields import Interval, Severity, parse_field, path
+from .fields import Interval, Severity, number, parse_field, path
 from .models import register
 
 Q = TypeVar("Q", Electrons, Charge, Offset, RawMosaic, RGBI)
@@ -258,8 +258,11 @@ class Fault:
 
     @property
     def effect_level_dn(self) -> float:
-        """Return the least change of the noise-free 8 bit image, in DN, that counts for a mask by effect."""
-        return 1.0
+        """Return the least change of the noise-free 8 bit image, in DN, that counts for a mask by effect.
+
+        It is the model's key `mask_level_dn`, declared by `mask_level`, or 1.
+        """
+        return float(getattr(self, "mask_level_dn", 1.0))
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data from which `from_dict` makes an equal fault."""
@@ -302,6 +305,16 @@ class LensFault(Fault):
     def prescription(self, frame: ImageFrame) -> Prescription:
         """Return the named lens or the camera's own."""
         return frame.real_lens(self.lens).prescription
+
+
+def mask_level() -> Any:
+    """Declare the key `mask_level_dn` of a model whose mask holds the pixels that change."""
+    return number(
+        1.0,
+        limits=(0.01, 255),
+        unit="DN of 255",
+        doc="the mask holds the pixels that the noise-free image changes in by at least this much",
+    )
 
 
 def with_sensor(camera: Camera, **changes: Any) -> Camera:

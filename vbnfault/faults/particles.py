@@ -61,7 +61,7 @@ from ..core.sundisc import forward, slopes_of
 from ..detector.noise import poisson_above_0
 from ..lens.streaks import Streaks, drawn, inside, pupil_support
 from .context import FaultContext, Params
-from .contract import Fault
+from .contract import Fault, mask_level
 from .fields import Interval, bounds, flag, number
 from .planes import reaches, times
 
@@ -133,12 +133,7 @@ class _Particles(Fault):
     most_grains: int = number(
         2000, limits=(1, 20_000), integer=True, doc="in one image; of more the brightest stay"
     )
-    mask_level_dn: float = number(
-        1.0,
-        limits=(0.01, 255),
-        unit="DN of 255",
-        doc="the mask holds the pixels that the noise-free image changes in by at least this much",
-    )
+    mask_level_dn: float = mask_level()
 
     def validate(self) -> None:
         """Raise ValueError if the nearest grains are not nearer than the farthest."""
@@ -174,11 +169,6 @@ class _Particles(Fault):
         level = np.float32(params["mask_level_dn"] / 255)
         white = np.asarray(context.camera.detector.white_e, dtype=np.float32)
         return np.asarray(reaches(light.added, level * white) | (light.passes <= 1 - level))
-
-    @property
-    def effect_level_dn(self) -> float:
-        """Return `mask_level_dn`."""
-        return float(self.mask_level_dn)
 
 
 def _with_default(key: str, default: Any) -> Any:

@@ -47,8 +47,8 @@ from ..core.files.resources import data_dir
 from ..core.files.user_files import read_input
 from ..core.quantities import LUMINANCE
 from .context import FaultContext, Params
-from .contract import Fault
-from .fields import Interval, Severity, bounds, number, paths, rows
+from .contract import Fault, mask_level
+from .fields import Interval, Severity, bounds, paths, rows
 from .planes import intensity_dn, reaches
 
 # Radius of a flare's outline over half the side of its texture, as `benchmarks/flare_textures.py` draws it.
@@ -107,12 +107,7 @@ class TextureStraylight(Fault):
     glare: Interval = bounds(0, 2, limits=(0, 2), integer=True, doc="glare at the Sun: 0 none, or texture 1 or 2")
     glare_radius: Interval = bounds(0.2, 0.45, limits=(1e-3, 5), unit="image widths", doc="radius of the glare")
     glare_brightness: Interval = bounds(0.8, 1.6, limits=(0, 1000), doc="factor on the glare's texture")
-    mask_level_dn: float = number(
-        1.0,
-        limits=(0.01, 255),
-        unit="DN of 255",
-        doc="the mask holds the pixels that the noise-free image changes in by at least this much",
-    )
+    mask_level_dn: float = mask_level()
     close_textures: tuple[str, ...] = paths(
         content="texture",
         doc="your own flares near the Sun, up to ten with the far ones, in place of the packaged ones: PNG or TIFF "
@@ -124,11 +119,6 @@ class TextureStraylight(Fault):
         {"index": (1, 10), "position": (-20, 20), "radius": (1e-3, 5), "brightness": (0, 1000)},
         doc="the flares themselves, in place of a draw of count, index, position, radius and brightness",
     )
-
-    @property
-    def effect_level_dn(self) -> float:
-        """Return `mask_level_dn`."""
-        return float(self.mask_level_dn)
 
     def validate(self) -> None:
         """Raise ValueError if there are fewer textures than flares or an index is not a whole number."""

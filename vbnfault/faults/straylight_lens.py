@@ -56,7 +56,7 @@ from ..lens.straylight.total import (
     veil_per_px,
 )
 from .context import FaultContext, Params
-from .contract import LensFault
+from .contract import LensFault, mask_level
 from .fields import Interval, Severity, bounds, choice, flag, number
 from .planes import intensity_dn, reaches, sums, times
 
@@ -137,12 +137,7 @@ class _LensStraylight(LensFault):
     reflections: int = number(2, limits=(2, 4), integer=True, doc="of the ghosts: 2, or 4 for those of four too")
     baffle_length_mm: float = number(0.0, limits=(0, 1e4), unit="mm", doc="of a tube in front of the lens")
     baffle_radius_mm: float = number(0.0, limits=(0, 1e4), unit="mm", doc="of that tube")
-    mask_level_dn: float = number(
-        1.0,
-        limits=(0.01, 255),
-        unit="DN of 255",
-        doc="the mask holds the pixels that the noise-free image changes in by at least this much",
-    )
+    mask_level_dn: float = mask_level()
 
     @classmethod
     def needs_sun_with(cls, table: Mapping[str, Any]) -> bool:
@@ -222,11 +217,6 @@ class _LensStraylight(LensFault):
         """Return the intensity of the straylight, float32[y, x] in DN of 255."""
         light = context.once(self._light, params)
         return np.zeros(context.shape, np.float32) if light is None else intensity_dn(light.added, context.camera)
-
-    @property
-    def effect_level_dn(self) -> float:
-        """Return `mask_level_dn`."""
-        return float(self.mask_level_dn)
 
     def _light(self, params: Params, context: FaultContext) -> AddedLight | None:
         """Return the straylight of a sample."""

@@ -35,7 +35,7 @@ from scipy.special import ndtr
 from ..core import spectra
 from ..core.quantities import Electrons
 from .context import FaultContext, Params
-from .contract import Fault
+from .contract import Fault, mask_level
 from .fields import Interval, bounds, number
 from .planes import intensity_dn
 
@@ -71,12 +71,7 @@ class SurroundingsStraylight(Fault):
     shadow_softness: Interval = bounds(
         0.05, 0.3, limits=(1e-3, 2), unit="half diagonals", doc="standard deviation of its edge; assumed"
     )
-    mask_level_dn: float = number(
-        1.0,
-        limits=(0.01, 255),
-        unit="DN of 255",
-        doc="the mask holds the pixels that the noise-free image changes in by at least this much",
-    )
+    mask_level_dn: float = mask_level()
 
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
         """Return the reflectance for this Sun (0: no veil), its fall, and the shadow of the rim.
@@ -113,11 +108,6 @@ class SurroundingsStraylight(Fault):
     def soft(self, params: Params, context: FaultContext) -> F32:
         """Return the intensity of the veil, float32[y, x] in DN of 255."""
         return intensity_dn(context.once(_veil_e, params), context.camera)
-
-    @property
-    def effect_level_dn(self) -> float:
-        """Return `mask_level_dn`."""
-        return float(self.mask_level_dn)
 
 
 def _lit_depth(context: FaultContext) -> float:
