@@ -432,9 +432,9 @@ def test_all_scattered_flux_arrives(name: str) -> None:
 
 def test_the_table_of_dust_is_the_same_from_disk() -> None:
     """The table that the process keeps equals the one read from disk and, at some sizes, the one computed."""
-    edges, angles, kept = particles._intensities(particles.DUST_INDEX)
+    edges, angles, kept = particles._intensities()
     particles._intensities.cache_clear()
-    read = particles._intensities(particles.DUST_INDEX)[2]
+    read = particles._intensities()[2]
     assert read is not kept
     np.testing.assert_array_equal(read, kept)
     assert not read.flags.writeable

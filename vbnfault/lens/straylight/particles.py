@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -136,8 +134,8 @@ def _large(x: F64, mu: F64, index: complex) -> F64:
     return np.asarray(diffracted + size**2 * (reflected + refracted * np.exp(-4 * size * index.imag * np.cos(r))))
 
 
-@lru_cache(maxsize=4)
-def _intensities(index: complex) -> tuple[F64, F64, F64]:
+@lru_cache(maxsize=1)
+def _intensities() -> tuple[F64, F64, F64]:
     """Return the intensity at all sizes and forward angles.
 
     The result is the bin edges of the size parameter, the angles in rad, and the table float64[bin, angle]. One
@@ -148,24 +146,23 @@ def _intensities(index: complex) -> tuple[F64, F64, F64]:
     angles = np.geomspace(1e-5, np.pi / 2, _ANGLES)
 
     def computed() -> dict[str, F64]:
-        return {"intensity": scattered_intensity(np.sqrt(edges[1:] * edges[:-1]), np.cos(angles), index=index)}
+        return {"intensity": scattered_intensity(np.sqrt(edges[1:] * edges[:-1]), np.cos(angles))}
 
     here = Path(__file__)
     code = code_hash([here, here.parents[1] / "coating.py"])
-    key = hashlib.sha256(json.dumps([code, index.real, index.imag]).encode()).hexdigest()
-    table = _TABLES.kept(key, computed)["intensity"]
+    table = _TABLES.kept(code, computed)["intensity"]
     for array in (edges, angles, table):
         array.setflags(write=False)
     return edges, angles, table
 
 
 @lru_cache(maxsize=256)
-def _dust(level: float, wavelength_nm: float, index: complex) -> tuple[F64, float]:
+def _dust(level: float, wavelength_nm: float) -> tuple[F64, float]:
     """Return the intensity of a dusty surface over its irradiance, float64[angle] in 1/sr, and an integral.
 
     The integral is that of the intensity over the forward hemisphere.
     """
-    edges, angles, table = _intensities(index)
+    edges, angles, table = _intensities()
     wavelength_um = 1e-3 * wavelength_nm
     diameters = np.clip(edges * wavelength_um / np.pi, _SMALLEST_UM, max(level, _SMALLEST_UM))
     bins = -np.diff(particle_count(level, diameters)) / _CC1246_AREA_UM2
@@ -175,20 +172,18 @@ def _dust(level: float, wavelength_nm: float, index: complex) -> tuple[F64, floa
     return intensity, float(scattered)
 
 
-def particle_bsdf(
-    cleanliness_level: float, wavelength_nm: float, beta: ArrayLike, *, index: complex = DUST_INDEX
-) -> F64:
+def particle_bsdf(cleanliness_level: float, wavelength_nm: float, beta: ArrayLike) -> F64:
     """Return the forward scatter of particles on a surface, in 1/sr, float64 like `beta`; 0 for β of 1 or more.
 
     Particles are spheres with the sizes of IEST-STD-CC1246, from 1 µm to `cleanliness_level` µm. The light
     falls on them along the normal, and each particle scatters independently of the others.
     """
     level = float(cleanliness_level)
-    intensity, _ = _dust(level, float(wavelength_nm), index)
+    intensity, _ = _dust(level, float(wavelength_nm))
     b = np.abs(np.asarray(beta, dtype=np.float64))
     if level <= _SMALLEST_UM:
         return np.zeros(b.shape)
-    angles = _intensities(index)[1]
+    angles = _intensities()[1]
     angle = np.arcsin(np.clip(b, np.sin(angles[0]), 1))
     scattered = np.exp(np.interp(np.log(angle), np.log(angles), np.log(intensity)))
     # radiance is intensity over cosine; beyond 84° a mean cosine of the outermost ring conserves the flux
@@ -196,8 +191,6 @@ def particle_bsdf(
     return np.where(b < 1, scattered / cosine, 0.0)
 
 
-def particle_scatter_fraction(
-    cleanliness_level: float, wavelength_nm: float, *, index: complex = DUST_INDEX
-) -> float:
+def particle_scatter_fraction(cleanliness_level: float, wavelength_nm: float) -> float:
     """Return the fraction of light that the particles of `particle_bsdf` scatter forwards."""
-    return _dust(float(cleanliness_level), float(wavelength_nm), index)[1]
+    return _dust(float(cleanliness_level), float(wavelength_nm))[1]
