@@ -152,7 +152,7 @@ def build_patch(body: Body, site: Site, spec: PatchSpec) -> Patch:
 def _with_scarps(body: Body, site: Site, model: Surface, limit: EdgeLimit, spec: PatchSpec) -> Surface:
     """Return points, normals and faces of the model, refined as far as its scarps need, with `spec.scarps`."""
     edge_m = mean_edge_m(body.vertices_m, body.faces)
-    finest_m = scarps.finest_facet_m(edge_m)
+    finest_m = scarps.FINEST * edge_m
     if not spec.scarps or spec.regolith is not None or limit.facet_m > scarps.COARSEST * edge_m:
         return model
     if limit.facet_m < finest_m:

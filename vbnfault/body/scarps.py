@@ -29,7 +29,7 @@ from .roughness import smoothed
 # Lengths in mean edges of the model: smoothing that leaves the ground on which heights are measured, smoothing that
 # tells crests from hollows, and neighbourhood of the local roughness
 _GROUND_EDGES, _CREST_EDGES, _AROUND_EDGES = 2.5, 0.7, 1.5
-_FINEST = 0.1  # facets in which scarps are made, in mean edges; finer ones would only cost time
+FINEST = 0.1  # facets in which scarps are made, in mean edges; finer ones would only cost time
 COARSEST = 0.25  # facets, in mean edges, that cannot show scarps
 _REACH = 0.5  # distance in mean edges over which a scarp gathers its slope
 _SURE = 0.3  # of the median curvature: beyond it, ground is wholly crest or hollow
@@ -125,11 +125,11 @@ def gathered(points: Float64, faces: Int32, where: Form, wander: Float64, edge_m
     off = points[there] - points[here]
     rise = 0.5 * np.einsum("ni,ni->n", off, where.up[here] + where.up[there])
     length = np.sqrt(np.einsum("ni,ni->n", off, off))
-    step = _STEP * np.minimum(np.minimum.reduceat(length, first), _FINEST * edge_m)
+    step = _STEP * np.minimum(np.minimum.reduceat(length, first), FINEST * edge_m)
     sure = np.tanh((where.crest + wander) / _SURE)
     grows, sinks = np.maximum(sure, 0), np.maximum(-sure, 0)
     raised = np.zeros(len(points))
-    for _ in range(round(_REACH / (_STEP * _FINEST))):
+    for _ in range(round(_REACH / (_STEP * FINEST))):
         slope = (rise + raised[there] - raised[here]) / length
         raised += step * grows * np.maximum(np.maximum.reduceat(slope, first), 0)
         raised += step * sinks * np.minimum(np.minimum.reduceat(slope, first), 0)
@@ -143,11 +143,6 @@ def wander(points_T_m: Float64, edge_m: float, seed: int) -> Float64:
         part = field.gradient(edges * edge_m, noise_key(seed, _STREAM + k), len(points_T_m))
         total += deviation / GRADIENT_STD * part
     return total
-
-
-def finest_facet_m(edge_m: float) -> float:
-    """Return the size of the facets in which scarps are made, for a model with this mean edge."""
-    return _FINEST * edge_m
 
 
 def _joined(faces: Int32, count: int) -> scipy.sparse.csr_matrix:

@@ -189,16 +189,12 @@ def pixel_sums(
     if blur_px > _SHARP_PX:  # defocus spreads each point of the Sun over a circle: fill it with points
         count = int(np.clip(16 * (1 + blur_px / max(radius_px, 0.5)) ** 2, 16, 1024))
         shifts = blur_px * sunflower(count)
-    total: F64 | None = None
     frame = np.array(shape[::-1])
     low = np.clip(np.floor(bounds[0] + shifts.min(axis=0)), 0, frame).astype(int)
     high = np.clip(np.ceil(bounds[1] + shifts.max(axis=0)), 0, frame).astype(int)
     if (high <= low).any():
         return None
-    for shift in shifts:
-        sums = _sums(disc, projection, bounds, shift, (low, high), profiles, gain)
-        total = sums if total is None else total + sums
-    assert total is not None
+    total = np.asarray(sum(_sums(disc, projection, bounds, shift, (low, high), profiles, gain) for shift in shifts))
     if not total.any():
         return None
     return PixelSums(slice(low[1], high[1]), slice(low[0], high[0]), total / len(shifts))

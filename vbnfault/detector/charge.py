@@ -76,12 +76,11 @@ def smear(
         np.add(above, here, out=total)
     every = (passed[-1] + rate[-1]) * np.float32(early)
 
-    def step(rows: slice) -> None:
+    for start in range(0, len(rate), ROWS_PER_BLOCK):
+        rows = slice(start, start + ROWS_PER_BLOCK)
         cv2.addWeighted(rate[rows], exposure_s - early, passed[rows], late - early, 0.0, dst=passed[rows])
         if early:
             passed[rows] += every
-
-    by_rows(step, len(rate))
     return _facing(passed, direction, back=True)
 
 
@@ -503,12 +502,6 @@ def remembered(step: Callable[..., F32]) -> Callable[..., F32]:
         return step(array, **options)
 
     return lambda signal_e, **options: made(_Plane(signal_e), **options).copy()
-
-
-def by_rows(step: Callable[[slice], None], height: int) -> None:
-    """Call `step` for each block of rows of a plane, which fits the cache."""
-    for start in range(0, height, ROWS_PER_BLOCK):
-        step(slice(start, min(start + ROWS_PER_BLOCK, height)))
 
 
 def _facing(image: F32, direction: str, *, back: bool = False) -> F32:

@@ -190,13 +190,10 @@ class MosaicDetector(Detector):
     @property
     def device(self) -> Device:
         """Return the simulated device, which is cached."""
-        return _device(self.sensor, self.seed, (self.height_px, self.width_px), self.direction)
+        return _device(self.sensor, self.seed, shape=(self.height_px, self.width_px), direction=self.direction)
 
 
-@lru_cache(maxsize=6)  # a device of another readout takes 2 MB for 1024 pixels (`chain._maps`)
-def _device(sensor: Sensor, seed: int, shape: tuple[int, int], direction: str) -> Device:
-    """Return a device from the cache, or make it."""
-    return Device(sensor, seed, shape=shape, direction=direction)
+_device = lru_cache(maxsize=6)(Device)  # one of another readout takes 2 MB for 1024 pixels (`chain._maps`)
 
 
 def _plain_sensor(sensor: Sensor) -> dict[str, Any]:

@@ -34,7 +34,7 @@ from ..core.quantities import DEAD, HOT, RTS, RTS_HIGH, STUCK
 from ..detector.charge import passing_dark_e
 from ..detector.effects.electrons import upper_fraction
 from ..detector.effects.output import show_stuck
-from ..detector.individual import Individual, IndividualSpec, RtsPixels, StuckPixels, aged, dark_rate_e_s, offset_e
+from ..detector.individual import IndividualSpec, RtsPixels, StuckPixels, aged, dark_rate_e_s, offset_e
 from .context import FaultContext, Params
 from .contract import Fault
 from .fields import Interval, Severity, bounds, number
@@ -214,9 +214,9 @@ def _damage(params: Params, context: FaultContext) -> _Damage:
     detector = context.camera.mosaic
     device = detector.device
     own = device.drawn  # what was measured does not age
-    old = _older(own, _ageing(own.spec, params))
+    old = _older(own, **_ageing(own.spec, params))
     # the fault's dose is fresh, which does not undo the annealing of the device's own
-    today = _older(own, (("anneal_s", old.spec.anneal_s),))
+    today = _older(own, anneal_s=old.spec.anneal_s)
     exposure_s = context.camera.exposure_s
 
     # defects are listed in order of birth, so the device's own come first
@@ -255,13 +255,10 @@ def _damage(params: Params, context: FaultContext) -> _Damage:
     )
 
 
-@lru_cache(maxsize=4)
-def _older(own: Individual, changes: tuple[tuple[str, Any], ...]) -> Individual:
-    """Return the device with the changed age and dose, computed once."""
-    return aged(own, **dict(changes))
+_older = lru_cache(maxsize=4)(aged)
 
 
-def _ageing(own: IndividualSpec, params: Params) -> tuple[tuple[str, Any], ...]:
+def _ageing(own: IndividualSpec, params: Params) -> dict[str, Any]:
     """Return the changed specification of the device. Only the added years grow by `growth_factor`."""
     growth, factor, years = own.hot_growth, params["growth_factor"], params["years"]
     total = min(own.years + years, _OLDEST_YR)
@@ -270,12 +267,12 @@ def _ageing(own: IndividualSpec, params: Params) -> tuple[tuple[str, Any], ...]:
     added = factor * years / total if total > 0 else 0.0
     if growth is not None:
         growth = replace(growth, log10_scale=growth.log10_scale + float(np.log10(more)))
-    return (
-        ("years", total),
-        ("dose_TeV_g", own.dose_TeV_g + params["dose_TeV_g"]),
-        ("anneal_s", params["anneal_days"] * 86400.0),
-        ("hot_growth", growth),
-        ("hot_clustered_fraction", params["clustered_share"]),
-        ("dead_fraction_yr", min(own.dead_fraction_yr + params["dead_per_year"] * added, _MOST_A_YEAR)),
-        ("stuck_fraction_yr", min(own.stuck_fraction_yr + params["stuck_per_year"] * added, _MOST_A_YEAR)),
-    )
+    return {
+        "years": total,
+        "dose_TeV_g": own.dose_TeV_g + params["dose_TeV_g"],
+        "anneal_s": params["anneal_days"] * 86400.0,
+        "hot_growth": growth,
+        "hot_clustered_fraction": params["clustered_share"],
+        "dead_fraction_yr": min(own.dead_fraction_yr + params["dead_per_year"] * added, _MOST_A_YEAR),
+        "stuck_fraction_yr": min(own.stuck_fraction_yr + params["stuck_per_year"] * added, _MOST_A_YEAR),
+    }

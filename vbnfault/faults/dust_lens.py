@@ -313,7 +313,7 @@ def _windows(
     at_x, at_y = footprints.centre_mm * footprints.cos, footprints.centre_mm * footprints.sin
     # distance from a node to the farthest position that has it as its nearest node
     apart = sum(float(np.hypot(np.diff(at_x, axis=a), np.diff(at_y, axis=a)).max(initial=0)) for a in (0, 1))
-    reach = footprint.largest_mm + grains.radius_mm + 0.55 * apart
+    reach = float(footprint.rim_mm.max()) + grains.radius_mm + 0.55 * apart
     grain_x, grain_y, square = (v.astype(np.float32)[:, None, None] for v in (grains.x_mm, grains.y_mm, reach**2))
     near: Any = (at_x - grain_x) ** 2 + (at_y - grain_y) ** 2 < square
     near &= footprints.area_mm2 > 0

@@ -27,9 +27,9 @@ from .fields import Interval, Severity, bounds, number
 
 
 @lru_cache(maxsize=8)
-def _mean_falloff(shape: tuple[int, int], focal_length_px: float) -> float:
-    """Return the mean over the frame of cos⁴θ behind a thin lens."""
-    return float(natural_falloff(None, shape, focal_length_px).mean(dtype=np.float64))
+def _mean_falloff(calibration: Calibration | None, shape: tuple[int, int], focal_length_px: float) -> float:
+    """Return the mean over the frame of the falloff behind a thin lens, cos⁴θ without a calibration."""
+    return float(natural_falloff(calibration, shape, focal_length_px).mean(dtype=np.float64))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,7 +48,8 @@ class Cos4Vignetting(Fault):
         low=255.0,
         high=2.0,
         drawn=lambda params, shape, focal_length_px: (
-            params["on_axis_illuminance_dn"] * (params.get("mean_falloff") or _mean_falloff(shape, focal_length_px))
+            params["on_axis_illuminance_dn"]
+            * (params.get("mean_falloff") or _mean_falloff(None, shape, focal_length_px))
         ),
     )
     localised = False
@@ -68,10 +69,11 @@ class Cos4Vignetting(Fault):
 
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:
         """Return E0, the least loss of the pixels in the mask, and a calibrated frame's mean falloff."""
-        e0 = self.on_axis_illuminance_dn.uniform(rng)
+        e0, camera = self.on_axis_illuminance_dn.uniform(rng), context.camera
+        mean = _mean_falloff(camera.lens.calibration, context.shape, camera.focal_length_px)
         if self.frame_illuminance_dn is not None:
-            e0 = min(self.frame_illuminance_dn / _mean(context), 255.0)
-        of_calibration = {} if context.camera.lens.calibration is None else {"mean_falloff": _mean(context)}
+            e0 = min(self.frame_illuminance_dn / mean, 255.0)
+        of_calibration = {} if camera.lens.calibration is None else {"mean_falloff": mean}
         return {"on_axis_illuminance_dn": e0, "mask_loss": float(self.mask_loss), **of_calibration}
 
     def apply(self, quantity: Any, params: Params, context: FaultContext) -> Any:
@@ -91,19 +93,8 @@ class Cos4Vignetting(Fault):
 
     def soft(self, params: Params, context: FaultContext) -> NDArray[np.float32]:
         """Return the factor on the light, float32[y, x]."""
-        e0 = np.float32(params["on_axis_illuminance_dn"] / 255)
-        return e0 * _falloff(context)
-
-
-def _falloff(context: FaultContext) -> NDArray[np.float32]:
-    """Return the falloff of the sample's thin lens, cos⁴θ without a calibration, float32[y, x]."""
-    camera = context.camera
-    return natural_falloff(camera.lens.calibration, context.shape, camera.focal_length_px)
-
-
-def _mean(context: FaultContext) -> float:
-    """Return the mean over the frame of the falloff of the sample's thin lens."""
-    return float(_falloff(context).mean(dtype=np.float64))
+        e0, camera = np.float32(params["on_axis_illuminance_dn"] / 255), context.camera
+        return e0 * natural_falloff(camera.lens.calibration, context.shape, camera.focal_length_px)
 
 
 @lru_cache(maxsize=2)

@@ -220,11 +220,6 @@ class Footprint:
             table=self,
         )
 
-    @property
-    def largest_mm(self) -> float:
-        """Return the largest distance of a rim from its middle."""
-        return float(self.rim_mm.max())
-
     @cached_property
     def rims_mm(self) -> F32:
         """Return `rim_mm` in single precision."""

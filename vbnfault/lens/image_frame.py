@@ -122,7 +122,4 @@ def _with_changes(lens: RealLens, changes: tuple[Change, ...]) -> RealLens:
     return replace(lens, prescription=changed(lens.prescription, changes))
 
 
-@lru_cache(maxsize=8)
-def _coated(lens: Prescription, coating: str) -> Prescription:
-    """Return the lens with a named coating on every surface between glass and air."""
-    return lens.coated(coating)
+_coated = lru_cache(maxsize=8)(Prescription.coated)

@@ -360,17 +360,13 @@ class RealLens:
         return self._beams.select(self._beams.area_mm2 > 0)
 
     @cached_property
-    def _zones(self) -> FieldBundles:
-        """Return the bundles of rays whose spots set the best focus: lit ones from the axis to the corner."""
-        return self._lit_beams.select(self._lit_beams.slope <= 1.1 * self._corner)
-
-    @cached_property
     def _best_shift_mm(self) -> float:
         """Return the distance from the paraxial focus to the smallest mean square radius of all spots.
 
-        Each spot counts with the light that its zone of the frame receives.
+        Each spot, of the lit ones from the axis to the corner, counts with the light that its zone of the frame
+        receives.
         """
-        beams, lens = self._zones, self._round
+        beams, lens = self._lit_beams.select(self._lit_beams.slope <= 1.1 * self._corner), self._round
         optics = paraxial_properties(lens)
         spots = spot_diagrams(lens, beams, D_NM, optics.bfd_mm)
         position, slope = spots.centred(spots.position_mm), spots.centred(spots.slope)

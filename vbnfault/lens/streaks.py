@@ -311,11 +311,5 @@ def _outlines(beams: Beams) -> tuple[F64, F64]:
     middle = 2 * (rims**3 * np.cos(turn)).sum(axis=1) / np.maximum(3 * (rims**2).sum(axis=1), 1e-300)
     x = x - middle[:, None]
     radius, angle = np.hypot(x, y), np.mod(np.arctan2(y, x), 2 * np.pi)
-    about = [np.interp(turn, *_sorted(a, r), period=2 * np.pi) for a, r in zip(angle, radius, strict=True)]
-    return np.stack(about), turn
-
-
-def _sorted(angle: F64, radius: F64) -> tuple[F64, F64]:
-    """Return both arrays in the order of the angle."""
-    order = np.argsort(angle)
-    return angle[order], radius[order]
+    # `np.interp` sorts the angles of a periodic function
+    return np.stack([np.interp(turn, a, r, period=2 * np.pi) for a, r in zip(angle, radius, strict=True)]), turn

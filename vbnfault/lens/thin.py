@@ -76,12 +76,13 @@ class ThinLens:
     @property
     def figures(self) -> dict[str, str | float]:
         """Return name, focal length, f-number, transmission, and a sentence `summary` for people."""
+        calibrated = "" if self.calibration is None else f", calibrated by the model {self.calibration.model}"
         return {
             "name": self.name,
             "efl_mm": self.focal_length_mm,
             "f_number": self.f_number,
             "transmission": self.transmission,
-            "summary": f"{self.name} of {self.focal_length_mm:.4g} mm, f/{self.f_number:.3g}{self._calibrated}",
+            "summary": f"{self.name} of {self.focal_length_mm:.4g} mm, f/{self.f_number:.3g}{calibrated}",
         }
 
     @property
@@ -102,11 +103,6 @@ class ThinLens:
         if self.calibration is None or self.calibration.foreshortens:
             return area
         return np.asarray(area * np.sqrt(1 + np.square(slope)))
-
-    @property
-    def _calibrated(self) -> str:
-        """Return the clause of a summary that names the model of the calibration."""
-        return "" if self.calibration is None else f", calibrated by the model {self.calibration.model}"
 
     @property
     def distortion(self) -> F64:
@@ -142,7 +138,8 @@ class ThinLens:
 
     def on_axis(self, radiance: Radiance) -> Irradiance:
         """Return the irradiance of radiance of any shape, which does not depend on the position in the image."""
-        return Irradiance(array=radiance.array * self._solid_angle, wavelength_nm=radiance.wavelength_nm)
+        solid_angle_sr = np.float32(np.pi * self.transmission / (4 * self.f_number**2))
+        return Irradiance(array=radiance.array * solid_angle_sr, wavelength_nm=radiance.wavelength_nm)
 
     def on_frame(self, radiance: Radiance) -> Radiance:
         """Return the radiance itself: the image has the grid of the render."""
@@ -164,11 +161,6 @@ class ThinLens:
         if self.halo is None:
             return sharp
         return replace(sharp, array=np.asarray(self.halo.applied(sharp.array, self.pixel_rad)))
-
-    @property
-    def _solid_angle(self) -> np.float32:
-        """Return irradiance over radiance, π T / (4 N²)."""
-        return np.float32(np.pi * self.transmission / (4 * self.f_number**2))
 
     def image_of_sun(self, radiance: Radiance, pixel_pitch_um: float) -> Irradiance:
         """Return the irradiance of the Sun's direct image, π T L cos⁴θ / (4 N²), per band.
@@ -326,13 +318,9 @@ def _moffat(scale_px: float, index: float, shape: tuple[int, int]) -> F64:
     inside = (np.arange(_FINE) + 0.5) / _FINE - 0.5
     fine = profile(*((np.arange(size)[:, None] + inside).ravel() for size in near))
     out[: near[0], : near[1]] = fine.reshape(near[0], _FINE, near[1], _FINE).mean(axis=(1, 3))
-    return out / _both_signs(out).sum()
-
-
-def _both_signs(quadrant: F64) -> F64:
-    """Return a quadrant of a point spread weighted by how many pixels have each of its offsets."""
-    weights = [np.where((np.arange(n) == 0) | (np.arange(n) == n - 1), 1.0, 2.0) for n in quadrant.shape]
-    return np.asarray(quadrant * weights[0][:, None] * weights[1])
+    # how many pixels have each of the offsets
+    weights = [np.where((np.arange(n) == 0) | (np.arange(n) == n - 1), 1.0, 2.0) for n in out.shape]
+    return out / (out * weights[0][:, None] * weights[1]).sum()
 
 
 def _gaussian(sigma_px: float, size: int) -> F64:
