@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ import vbnfault
 from vbnfault import cli
 from vbnfault.core.errors import InputError
 from vbnfault.fit import passport as fit_passport
+from vbnfault.fit import two_samples
 from vbnfault.fit.frames import look, read_frame
 from vbnfault.fit.replay import Replay
 from vbnfault.fit.stars import encircled_radii
@@ -35,6 +37,20 @@ SMALL = {
 FRAMES = 8
 
 
+@pytest.fixture(scope="module", autouse=True)
+def few_trees() -> Iterator[None]:
+    """A forest of a tenth of the trees tells what these tests need; its accuracy is another file's subject."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(two_samples, "_TREES", 30)
+        yield
+
+
+@pytest.fixture
+def no_page(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spare a test the page, which takes longer than the frames."""
+    monkeypatch.setattr(fit_passport, "_write_page", lambda *_: None)
+
+
 @pytest.fixture(scope="module")
 def frames(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Frames of the scene itself, with the noise, tracks and grains of another seed, half the camera's size."""
@@ -48,8 +64,7 @@ def frames(tmp_path_factory: pytest.TempPathFactory) -> Path:
         writer = csv.DictWriter(file, COLUMNS)
         writer.writeheader()
         writer.writerows(table)
-    scene = vbnfault.load_scene("rosetta67p", SMALL)
-    replay = Replay(scene, load_trajectory(str(folder / "poses.csv")))
+    replay = Replay(vbnfault.load_scene("rosetta67p", SMALL), load_trajectory(str(folder / "poses.csv")))
     # other sensors' noise on the same ground: the seed of the ground stays
     for k in range(FRAMES):
         raw = replay.session.simulate(k).layers["raw"]
@@ -59,6 +74,12 @@ def frames(tmp_path_factory: pytest.TempPathFactory) -> Path:
             replay.display.developed(np.clip(raw + np.rint(0.3 * rng.normal(size=raw.shape)), 0, 4095), 2),
         )
     return folder
+
+
+@pytest.fixture(scope="module")
+def replay(frames: Path) -> Replay:
+    """Return what renders images for the frames."""
+    return Replay(vbnfault.load_scene("rosetta67p", SMALL), load_trajectory(str(frames / "poses.csv")))
 
 
 @pytest.fixture(scope="module")
@@ -85,6 +106,7 @@ def test_frames_of_the_scene_itself_agree_with_it(result: tuple[dict[str, Any], 
     assert "://" not in page  # nothing from elsewhere; pictures in base 64 have no colon
 
 
+@pytest.mark.usefixtures("no_page")
 def test_a_blurred_scene_is_found_out(frames: Path, tmp_path: Path) -> None:
     """A pixel of the frames is 1.36 mrad wide; a core of two pixels takes most of the power below four pixels."""
     blurred = SMALL | {"camera.point_spread.core_urad": 2700.0}
@@ -103,7 +125,8 @@ def test_the_command_keeps_frames_back_and_continues(
     sets = [word for key, value in SMALL.items() for word in ("--set", f"{key}={json.dumps(value)}")]
     command = ["passport", str(frames), "--scene", "rosetta67p", "--out", str(tmp_path / "out"), *sets]
     command += ["--kept-back", "0.6", "--mend-poses", "1", "--gain", "1", "--gain", "1.4", "--threads", "2"]
-    command += ["--poses", str(frames / "poses.csv")]
+    command += ["--poses", str(frames / "poses.csv"), "--workers", "1"]
+    monkeypatch.setattr(fit_passport, "_write_page", lambda *_: None)  # the last command writes it
     shown = CliRunner().invoke(cli.app, [*command, "--part", "shown"], catch_exceptions=False)
     assert shown.exit_code == 0
     assert "may not: frames on which settings were chosen flatter the scene" in shown.output
@@ -114,6 +137,7 @@ def test_the_command_keeps_frames_back_and_continues(
     monkeypatch.undo()
     judged = CliRunner().invoke(cli.app, [*command, "--part", "kept_back"], catch_exceptions=False)
     assert "flatter" not in judged.output
+    assert (tmp_path / "out/passport.html").is_file()
     second = json.loads((tmp_path / "out/passport.json").read_text())["frames"]
     assert set(first).isdisjoint(second)
     assert len(first) + len(second) == FRAMES
@@ -145,6 +169,7 @@ def test_wrong_frames_are_refused_before_anything_is_rendered(frames: Path, tmp_
         assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.usefixtures("no_page")
 def test_a_pair_that_is_damaged_or_gone_is_rendered_again(
     frames: Path, tmp_path: Path, result: tuple[dict[str, Any], Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -164,6 +189,7 @@ def test_a_pair_that_is_damaged_or_gone_is_rendered_again(
     assert json.dumps(again["statistics"]) == json.dumps(found["statistics"])  # NaN differs from itself
 
 
+@pytest.mark.usefixtures("no_page")
 def test_processes_give_the_pairs_that_one_gives(
     frames: Path, tmp_path: Path, result: tuple[dict[str, Any], Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -240,7 +266,9 @@ def test_what_may_be_concluded_follows_from_the_whole_interval(
 
 
 @pytest.mark.parametrize("f_number", [1.5, 1.0])
-def test_a_frame_of_a_short_exposure_is_replayed_with_its_smear(frames: Path, f_number: float) -> None:
+def test_a_frame_of_a_short_exposure_is_replayed_with_its_smear(
+    frames: Path, replay: Replay, f_number: float
+) -> None:
     """A wider stop and no attenuator: the exposure is as many times shorter as there is more light.
 
     At f/1.0 the smear passes for a part of the body, so that only the frame's own body tells how strong it is.
@@ -250,20 +278,19 @@ def test_a_frame_of_a_short_exposure_is_replayed_with_its_smear(frames: Path, f_
     short = Replay(vbnfault.load_scene("rosetta67p", open_stop), table)
     frame = short.display.developed(short.session.simulate(2).layers["raw"], 2)
     assert look(frame).smeared
-    pair = Replay(vbnfault.load_scene("rosetta67p", SMALL), table).pair(2, frame)
+    pair = replay.pair(2, frame)
     assert pair.settings["transmission"] == pytest.approx((5.1 / f_number) ** 2, rel=0.1)
     assert pair.rendered.smeared
     assert pair.figures["iou"] > 0.98
 
 
-def test_lost_columns_are_no_smear(frames: Path) -> None:
+def test_lost_columns_are_no_smear(frames: Path, replay: Replay) -> None:
     """Grey columns have backgrounds of their own, and say nothing of the exposure."""
     frame = read_frame(frames, "frame_2")
     middle = int(np.flatnonzero(look(frame).lit.any(axis=0)).mean())
     frame[:, middle - 6 : middle : 3] = 40
     assert look(frame).smeared
-    scene = vbnfault.load_scene("rosetta67p", SMALL)
-    assert "transmission" not in Replay(scene, load_trajectory(str(frames / "poses.csv"))).pair(2, frame).settings
+    assert "transmission" not in replay.pair(2, frame).settings
 
 
 # --- stars ------------------------------------------------------------------------------------------------------
