@@ -279,6 +279,14 @@ def test_a_cluster_that_ends_is_one_sentence(
     monkeypatch.setattr(dask, "_SECONDS_BETWEEN_CHECKS", 0.01)
     if event == "workers leave":  # a scheduler that closes may lose its workers first
         monkeypatch.setattr(dask, "_SECONDS_WITHOUT_WORKERS", 0.0)
+    connect = distributed.Client._ensure_connected
+
+    async def connected(client: Any, timeout: float | None = None) -> None:
+        if (tmp_path / "happened").exists():
+            raise ImportError("the client closes at once, where it else tries again for a minute")
+        await connect(client, timeout)
+
+    monkeypatch.setattr(distributed.Client, "_ensure_connected", connected)
     out = tmp_path / "s.zarr"
     with (
         dask_config.set({"distributed.comm.timeouts.connect": "300s"}),
