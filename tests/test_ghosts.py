@@ -202,7 +202,7 @@ def test_paraxial_rays_are_the_limit_of_a_small_stop_and_angle() -> None:
         small = replace(lens, surfaces=tuple(surfaces))
         angle = 2.0 * share
         traced = {g.pair: g for g in traced_ghosts(small, angle, across=160)}
-        first = {g.pair: g for g in paraxial_ghosts(small, angle)}
+        first = {g.pair: g for g in paraxial_ghosts(small, angle, across=160)}
         pairs = [p for p in first if p in traced]
         assert len(pairs) > 60
         apart = [
@@ -261,7 +261,7 @@ def test_a_picture_holds_the_flux_of_its_ghosts(kind: str, worst: float) -> None
     told = (
         {g.pair: g for g in traced_ghosts(lens, 6.0, azimuth_deg=40.0, across=192)}
         if kind == "traced"
-        else {g.pair: g for g in paraxial_ghosts(lens, 6.0, azimuth_deg=40.0)}
+        else {g.pair: g for g in paraxial_ghosts(lens, 6.0, azimuth_deg=40.0, across=192)}
     )
     axis = (np.arange(2 * half) + 0.5 - half) * pitch
     rays, arrivals = boxes(made._tracer, 6.0)

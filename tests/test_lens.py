@@ -451,7 +451,7 @@ def test_paraxial_ghosts_are_the_limit_of_exact_ones(name: str) -> None:
     pupil = np.pi / 4 * paraxial_properties(small).entrance_pupil_diameter_mm ** 2
     slope = np.tan(np.radians(angle))
     compared = 0
-    for found in paraxial_ghosts(small, angle):
+    for found in paraxial_ghosts(small, angle, across=256):
         path = ghost(small, *found.pair)
         _, met = along(small, path)
         rims = np.array([small.surfaces[row].semi_diameter_mm for row, _ in path])
