@@ -92,7 +92,8 @@ def test_frames_never_train_and_test_at_once() -> None:
     assert 0.2 < mean < 0.8
 
 
-def test_the_benchmark_writes_figures_of_both_kinds(tmp_path: Path) -> None:
+def test_the_benchmark_writes_figures_of_both_kinds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(two_samples, "_TREES", 10)
     for name, (real, rendered) in enumerate(pairs(blur_px=0.6)[:4]):
         cv2.imwrite(str(tmp_path / f"{name}_real.png"), real)
         cv2.imwrite(str(tmp_path / f"{name}_rendered.png"), rendered)
@@ -104,7 +105,9 @@ def test_the_benchmark_writes_figures_of_both_kinds(tmp_path: Path) -> None:
     assert {f"{kind}, all features" for kind in two_samples.kinds()} <= set(figures["sky"])
 
 
-def test_draws_are_those_of_the_seeds_that_follow() -> None:
+def test_draws_are_those_of_the_seeds_that_follow(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(two_samples, "_TREES", 10)
+    monkeypatch.setattr(two_samples, "PLACES", ("body",))
     keys = {"size": SIZE, "count": 3, "splits": 2}
     both = two_samples.two_sample_test(pairs(blur_px=0.6), draws=2, seed=5, **keys)[0]  # type: ignore[arg-type]
     drawn = [two_samples.told(looks(blur_px=0.6), "body", seed=seed, **keys) for seed in (5, 6)]

@@ -223,7 +223,7 @@ def test_the_preset_of_every_body_renders(name: str) -> None:
             "title": "t",
             "dataset": {"samples": 1, "sites": 1, "layers": ["depth_m"]},
             "body": {"name": name},
-            "patch": {"facet_m": 2.0, "radius_m": 60.0, "max_triangles": 400_000},
+            "patch": {"facet_m": 3.0, "radius_m": 40.0, "max_triangles": 400_000},
             "camera": {"width_px": 48, "height_px": 48},
             "geometry": {"height_m": [150.0, 160.0], "min_lit_fraction": 0.5},
         },
