@@ -41,7 +41,7 @@ TERRAIN = {
     "patch.facet_m": 12.0,
     "patch.radius_m": 60.0,
     "patch.min_boulder_m": 6.0,
-    "patch.max_triangles": 100_000,
+    "patch.max_triangles": 40_000,
 }
 LONGEST_PX = 64
 SAMPLES_OF_PAGES = {

@@ -19,6 +19,7 @@ from typer.testing import CliRunner
 
 import vbnfault
 from vbnfault import cli
+from vbnfault.core import figures
 from vbnfault.core.errors import InputError
 from vbnfault.fit import passport as fit_passport
 from vbnfault.fit import two_samples
@@ -39,9 +40,10 @@ FRAMES = 8
 
 @pytest.fixture(scope="module", autouse=True)
 def few_trees() -> Iterator[None]:
-    """A forest of a tenth of the trees tells what these tests need; its accuracy is another file's subject."""
+    """A forest of few trees, and figures of a roomy size, tell what these tests need; other files test both."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(two_samples, "_TREES", 30)
+        patch.setattr(figures, "_fit", lambda figure, *_: figure.set_layout_engine("none"))
         yield
 
 

@@ -407,7 +407,8 @@ def test_a_fixed_exposure_is_kept_and_scales_the_signal() -> None:
 
 
 def test_the_paper_example_has_the_papers_parameters() -> None:
-    shrink = {"camera.width_px": 256, "camera.height_px": 256, "patch.facet_m": 8.0}
+    shrink = {"camera.width_px": 256, "camera.height_px": 256}
+    shrink |= {"patch.facet_m": 12.0, "patch.radius_m": 60.0, "patch.max_triangles": 100_000}
     s = Session(config.load_scene("paper_example", shrink))
     parameters = to_sample(s.frame(0)).scalars["parameters"]
     assert len(parameters["dust_on_optics"]["x_px"]) == 50

@@ -409,6 +409,7 @@ def write_box(path: Path, low: tuple[float, ...], high: tuple[float, ...]) -> st
 def test_a_model_that_hides_the_whole_frame_is_named(tmp_path: Path, low: Any, high: Any, flown: bool) -> None:
     """By a build and a description before anything is rendered, and by a sample, with bounds and with poses."""
     table = {"spacecraft": {"model": write_box(tmp_path / "box.obj", low, high)}, "dataset": {"samples": 1}}
+    table["patch"] = {"facet_m": 12.0, "radius_m": 60.0, "boulders": False, "max_triangles": 60_000}
     scene = parse_scene({"title": "t", "camera": {"fov_deg": 60.0}, **table}, source="t.toml")
     poses = columns_of([row("a", (9e3, 0.0, 0.0), (1.0, 0.0, 0.0))]) if flown else None
     for act in (Session.warn_of_doubts, lambda session: session.simulate(0)):
