@@ -267,7 +267,7 @@ def test_points_on_an_edge_with_and_without_slivers(tmp_path: Path, points: int,
 def test_a_corner_of_one_face_beside_its_vertex_is_closed_or_refused() -> None:
     """The hole between both is filled with slivers, which may share their three corners with faces beyond them."""
     vertices, faces = ball(2.0)
-    for face, corner in itertools.product(range(0, len(faces), 4), range(3)):
+    for face, corner in itertools.product(range(len(faces)), range(3)):
         for away in ([1e-9, 0, 0], [1e-37, 0, 0]):
             moved = np.vstack([vertices, vertices[faces[face, corner]] + away])
             apart = faces.copy()
