@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from pathlib import Path
 
@@ -129,3 +130,28 @@ def test_each_kind_tells_blurred_patches_and_no_equal_ones() -> None:
 def test_too_few_frames_are_refused() -> None:
     with pytest.raises(InputError, match="3 frames: a classifier needs at least 4"):
         two_samples.two_sample_test(pairs(blur_px=0.0)[:3])
+
+
+def test_the_shift_says_which_setting_brings_images_nearer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Rendered noise is blurred by 0.8 px, then by 0.6 px, then not at all, as the real one.
+
+    With n = 128 patches of each class and p = 73 features, equal classes differ by d² = 2 p / n = 1.1 by chance.
+    """
+    import passport_shift
+
+    for name, size in (("SIZE_PX", SIZE), ("COUNT", 8), ("DRAWS", 2), ("HALVES", 4)):
+        monkeypatch.setattr(passport_shift, name, size)
+    folders = []
+    for blur_px in (0.8, 0.6, 0.0):
+        folders.append(tmp_path / f"blur_{blur_px}")
+        folders[-1].mkdir()
+        for k, (real, rendered) in enumerate(pairs(blur_px=blur_px)):
+            cv2.imwrite(str(folders[-1] / f"{k}_real.png"), real)
+            cv2.imwrite(str(folders[-1] / f"{k}_rendered.png"), rendered)
+    monkeypatch.setattr(sys, "argv", ["passport_shift.py", *map(str, folders)])
+    passport_shift.main()
+    base, less, none, _ = (float(d) for d in re.findall(r": d ([0-9.]+)(?:,| with)", capsys.readouterr().out))
+    assert base > less > 5
+    assert none < 1.5

@@ -260,9 +260,9 @@ class Fault:
     def effect_level_dn(self) -> float:
         """Return the least change of the noise-free 8 bit image, in DN, that counts for a mask by effect.
 
-        It is the model's key `mask_level_dn`, declared by `mask_level`, or 1.
+        It is the key `mask_level_dn` of a model whose mask is one by effect (`mask_level`), or 1.
         """
-        return float(getattr(self, "mask_level_dn", 1.0))
+        return float(getattr(self, "mask_level_dn", 1.0)) if self.effect_mask else 1.0
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data from which `from_dict` makes an equal fault."""
