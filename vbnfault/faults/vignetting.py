@@ -28,7 +28,7 @@ from .fields import Interval, Severity, bounds, number
 
 @lru_cache(maxsize=8)
 def _mean_falloff(calibration: Calibration | None, shape: tuple[int, int], focal_length_px: float) -> float:
-    """Return the mean over the frame of the falloff behind a thin lens, cos⁴θ without a calibration."""
+    """Return the mean over the frame of a thin lens's falloff, which is cos⁴θ without a calibration."""
     return float(natural_falloff(calibration, shape, focal_length_px).mean(dtype=np.float64))
 
 

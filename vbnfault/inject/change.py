@@ -60,15 +60,16 @@ def struck(
             return cv2.subtract(made, shared).reshape(shared.shape)
 
         below = picture.seen(picture.below) if picture.below.any() else None
-        of_below: Any = 0 if below is None else picture.in_image(moved(below) - below.array)
-        noise = _missing_noise(picture, change + of_below, picture.collected(after), moved, rng)
+        of_below = None if below is None else picture.in_image(moved(below) - below.array)
+        seen = change if of_below is None else change + of_below
+        noise = _missing_noise(picture, seen, picture.collected(after), moved, rng)
         change, after = change + noise, after + (picture.seen(noise).array if noise.any() else 0)
     else:
-        after, change, of_below = before.array, np.zeros_like(picture.light), 0
+        after, change, of_below = before.array, np.zeros_like(picture.light), None
     inside = any(acting_at(draws, step) for step in MOSAIC_STEPS)
     if inside or (optical and development.exposure.camera.detector.mosaic is not None):
         change = picture.in_image(_through_sensor(picture, development, draws, after, rng))
-    numbers = picture.with_change(change + of_below)
+    numbers = picture.with_change(change if of_below is None else change + of_below)
     on_image = bool(acting_at(draws, "rgbi"))
     if on_image:
         shown = RGBI(array=levels(numbers, picture.response))

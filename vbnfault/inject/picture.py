@@ -28,7 +28,8 @@ _COLOURS = ("R", "G", "B")
 # The search for the light that an image shows takes so many steps at most, and ends with one that changes it by
 # less than this over white
 _STEPS, _NEAR = 8, 1e-4
-# Light of a number at a black level above 0, over white: it shows what dims it, so that it gets noise as others do
+# Where black lies above 0, each number stands for at least this light over white. A fault that dims it changes it,
+# so that a pixel at black gets the noise of that fault, too.
 _FAINT = np.float32(1e-9)
 
 

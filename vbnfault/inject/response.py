@@ -64,7 +64,7 @@ class Response:
         return np.where(code <= 0.04045, code / 12.92, ((bright + 0.055) / 1.055) ** 2.4)
 
     def shown(self, numbers: ArrayLike) -> NDArray[np.float32]:
-        """Return `light` in single precision."""
+        """Return the light of numbers, float32 in their shape, as `light` does: below 0 for numbers below black."""
         return self.light(numbers).astype(np.float32)
 
     def levels(self, numbers: ArrayLike) -> NDArray[np.uint8]:

@@ -288,7 +288,7 @@ class Store:
             ) from None
 
     def drawn(self, samples: Iterable[int] | NDArray[np.int64]) -> Iterator[dict[str, Any]]:
-        """Yield what was drawn for each fault of samples, by class. Raises VbnfaultError, as `read` and `table`."""
+        """Yield the drawn parameters of each sample, by fault. Raises VbnfaultError, as `read` and `table` do."""
         texts = self.read("parameters")
         return (self.table(int(i), "parameters", texts[i]) for i in samples)
 

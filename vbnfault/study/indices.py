@@ -324,7 +324,7 @@ def half_widths(indices: xr.Dataset) -> xr.DataArray:
 
 
 def needed_samples(n: int, reached: float, asked: float) -> int:
-    """Return the n, a power of two, that should reach a half-width, if `n` reached another one.
+    """Return how many samples, a power of two, should reach a half-width, if `n` samples reached another one.
 
     Half-widths shrink as 1 / √n, or faster where surrogates get better with more samples.
     """

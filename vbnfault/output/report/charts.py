@@ -156,7 +156,7 @@ def _limits(values: F64, bounds: Sequence[tuple[float, float]], logarithmic: boo
 
 
 def bin_edges(values: F64, low: float, high: float, logarithmic: bool) -> F64:
-    """Return the edges of the bins. Few values have fewer; bins of whole numbers hold equally many of these."""
+    """Return the edges of the bins. Few values get fewer bins; bins of whole numbers cover equally many of them."""
     bins = max(6, min(_BINS, round(2 * math.sqrt(len(values)))))
     if logarithmic:
         return np.geomspace(low, high, bins + 1)
