@@ -20,6 +20,7 @@ from vbnfault import store as st
 from vbnfault.core.errors import InputError, VbnfaultError
 from vbnfault.output.contact_sheet import COLOURS
 from vbnfault.output.export import export_store
+from vbnfault.output.export.formats.video import _film
 
 FILES = ("train/{}/0_approach.mp4", "val/{}/1_still.mp4", "test/{}/2_leave_night_day.mp4")
 FIRST = (0, FRAMES[0], FRAMES[0] + FRAMES[1])
@@ -64,6 +65,18 @@ def test_films_hold_the_frames_in_order_at_their_times(data: st.Store, exported:
         seconds = data.read("time_s", first, first + count)
         np.testing.assert_allclose(times, seconds - seconds[0], atol=1e-4)
         assert rate == (1 / Fraction(str(STEP_S)) if count > 1 else 1)
+
+
+def test_four_pixels_share_the_mean_of_their_colours(tmp_path: Path) -> None:
+    """A red pixel counts as much in whichever of the four it is; rounding changes their mean by at most 3 DN."""
+    image = np.full((32, 32, 3), 60, np.uint8)
+    image[8, 8] = image[8, 17] = image[17, 24] = image[25, 25] = (255, 60, 60)
+    with _film(tmp_path / "red.mp4", Fraction(1)) as add:
+        add(image)
+    shown, *_ = frames(tmp_path / "red.mp4")
+    for y, x in ((8, 8), (8, 16), (16, 24), (24, 24)):
+        of_four = shown[0, y : y + 2, x : x + 2].astype(float).mean(axis=(0, 1))
+        np.testing.assert_allclose(of_four, (60 + 195 / 4, 60, 60), atol=3)
 
 
 def test_masks_have_the_colours_of_the_contact_sheet(data: st.Store, exported: Path, tmp_path: Path) -> None:

@@ -41,7 +41,8 @@ class Video(Format):
     - NUMBER and NAME are index and name of the sequence; characters other than letters, digits, points and hyphens
       become `_`.
     - H.264 holds even numbers of columns and rows: an odd last one is repeated. It is a codec with loss, of about
-      1 DN, and halves the resolution of colours: measure on the store, or on the format `png`.
+      1 DN in brightness, and four pixels share the mean of their colours: measure on the store, or on the format
+      `png`.
     - Frames are evenly spaced. `time_s` and `frame` of each are in `samples.jsonl`.
     """
 
@@ -125,6 +126,16 @@ def _drawn(spec: StoreSpec, sample: Sample) -> U8:
     return contact_sheet.tile(spec, sample, names, side_px)
 
 
+def _yuv420(rgb: U8) -> U8:
+    """Return an image uint8[y, x, RGB] of even sides as planes: brightness, and colour at half the resolution."""
+    height, width = rgb.shape[:2]
+    # OpenCV takes the colour of the first of four pixels, which would lose coloured defects or make them larger
+    means = cv2.resize(rgb, (width // 2, height // 2), interpolation=cv2.INTER_AREA)
+    planes = cv2.cvtColor(rgb, cv2.COLOR_RGB2YUV_I420)
+    planes[height:] = cv2.cvtColor(means.repeat(2, 0).repeat(2, 1), cv2.COLOR_RGB2YUV_I420)[height:]
+    return np.asarray(planes, np.uint8)
+
+
 @contextmanager
 def _film(path: Path, rate: Fraction) -> Iterator[Callable[[U8], None]]:
     """Begin a film and yield what adds a frame, uint8[y, x, RGB]; equal frames give equal bytes."""
@@ -140,7 +151,7 @@ def _film(path: Path, rate: Fraction) -> Iterator[Callable[[U8], None]]:
         def add(rgb: U8) -> None:
             height, width = rgb.shape[:2]
             even = np.pad(rgb, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
-            frame = av.VideoFrame.from_ndarray(cv2.cvtColor(even, cv2.COLOR_RGB2YUV_I420), format="yuv420p")
+            frame = av.VideoFrame.from_ndarray(_yuv420(even), format="yuv420p")
             if not codec.is_open:
                 codec.width, codec.height = frame.width, frame.height
             frame.pts, frame.time_base = next(frames), 1 / rate
