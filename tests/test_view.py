@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import http.client
 import json
 import os
@@ -461,6 +462,43 @@ def test_one_sample_by_mouse_and_by_keys(page: Page, served: Served) -> None:
     assert all(
         u.startswith((served.viewer.url, "blob:", "data:", "about:")) for u in page.requests if "file:" not in u
     )
+
+
+@needs_browser
+def test_the_pointer_names_defects_and_reads_a_render_with_a_guard_band(page: Page, tmp_path: Path) -> None:
+    """A render of 12 rows and 10 columns more than the frame begins 6 rows and 5 columns outside of it."""
+    spec = make_spec(layers=("defects", "scene_radiance"), rendered_shape=(36, 42))
+    sample = fake_sample(spec, 0)
+    defects = np.zeros((spec.height, spec.width), np.uint8)
+    defects[7, 9], defects[8, 9] = 1, 8 | 16
+    scene = np.arange(3 * 36 * 42, dtype=np.float16).reshape(3, 36, 42) % 2048
+    store = st.create(tmp_path / "s.zarr", spec, 1)
+    layers = {**sample.layers, "defects": defects, "scene_radiance": scene}
+    st.write_samples(store, [dataclasses.replace(sample, layers=layers)])
+    with contextlib.closing(Served(store)) as served:
+        ready(page, served)
+        page.evaluate("location.hash = '#0'")
+
+        def pointed(layer: str, x: int, y: int) -> str:
+            page.click(f"[data-layer={layer}]")
+            page.wait(f"window.vbnfault.view.pixels?.layer.name === '{layer}'")
+            return str(
+                page.evaluate(f"""(() => {{
+              const canvas = document.getElementById("canvas"), box = canvas.getBoundingClientRect();
+              const zoom = 0.97 * Math.min(box.width / {spec.width}, box.height / {spec.height});
+              const clientX = box.x + box.width / 2 + ({x} + 0.5 - {spec.width / 2}) * zoom;
+              const clientY = box.y + box.height / 2 + ({y} + 0.5 - {spec.height / 2}) * zoom;
+              canvas.dispatchEvent(new PointerEvent("pointermove", {{ clientX, clientY }}));
+              return document.getElementById("probe").textContent;
+            }})()""")
+            )
+
+        assert pointed("defects", 9, 7).split(":")[1].split() == ["hot"]
+        assert pointed("defects", 9, 8).split(":")[1].split() == ["rts", "rts_high"]
+        assert pointed("defects", 9, 9).split(":")[1].split() == ["none"]
+        shown = pointed("scene_radiance", 4, 3).replace("\u202f", "").split(":")[1].split()[:3]
+        assert [float(value) for value in shown] == scene[:, 9, 9].tolist()
+        assert page.errors == []
 
 
 @needs_browser

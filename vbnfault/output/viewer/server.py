@@ -174,6 +174,7 @@ class Viewer:
                     "units": row.units,
                     "about": row.long_name,
                     "names": list(SEMANTIC) if name == "semantic" else list(row.names),
+                    "bits": row.bits,
                 }
                 for name, row in spec.pixel_layers.items()
             ],

@@ -1,5 +1,5 @@
 // Read layers of a sample, which the server decodes, and paint them into canvases.
-const SEMANTIC = [[24, 26, 32], [176, 164, 148], [240, 228, 66], [86, 200, 255]];
+const CLASSES = [[24, 26, 32], [176, 164, 148], [240, 228, 66], [86, 200, 255]];
 // viridis (van der Walt and Smith 2015) at nine places, dark to bright
 const VIRIDIS = [[68, 1, 84], [71, 44, 122], [59, 81, 139], [44, 113, 142], [33, 144, 141], [39, 173, 129], [92, 200, 99], [170, 220, 50], [253, 231, 37]];
 const WIDE = { uint8: Uint8Array, bool: Uint8Array, uint16: Uint16Array, float32: Float32Array, float64: Float64Array };
@@ -56,9 +56,15 @@ export function rooted(canvas) {
   return out;
 }
 
+// Return rows and columns of a layer.
+export const sizeOf = (layer, shape) => (layer.dims[0] === "band" || layer.dims[0] === "fault" ? shape.slice(1, 3) : shape.slice(0, 2));
+
+// Return the name of a value of a layer of classes, or the names of its bits.
+export const nameOf = (layer, value) => (layer.bits ? layer.names.filter((_, k) => (value >> k) & 1).join(" ") || "none" : layer.names[value] ?? value);
+
 // Return a canvas of a layer, {low, high, units} or {names} for its legend, and whether it is an image of the camera.
 export function paint(layer, { data, shape }) {
-  const [height, width] = layer.dims[0] === "band" || layer.dims[0] === "fault" ? shape.slice(1, 3) : shape;
+  const [height, width] = sizeOf(layer, shape);
   const canvas = canvasOf(width, height);
   const context = canvas.getContext("2d");
   const image = context.createImageData(width, height);
@@ -82,14 +88,18 @@ export function paint(layer, { data, shape }) {
     }
     legend = { note: "red right, green up, blue towards the camera" };
   } else if (layer.names.length) {
-    const used = new Set(data);
+    // a value of several bits has the colour of the lowest one
+    const names = layer.bits ? ["none", ...layer.names] : layer.names;
+    const classOf = (value) => (layer.bits && value ? 32 - Math.clz32(value & -value) : value);
+    const colours = names.map((_, k) => CLASSES[k % 4].map((value) => value * (k > 3 ? 0.7 : 1)));
+    const used = new Set();
     for (let k = 0; k < count; k++) {
-      const colour = SEMANTIC[data[k] % 4];
-      const bright = data[k] > 3 ? 0.7 : 1;
-      for (let c = 0; c < 3; c++) out[4 * k + c] = colour[c] * bright;
+      const of = classOf(data[k]), colour = colours[of] ?? CLASSES[0];
+      used.add(of);
+      for (let c = 0; c < 3; c++) out[4 * k + c] = colour[c];
       out[4 * k + 3] = 255;
     }
-    legend = { names: layer.names.map((name, k) => [name, SEMANTIC[k % 4], used.has(k)]).filter((entry) => entry[2]) };
+    legend = { names: names.map((name, k) => [name, colours[k], used.has(k)]).filter((entry) => entry[2]) };
   } else if (layer.dims[0] === "band") {
     const bands = shape[0], chosen = [Math.round(0.75 * (bands - 1)), Math.round(0.5 * (bands - 1)), Math.round(0.2 * (bands - 1))];
     const { high } = range(data.subarray(chosen[1] * count, (chosen[1] + 1) * count), 1);

@@ -1,7 +1,7 @@
 // The page of `vbnfault view`: a grid of small images that scrolls any number of samples, and one sample at full size.
 import { $, coloured, grouped, make, words } from "/elements.js";
 import { player } from "/film.js";
-import { difference, paint, paintMasks, ramp, read, rooted } from "/layers.js";
+import { difference, nameOf, paint, paintMasks, ramp, read, rooted, sizeOf } from "/layers.js";
 
 const NOT_KNOWN = 255, GAP = 10, CAPTION = 26, MOST_PX = 2e7; // browsers cannot scroll elements of more than 3.3e7 px
 const about = await (await fetch("/api/store")).json();
@@ -437,7 +437,8 @@ function redraw() {
   context.imageSmoothingEnabled = zoom < 2;
   context.imageSmoothingQuality = "high";
   if (brighter && typeof view.root === "function") view.root = view.root(); // made once, when it is first asked for
-  context.drawImage((brighter && view.root) || view.base, 0, 0, about.width, about.height);
+  const { width, height } = view.base; // those of the render with its guard band are greater than those of the frame
+  context.drawImage((brighter && view.root) || view.base, (about.width - width) / 2, (about.height - height) / 2);
   view.masks.forEach((mask, k) => { if (mask && !view.hidden.has(k)) context.drawImage(mask.canvas, 0, 0); });
 }
 
@@ -591,12 +592,13 @@ canvas.addEventListener("pointermove", (event) => {
   }
   const [x, y] = pixelAt(event);
   if (!view.pixels || x < 0 || y < 0 || x >= about.width || y >= about.height) { $("probe").textContent = ""; return; }
-  const { data, shape, layer } = view.pixels, at = y * about.width + x;
+  const { data, shape, layer } = view.pixels, [height, width] = sizeOf(layer, shape);
+  const at = (y + (height - about.height) / 2) * width + x + (width - about.width) / 2;
   const channels = layer.dims[0] === "band" ? null : shape[2] ?? 1;
-  const values = channels === null ? [...Array(shape[0]).keys()].map((b) => data[b * about.width * about.height + at]) : [...data.subarray(at * channels, (at + 1) * channels)];
-  const named = layer.names.length ? values.map((v) => layer.names[v] ?? v) : values.map((v) => (Number.isFinite(v) ? short(Number(v)) : "–"));
+  const values = channels === null ? [...Array(shape[0]).keys()].map((b) => data[b * width * height + at]) : [...data.subarray(at * channels, (at + 1) * channels)];
+  const said = values.map((v) => (layer.names.length ? nameOf(layer, v) : Number.isFinite(v) ? short(Number(v)) : "–"));
   const masks = view.masks.flatMap((mask, k) => (mask && !view.hidden.has(k) && mask.canvas.getContext("2d").getImageData(x, y, 1, 1).data[3] ? [words(about.faults[k].name)] : []));
-  $("probe").textContent = `x ${x}, y ${y}: ${named.join(" ")} ${layer.units === "1" ? "" : layer.units}${masks.length ? ` · ${masks.join(", ")}` : ""}`;
+  $("probe").textContent = `x ${x}, y ${y}: ${said.join(" ")} ${layer.units === "1" ? "" : layer.units}${masks.length ? ` · ${masks.join(", ")}` : ""}`;
 });
 canvas.addEventListener("wheel", (event) => {
   event.preventDefault();
