@@ -6,19 +6,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import trimesh
 from poses_kit import columns_of, row
 
 FRAMES = (3, 1, 5)
 NAMES = ("approach", "still", "leave")
 SCENE = """
 title = "frames"
+body.shape = "body.obj"
 faults.dust_on_optics.model = "defocused"
 faults.cosmic_rays.flux_per_cm2_s = 3000.0
 camera = {detector = "generic_ccd", width_px = 64, height_px = 48, fov_deg = 40.0, exposure_s = 0.02}
 plan.faulty_fraction = 1.0
 plan.classes_per_sample = [2, 2]
 render = {bands = 2, samples_per_pixel = 1}
-patch = {facet_m = 10.0, radius_m = 40.0, boulders = false, max_triangles = 60_000}
+patch = {facet_m = 10.0, radius_m = 40.0, boulders = false, max_triangles = 20_000}
 dataset = {shard_samples = 2, seed = 3}
 trajectory.file = "poses.csv"
 """
@@ -45,9 +47,15 @@ def write(path: Path, table: dict[str, list[Any]]) -> Path:
     return path
 
 
-def write_scene(folder: Path) -> Path:
-    """Write the scene and its table of poses into a folder, and return the path of the scene."""
-    write(folder / "poses.csv", columns())
+def write_scene(folder: Path, text: str = SCENE, table: dict[str, list[Any]] | None = None) -> Path:
+    """Write a scene, its table of poses and its body into a folder, and return the path of the scene.
+
+    The body has the length and the volume of 67P, and 1280 facets: the packaged shape has 36,000, which would take
+    most of the time.
+    """
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    ball.apply_scale([2500.0, 1336.0, 1336.0]).export(folder / "body.obj")
+    write(folder / "poses.csv", table or columns())
     path = folder / "scene.toml"
-    path.write_text(SCENE)
+    path.write_text(text)
     return path

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from frames_kit import EVENTS, FRAMES, SCENE, columns, write
+from frames_kit import EVENTS, FRAMES, SCENE, write_scene
 
 import vbnfault
 from vbnfault.detect.prediction import Prediction
@@ -122,10 +122,8 @@ class Always:
 
 
 def test_a_store_of_sequences_is_scored_in_time(tmp_path: Path) -> None:
-    write(tmp_path / "poses.csv", columns())
-    (tmp_path / "scene.toml").write_text(SCENE + EVENTS)
     store = tmp_path / "s.zarr"
-    vbnfault.build(tmp_path / "scene.toml", store, progress=False)
+    vbnfault.build(write_scene(tmp_path, SCENE + EVENTS), store, progress=False)
     result = score(Always(), store, tmp_path / "score", ScoreOptions(split=ALL, navigation=False))
     listed = vbnfault.events(store)
     time = result["time"]

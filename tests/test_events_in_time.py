@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import pytest
 from conftest import Called
-from frames_kit import EVENTS, FRAMES, NAMES, SCENE, columns, write, write_scene
+from frames_kit import EVENTS, FRAMES, NAMES, columns, write, write_scene
 from poses_kit import columns_of, row
 
 import vbnfault
@@ -147,13 +147,12 @@ def test_every_fault_changes_the_frames_of_its_event_and_no_other(tmp_path: Path
         "camera.width_px": 40,
         "camera.height_px": 40,
         "camera.exposure_s": 0.04,  # so long that some pixels are full, as blooming needs
-        "patch.max_triangles": 20_000,
         "dataset.shard_samples": 4,
         "event": [
             {"cause": f"cause of {fault}", "faults": [fault], "onset_s": 1.0, "duration_s": 2.0} for fault in chosen
         ],
     }
-    (tmp_path / "scene.toml").write_text(SCENE)
+    path = write_scene(tmp_path)
     order, fault_of = dataset_order(chosen), [""] * len(chosen)
     for _ in range(2):  # which sequence has which class does not depend on the Suns, but these on the classes
         suns = [SUN_AHEAD if fault == "straylight" else SUN_BEHIND for fault in fault_of]
@@ -161,7 +160,7 @@ def test_every_fault_changes_the_frames_of_its_event_and_no_other(tmp_path: Path
         names, time_s = [f"s{k}" for k in range(len(suns))], [0.0, 1.0, 2.0, 3.0] * len(suns)
         table = {**columns_of(poses), "sequence": np.repeat(names, 4).tolist(), "time_s": time_s}
         write(tmp_path / "poses.csv", table)
-        scene = config.load_scene(tmp_path / "scene.toml", keys)
+        scene = config.load_scene(path, keys)
         planned = vbnfault.Session(scene).plan.injected
         fault_of = [order[k] for k in planned[::4].argmax(axis=1)]
     out = tmp_path / "s.zarr"

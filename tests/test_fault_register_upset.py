@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from frames_kit import FRAMES, SCENE, columns, write
+from frames_kit import FRAMES, SCENE, write_scene
 from numpy.typing import NDArray
 from test_faults_kit import make, make_context, noisy, rng, with_mosaic
 
@@ -108,10 +108,8 @@ def test_readout_in_the_opposite_order_mirrors() -> None:
 
 def scene_in(folder: Path) -> Path:
     """Nine frames; no device or image has anything but light, noise and the faults that a test names."""
-    write(folder / "poses.csv", columns())
     text = re.sub(r"(?m)^faults.*\n|^plan.classes.*\n", "", SCENE).replace("generic_ccd", "generic_cmos")
-    (folder / "scene.toml").write_text(text.replace("0.02}", "0.006}"))
-    return folder / "scene.toml"
+    return write_scene(folder, text.replace("0.02}", "0.006}"))
 
 
 @pytest.fixture

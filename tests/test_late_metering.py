@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import recorded_calls
-from frames_kit import FRAMES, SCENE, columns, write
+from frames_kit import FRAMES, columns, write_scene
 from poses_kit import columns_of, row
 
 import vbnfault
@@ -30,9 +30,7 @@ def write_poses(folder: Path, angles_deg: tuple[float, ...] = ANGLES_DEG) -> Pat
     angle = np.radians(angles_deg)
     places = zip(3e3 * np.sin(angle), 3e3 * np.cos(angle), strict=True)
     poses = [row(f"{k}", (x, y, 300.0), (0, 1, 0)) for k, (x, y) in enumerate(places)]
-    write(folder / "poses.csv", {**columns(), **columns_of(poses)})
-    (folder / "scene.toml").write_text(SCENE)
-    return folder / "scene.toml"
+    return write_scene(folder, table={**columns(), **columns_of(poses)})
 
 
 @pytest.fixture

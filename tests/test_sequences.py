@@ -28,6 +28,14 @@ def scene(tmp_path: Path) -> Path:
     return write_scene(tmp_path)
 
 
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the path of the scene's finished store, which no test changes."""
+    folder = tmp_path_factory.mktemp("built")
+    vbnfault.build(write_scene(folder), folder / "s.zarr", progress=False)
+    return folder / "s.zarr"
+
+
 # --- tables -------------------------------------------------------------------------------------------------------
 
 
@@ -147,7 +155,9 @@ def test_a_plan_keeps_sequences_whole(scene: Path) -> None:
         plan.make_plan(loaded.model_copy(update={"trajectory": short}), ["dust_on_optics"])
 
 
-def test_frames_share_the_instrument_and_not_what_happens_in_an_exposure(scene: Path, tmp_path: Path) -> None:
+def test_frames_share_the_instrument_and_not_what_happens_in_an_exposure(
+    scene: Path, built: Path, tmp_path: Path
+) -> None:
     out = tmp_path / "s.zarr"
     assert vbnfault.build(scene, out, samples=4, progress=False).built == 4  # ends within the last sequence
     assert vbnfault.build(scene, out, samples=4, append=5, progress=False).built == 5
@@ -166,9 +176,7 @@ def test_frames_share_the_instrument_and_not_what_happens_in_an_exposure(scene: 
     assert "null" not in dust + rays
     assert len(set(rays)) == 9
     assert len({image.tobytes() for image in images}) == 9
-    single = tmp_path / "single.zarr"
-    vbnfault.build(scene, single, progress=False)
-    with vbnfault.open_dataset(single) as data:
+    with vbnfault.open_dataset(built) as data:
         assert [json.dumps(json.loads(text).get("dust_on_optics")) for text in data["parameters"].values] == dust
         np.testing.assert_array_equal(data["image"].values[:4], images[:4])
     np.testing.assert_array_equal(vbnfault.simulate(scene, 8).layers["image"], images[8])
@@ -228,12 +236,12 @@ def test_telegraph_pixels_blink_from_frame_to_frame(scene: Path, tmp_path: Path,
     np.testing.assert_array_equal(taken.layers["defects"], defects[2])
 
 
-def test_a_frozen_frame_is_the_frame_before_bit_for_bit(scene: Path, tmp_path: Path) -> None:
+def test_a_frozen_frame_is_the_frame_before_bit_for_bit(scene: Path, built: Path, tmp_path: Path) -> None:
     """Beside it, dust and rays strike; without the class, the scene has the same dust, rays and noise."""
     frozen = {"faults.frozen_frame": {"model": "repeated", "rows_fraction": 0.4, "shift_px": 160.0}}
     struck = config.load_scene(scene, {**frozen, "plan.classes_per_sample": [3, 3]})
-    plain = vbnfault.Session(config.load_scene(scene))
-    images = [plain.simulate(k).layers["image"] for k in range(9)]
+    with vbnfault.open_dataset(built) as data:
+        images = data["image"].values
     out = tmp_path / "s.zarr"
     vbnfault.build(struck, out, progress=False, workers=2)
     with vbnfault.open_dataset(out) as data:
@@ -297,14 +305,12 @@ def test_charge_of_the_frame_before_is_released_in_the_next(scene: Path, tmp_pat
     assert session.frame(0).injection.draws["persistence"].params["source"] in ("frame", "sun")
 
 
-def test_readers_give_the_columns_of_sequences(scene: Path, tmp_path: Path) -> None:
+def test_readers_give_the_columns_of_sequences(built: Path) -> None:
     from vbnfault.store import open_store
     from vbnfault.train import Columns
 
-    out = tmp_path / "s.zarr"
-    vbnfault.build(scene, out, samples=4, progress=False)
-    table = Columns(open_store(out))
-    assert table["frame"].tolist() == [0, 1, 2, 0]
+    table = Columns(open_store(built))
+    assert table["frame"].tolist() == [0, 1, 2, 0, 0, 1, 2, 3, 4]
     assert {"sequence", "frame", "time_s"} <= set(table)
 
 
@@ -332,13 +338,11 @@ def test_frames_of_a_loop_are_those_of_a_table(scene: Path, monkeypatch: pytest.
     assert bright.scalars["injected"].sum() == 1
 
 
-def test_windows_are_frames_that_follow_each_other(scene: Path, tmp_path: Path) -> None:
+def test_windows_are_frames_that_follow_each_other(built: Path) -> None:
     torch = pytest.importorskip("torch", reason="PyTorch is not installed: pip install '.[torch]'")
     from vbnfault.torch import SampleDataset, WindowDataset
 
-    out = tmp_path / "s.zarr"
-    vbnfault.build(scene, out, progress=False)
-    data = SampleDataset(str(out), None, ["time_s", "masks"])
+    data = SampleDataset(str(built), None, ["time_s", "masks"])
     windows = WindowDataset(data, 2)
     assert [window["sample"].tolist() for window in windows] == [[k, k + 1] for k in (0, 1, 4, 5, 6, 7)]
     for window in windows:
@@ -350,7 +354,7 @@ def test_windows_are_frames_that_follow_each_other(scene: Path, tmp_path: Path) 
     assert [w["sample"].tolist() for w in WindowDataset(data, 2, step=2)] == [[0, 1], [4, 5], [6, 7]]
     batches = list(torch.utils.data.DataLoader(WindowDataset(data, 3, step=2), batch_size=2))
     assert [batch["sample"].tolist() for batch in batches] == [[[0, 1, 2], [4, 5, 6]], [[6, 7, 8]]]
-    without = SampleDataset(str(out), None, where=lambda columns: columns["frame"] != 1)
+    without = SampleDataset(str(built), None, where=lambda columns: columns["frame"] != 1)
     assert [w["sample"].tolist() for w in WindowDataset(without, 2)] == [[6, 7], [7, 8]]  # no gap inside
     brighter = WindowDataset(data, 5, transform=lambda window: int(window["image"].max()))
     assert list(brighter) == [int(max(data[k]["image"].max() for k in range(4, 9)))]
@@ -362,18 +366,17 @@ def test_windows_are_frames_that_follow_each_other(scene: Path, tmp_path: Path) 
         with pytest.raises(InputError, match=sentence):
             WindowDataset(data, **options)
     with pytest.raises(InputError, match="changes each frame by itself"):
-        WindowDataset(SampleDataset(str(out), transform=dict), 2)
+        WindowDataset(SampleDataset(str(built), transform=dict), 2)
 
 
-def test_a_contact_sheet_has_film_strips(scene: Path, tmp_path: Path) -> None:
+def test_a_contact_sheet_has_film_strips(built: Path, tmp_path: Path) -> None:
     """Two of three sequences, the first and the last, a row each: tiles of 320 px, with gaps of 14 px."""
     import cv2
 
     from vbnfault.output import contact_sheet
 
-    out, sheet = tmp_path / "s.zarr", tmp_path / "sheet.png"
-    vbnfault.build(scene, out, progress=False)
-    assert contact_sheet.preview(out, sheet) == 3 + 5
+    sheet = tmp_path / "sheet.png"
+    assert contact_sheet.preview(built, sheet) == 3 + 5
     picture = cv2.imread(str(sheet))
     assert picture.shape[1] == 14 + 5 * (320 + 14)
     rows = picture.shape[0] - 14 - 2 * (240 + 46 + 14)
@@ -382,7 +385,7 @@ def test_a_contact_sheet_has_film_strips(scene: Path, tmp_path: Path) -> None:
     first = picture[-2 * (240 + 46 + 14) : -(240 + 46 + 14), :, 0]
     beyond = slice(14 + 3 * 334, None)  # the first strip has three frames
     assert np.ptp(first[:, beyond]) == 0 < np.ptp(second[:, beyond])
-    assert contact_sheet.preview(out, sheet, max_samples=1) == 1
+    assert contact_sheet.preview(built, sheet, max_samples=1) == 1
 
 
 def test_the_description_counts_sequences(scene: Path) -> None:
