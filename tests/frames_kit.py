@@ -47,14 +47,21 @@ def write(path: Path, table: dict[str, list[Any]]) -> Path:
     return path
 
 
-def write_scene(folder: Path, text: str = SCENE, table: dict[str, list[Any]] | None = None) -> Path:
-    """Write a scene, its table of poses and its body into a folder, and return the path of the scene.
+def write_body(folder: Path, subdivisions: int = 3, relief: float = 0.0) -> Path:
+    """Write an ellipsoid of the length and the volume of 67P into a folder, and return its path.
 
-    The body has the length and the volume of 67P, and 1280 facets: the packaged shape has 36,000, which would take
-    most of the time.
+    It has 1280 facets: the packaged shape has 36,000, which would take most of the time of a test. `relief` is the
+    standard deviation of the radii of its vertices over their mean.
     """
-    ball = trimesh.creation.icosphere(subdivisions=3)
+    ball = trimesh.creation.icosphere(subdivisions=subdivisions)
+    ball.vertices *= 1 + relief * np.random.default_rng(0).normal(size=(len(ball.vertices), 1))
     ball.apply_scale([2500.0, 1336.0, 1336.0]).export(folder / "body.obj")
+    return folder / "body.obj"
+
+
+def write_scene(folder: Path, text: str = SCENE, table: dict[str, list[Any]] | None = None) -> Path:
+    """Write a scene, its table of poses and its body into a folder, and return the path of the scene."""
+    write_body(folder)
     write(folder / "poses.csv", table or columns())
     path = folder / "scene.toml"
     path.write_text(text)
