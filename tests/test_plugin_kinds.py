@@ -8,11 +8,13 @@ import pickle
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
-from test_plugins import GLINT, nothing_stays_loaded, plugin, run, scene_file
+from conftest import Called
+from test_plugins import GLINT, nothing_stays_loaded, plugin, scene_file
 
 from vbnfault import dataset, faults, pipeline, reflectance, testing
 from vbnfault.core.errors import InputError
@@ -107,17 +109,17 @@ def test_a_detector_effect_behind_an_unknown_one_is_refused(tmp_path: Path) -> N
     config.load_scene(scene_file(tmp_path, faults=""))
 
 
-def test_a_sensor_with_an_effect_of_a_plugin_is_characterised(tmp_path: Path) -> None:
+def test_a_sensor_with_an_effect_of_a_plugin_is_characterised(tmp_path: Path, call: Callable[..., Called]) -> None:
     path, sensor, out = plugin(tmp_path, GROUND, "my_ground.py"), tmp_path / "mine.toml", tmp_path / "mine"
     sensor.write_text(SENSOR, encoding="utf-8")
     small = ("--pixels", "64", "--points", "8", "--stack", "2", "--out", str(out))
-    refused = run(tmp_path, "detector", str(sensor), *small)
-    assert refused.returncode == 2
-    assert "--plugin" in refused.stderr
+    refused = call("detector", sensor, *small)
+    assert refused.code == 2
+    assert "--plugin" in refused.said
     assert not out.exists()
-    done = run(tmp_path, "detector", str(sensor), "--plugin", str(path), *small)
-    assert done.returncode == 0, done.stderr
-    assert ", with pedestal" in done.stdout
+    done = call("detector", sensor, "--plugin", path, *small)
+    assert done.code == 0, done.err
+    assert ", with pedestal" in done.out
     assert json.loads((out / "emva1288.json").read_text())["effects"] == {"pedestal": {"level_e": 2000.0}}
 
 
