@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+import trimesh
 from poses_kit import columns_of, row
 from scipy.integrate import quad
 
@@ -23,6 +25,7 @@ from vbnfault.render.description import View
 from vbnfault.scene import config
 from vbnfault.scene.coma import ComaTable, PhaseFunctionTable
 from vbnfault.scene.trajectory import as_trajectory
+from vbnfault.world import assemble
 from vbnfault.world.coma import Coma, Lines, Outflow, Shadow, make_coma, relative_phase, sun_axes
 from vbnfault.world.coma_ground import diffuse_reflectance, dust_towards_sun, irradiance_of_sky
 from vbnfault.world.haze import haze
@@ -397,6 +400,15 @@ def test_dust_dims_and_lights_the_ground() -> None:
 def pose(camera_T_m: Any, sun_T: Any, name: str = "far") -> dict[str, Any]:
     """Return a row of a table of poses at 1.5 au."""
     return row(name, camera_T_m, np.array(sun_T, float) / np.linalg.norm(sun_T), sun_distance_au=1.5)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_facets() -> Iterator[None]:
+    """The sphere of a scene has 20,000 facets, not 82,000: edges of 0.04 R put its limb within 0.01 px at 45 km."""
+    ball = trimesh.creation.icosphere(subdivisions=5)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(assemble, "ellipsoid", lambda axes, _: (ball.vertices * axes, ball.faces.astype(np.int32)))
+        yield
 
 
 def small_scene(**coma_table: Any) -> dict[str, Any]:
