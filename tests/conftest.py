@@ -166,6 +166,19 @@ def render_threads(count: int) -> Iterator[None]:
         render.set_threads(before)
 
 
+@contextlib.contextmanager
+def ellipsoids_of(subdivisions: int) -> Iterator[None]:
+    """In a `with` block, ellipsoids of scenes have 20 * 4^subdivisions facets; 82,000 take most of a test."""
+    import trimesh
+
+    from vbnfault.world import assemble
+
+    ball = trimesh.creation.icosphere(subdivisions=subdivisions)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(assemble, "ellipsoid", lambda axes, _: (ball.vertices * axes, ball.faces.astype("int32")))
+        yield
+
+
 @pytest.fixture(scope="session")
 def real_shape() -> Path:
     """The 67P shape model; skips where it is not at hand, since it is not part of the project."""

@@ -10,7 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-import trimesh
+from conftest import ellipsoids_of
 from poses_kit import columns_of, row
 from scipy.integrate import quad
 
@@ -25,7 +25,6 @@ from vbnfault.render.description import View
 from vbnfault.scene import config
 from vbnfault.scene.coma import ComaTable, PhaseFunctionTable
 from vbnfault.scene.trajectory import as_trajectory
-from vbnfault.world import assemble
 from vbnfault.world.coma import Coma, Lines, Outflow, Shadow, make_coma, relative_phase, sun_axes
 from vbnfault.world.coma_ground import diffuse_reflectance, dust_towards_sun, irradiance_of_sky
 from vbnfault.world.haze import haze
@@ -404,10 +403,8 @@ def pose(camera_T_m: Any, sun_T: Any, name: str = "far") -> dict[str, Any]:
 
 @pytest.fixture(scope="module", autouse=True)
 def few_facets() -> Iterator[None]:
-    """The sphere of a scene has 20,000 facets, not 82,000: edges of 0.04 R put its limb within 0.01 px at 45 km."""
-    ball = trimesh.creation.icosphere(subdivisions=5)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(assemble, "ellipsoid", lambda axes, _: (ball.vertices * axes, ball.faces.astype(np.int32)))
+    """The sphere of a scene has 20,000 facets: edges of 0.04 R put its limb within 0.01 px at 45 km."""
+    with ellipsoids_of(5):
         yield
 
 

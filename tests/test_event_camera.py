@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-import trimesh
-from conftest import Called
+from conftest import Called, ellipsoids_of
 from numpy.typing import NDArray
 from poses_kit import columns_of, row
 
@@ -22,7 +21,6 @@ from vbnfault.output.event_files import write_events
 from vbnfault.pipeline.event_camera import EventFlight
 from vbnfault.scene import keyed_random
 from vbnfault.scene.config import parse_scene
-from vbnfault.world import assemble
 
 pytestmark = pytest.mark.filterwarnings("ignore:body.shape = 'ellipsoid'")  # its values are those of 67P
 
@@ -259,10 +257,8 @@ def write_poses(path: Path, **columns: Any) -> None:
 
 @pytest.fixture(scope="module", autouse=True)
 def few_facets() -> Iterator[None]:
-    """The ball has 5120 facets, and not 82,000: edges of 0.08 R leave its limb within 0.02 px."""
-    ball = trimesh.creation.icosphere(subdivisions=4)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(assemble, "ellipsoid", lambda axes, _: (ball.vertices * axes, ball.faces.astype(np.int32)))
+    """The ball has 5120 facets: edges of 0.08 R leave its limb within 0.02 px."""
+    with ellipsoids_of(4):
         yield
 
 

@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-import trimesh
-from conftest import Called
+from conftest import Called, ellipsoids_of
 from poses_kit import columns_of, row
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
@@ -29,7 +28,6 @@ from vbnfault.pipeline.spec import SampleSpec
 from vbnfault.render.light import _TIME_STEPS
 from vbnfault.scene import config
 from vbnfault.scene.trajectory import as_trajectory
-from vbnfault.world import assemble
 from vbnfault.world.sky import SkyFrame
 
 RADIUS_M, DISTANCE_M, PX, FIELD_DEG = 100.0, 260.0, 64, 56.0
@@ -59,10 +57,8 @@ SCENE: dict[str, Any] = {
 
 @pytest.fixture(scope="module", autouse=True)
 def few_facets() -> Iterator[None]:
-    """The ball has 20,000 facets, and not 82,000: edges of 0.04 R leave its limb within 0.006 px."""
-    ball = trimesh.creation.icosphere(subdivisions=5)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(assemble, "ellipsoid", lambda axes, _: (ball.vertices * axes, ball.faces.astype(np.int32)))
+    """The ball has 20,000 facets: edges of 0.04 R leave its limb within 0.006 px."""
+    with ellipsoids_of(5):
         yield
 
 
