@@ -478,6 +478,8 @@ def test_the_pointer_names_defects_and_reads_a_render_with_a_guard_band(page: Pa
     with contextlib.closing(Served(store)) as served:
         ready(page, served)
         page.evaluate("location.hash = '#0'")
+        page.wait("performance.getEntriesByName('sample').length")
+        page.wait("document.getElementById('scalars').children.length")  # whose coming moves what is to be clicked
 
         def pointed(layer: str, x: int, y: int) -> str:
             page.click(f"[data-layer={layer}]")
