@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -26,7 +27,7 @@ from vbnfault.pipeline.development import take_images
 from vbnfault.pipeline.injection import inject_faults
 from vbnfault.pipeline.labels import label
 from vbnfault.pipeline.spec import Frame
-from vbnfault.scene.config import Scene, configure_faults, load_scene
+from vbnfault.scene.config import Scene, configure_faults, load_scene, parse_scene
 
 SMALL = {
     "camera.width_px": 96,
@@ -334,6 +335,49 @@ def test_the_sun_behind_a_fisheye_makes_no_straylight(circle_deg: float, away_de
         sun=(np.sin(angle), 0.0, np.cos(angle)),
     )
     assert result.injected.tolist() == [seen]
+
+
+# Numbers of an image of 96 x 72 px, whose polynomial folds back 86 px from the principal point: a frame of the
+# default 1024 x 1024 px reaches beyond.
+UNSIZED = {"fx": 100.0, "cx": 47.5, "cy": 35.5, "k1": -0.2}
+
+
+@pytest.mark.parametrize("in_file", [False, True])
+def test_a_calibration_without_a_size_is_that_of_the_first_image(tmp_path: Path, in_file: bool) -> None:
+    calibration: dict[str, Any] = UNSIZED
+    if in_file:
+        storage = cv2.FileStorage(str(tmp_path / "camera.yml"), cv2.FILE_STORAGE_WRITE)
+        storage.write("camera_matrix", np.array([[100, 0, 47.5], [0, 100, 35.5], [0, 0, 1]]))
+        storage.write("distortion_coefficients", np.array([[-0.2, 0, 0, 0]]))
+        storage.release()
+        calibration = {"file": str(tmp_path / "camera.yml")}
+    table = {"calibration": calibration, "exposure_s": 0.02}
+    faults: dict[str, Any] = {"vignetting": {}}
+    injector = Injector(parse_scene({"title": "own", "camera": table, "faults": faults}, source="own"))
+    large, small = (np.full(shape, 9000, np.uint16) for shape in ((72, 96), (36, 48)))
+    found = injector(large).camera.lens.calibration
+    assert found is not None
+    assert (found.width_px, found.height_px) == (96, 72)
+    np.testing.assert_array_equal(found.intrinsics, [100, 100, 48, 36])
+    with pytest.raises(InputError, match="is of an image of 96 x 72 px, and the camera has 48 x 36 px"):
+        injector(small)
+    # numbers with a size keep it, also where it is that of the camera
+    size = {"width_px": 96, "height_px": 72}
+    for sized in ({**table, **size, "calibration": UNSIZED}, {**table, "calibration": UNSIZED | size}):
+        with pytest.raises(InputError, match="is of an image of 96 x 72 px, and the camera has 48 x 36 px"):
+            vbnfault.inject(small, faults, camera=sized)
+    table["calibration"] = {**calibration, "scale_to_frame": True}
+    injector = Injector(parse_scene({"title": "own", "camera": table, "faults": faults}, source="own"))
+    injector(large)
+    np.testing.assert_array_equal(injector(small).camera.intrinsics, [50, 50, 24, 18])
+
+
+@pytest.mark.parametrize("key", ["focal_length_mm", "lens"])
+def test_a_focal_length_is_that_of_images_of_any_size(key: str) -> None:
+    camera = {key: {"focal_length_mm": 50.0, "lens": "nikkor_28_f2p8"}[key], "exposure_s": 0.02}
+    result = vbnfault.inject(np.full((72, 96), 9000, np.uint16), {"dust_on_optics": {}}, camera=camera)
+    focal_mm = 50.0 if key == "focal_length_mm" else 28.6  # the lens's own
+    assert result.camera.lens.focal_length_mm == pytest.approx(focal_mm, rel=1e-4)
 
 
 def test_the_sun_may_be_in_the_corner_of_the_frame() -> None:

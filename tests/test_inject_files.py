@@ -28,7 +28,7 @@ from vbnfault.core.files import images as image_files
 from vbnfault.core.files.images import write_exr, write_png
 from vbnfault.inject.batch import inject_files
 from vbnfault.inject.files import read_image
-from vbnfault.scene.config import Scene, load_scene
+from vbnfault.scene.config import Scene, load_scene, parse_scene
 
 # --- files --------------------------------------------------------------------------------------------------------
 
@@ -504,6 +504,28 @@ def test_a_store_keeps_what_fits_and_names_the_rest(tmp_path: Path) -> None:
         inject_files([pictures], scene, tmp_path / "out", labels="zarr", progress=False)
     assert failed.value.exit_code == 1
     assert sorted(path.name for path in (tmp_path / "out/labels").iterdir()) == ["01.png.json", "02.png.json"]
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_calibration_without_a_size_is_that_of_the_first_image_of_a_batch(tmp_path: Path, workers: int) -> None:
+    pictures = _pictures(tmp_path / "in", 2)
+    write_png(pictures / "small.png", np.full((32, 48), 90, np.uint8))
+    camera = {"calibration": {"fx": 100.0, "cx": 47.5, "cy": 31.5}, "exposure_s": 0.01}
+    scene = parse_scene({"title": "own", "camera": camera, "faults": {"vignetting": {}}}, source="own")
+    with pytest.raises(VbnfaultError, match=r"small.png: camera.calibration: is of an image of 96 x 64 px, and"):
+        inject_files([pictures], scene, tmp_path / "out", workers=workers, progress=False)
+    made = sorted(path.name for path in (tmp_path / "out" / "labels").iterdir())
+    assert made == ["00.png.json", "01.png.json"]
+
+
+def test_a_store_of_images_keeps_the_focal_length(tmp_path: Path) -> None:
+    camera = {"focal_length_mm": 50.0, "exposure_s": 0.01}  # pixels of 5.5 um
+    scene = parse_scene({"title": "own", "camera": camera, "faults": {"vignetting": {}}}, source="own")
+    inject_files([_pictures(tmp_path / "in", 1)], scene, tmp_path / "out", labels="zarr", progress=False)
+    data = vbnfault.open_dataset(tmp_path / "out" / "dataset.zarr")
+    np.testing.assert_allclose(data["intrinsics"][0, :2], 50.0 / 5.5e-3)
+    assert data.attrs["scene"]["camera"]["fov_deg"] == pytest.approx(np.degrees(2 * np.arctan(48 * 5.5e-3 / 50)))
+    assert not vbnfault.verify(tmp_path / "out" / "dataset.zarr").problems
 
 
 def test_a_scene_without_a_plan_commands_every_class_in_every_image_and_says_what_came_of_it(

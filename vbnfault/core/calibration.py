@@ -67,6 +67,10 @@ _LEAST_SLOPE_Z = 1e-3
 _BORDER = 65  # positions along each side of the frame
 
 
+class SizeMissing(InputError):
+    """Report that a file of OpenCV does not state the size of the calibrated image."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Calibration:
     """Hold the calibration of a camera, and map between unit directions in C and pixels.

@@ -43,7 +43,7 @@ def in_file(source: str) -> Iterator[None]:
     except InputError as error:
         if f"{error}".startswith(f"{source}: "):
             raise
-        raise InputError(f"{source}: {error}") from None
+        raise type(error)(f"{source}: {error}") from None
 
 
 @contextmanager

@@ -45,7 +45,7 @@ from ..store import SCALARS
 from .files import ENDINGS, MOST_VALUES, ImageFile, read_image, source_files
 from .films import ENDINGS as FILMS
 from .films import Film, assemble, frame_path, unpack
-from .injector import Injected, Injector
+from .injector import Injected, Injector, of_first_image
 from .picture import levels
 
 Labels = Literal["png", "zarr"]
@@ -356,6 +356,9 @@ def inject_files(
         image = (scene.image or ImageTable()).model_copy(update={"frames": frames})
         scene = scene.model_copy(update={"dataset": dataset, "image": image})
     batch = Batch(scene=scene, sources=sources, names=names, out=out, sun=sun)
+    if scene.camera.unsized_calibration:
+        height, width = _first_image(batch).numbers.shape[:2]
+        batch = dataclasses.replace(batch, scene=of_first_image(scene, width, height))
     options = build.BuildOptions(workers=workers, progress=progress)
     batch.injector.require_faults()  # an unusable scene is reported before any image
     _check_kept(batch)
@@ -396,7 +399,7 @@ def _build(batch: Batch, options: build.BuildOptions) -> None:
     """Make a store of a batch beside its files."""
     first = _first_image(batch)
     height, width = first.numbers.shape[:2]
-    camera = batch.scene.camera.model_copy(update={"width_px": width, "height_px": height})
+    camera = batch.scene.camera.of_image(width, height)
     layers = _LAYERS if first.depth_m is None else (*_LAYERS, "depth_m")
     dataset = batch.scene.dataset.model_copy(update={"layers": layers})
     scene = batch.scene.model_copy(update={"camera": camera, "dataset": dataset})

@@ -355,6 +355,7 @@ class Injector:
             return given, []
         if min(shape) < _LEAST_PX:
             raise InputError(f"image of {width} x {height} pixels: must have at least {_LEAST_PX} x {_LEAST_PX}")
+        self.scene = of_first_image(self.scene, width, height)
         table, assumed = self.scene.camera, []
         given_keys = table.model_fields_set
         if table.calibration is None and not {"fov_deg", "focal_length_mm", "lens"} & given_keys:
@@ -364,7 +365,7 @@ class Injector:
             assumed.append(f"camera.detector = '': assumed, {pixels}, since the scene names none")
         if (shape, grey) not in self._cameras:
             self._cameras[shape, grey] = self._made_camera(
-                table.model_copy(update={"width_px": width, "height_px": height}),
+                table.of_image(width, height),
                 GreyDetector if grey else ThreeColourDetector,
             )
         camera, of_exposure = self._cameras[shape, grey]
@@ -424,6 +425,13 @@ class Injector:
         if self._shared is None or self._shared[0] != key:
             self._shared = key, SharedResults(kept=True)
         return self._shared[1]
+
+
+def of_first_image(scene: Scene, width_px: int, height_px: int) -> Scene:
+    """Return a scene whose calibration, where its size is not given, is that of an image of this size."""
+    if not scene.camera.unsized_calibration:
+        return scene
+    return scene.model_copy(update={"camera": scene.camera.of_image(width_px, height_px)})
 
 
 @lru_cache(maxsize=8)

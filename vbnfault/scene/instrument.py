@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from ..core import spectra
-from ..core.calibration import Calibration
+from ..core.calibration import Calibration, SizeMissing
 from ..core.errors import InputError, under_key
 from ..core.quantities import ARCHITECTURES, READOUT_DIRECTIONS, Architecture, ReadoutDirection
 from ..core.tables import Table, pair_within
@@ -33,6 +33,7 @@ OF_THE_DETECTOR = (
 # The widest field of a rectilinear image. That of a calibration counts as at most this wide where poses are drawn.
 _WIDEST_DEG = 140.0
 _MOST_PX = 16384  # columns or rows of an image
+_SIZE = {"width_px", "height_px"}
 # Keys that only a camera with a named detector has.
 OF_A_DETECTOR = ("individuals", "detector_temperature_K", "stretch", "black")
 # Keys of a sensor file that users expect under [camera].
@@ -289,15 +290,20 @@ class CameraTable(Table):
             raise ValueError(
                 f"focal_length_mm = {self.focal_length_mm:g}: the calibration has its own; leave one out"
             )
+        named = _SIZE & self.model_fields_set
+        unsized = _SIZE - table.model_fields_set if not (named or table.file) else set()
         try:
             table = table.in_numbers(self.width_px, self.height_px)
-            if not {"width_px", "height_px"} & self.model_fields_set and not table.scale_to_frame:
+            table.model_fields_set.difference_update(unsized)
+            if not named and not table.scale_to_frame:
                 for key in ("width_px", "height_px"):
                     if not 16 <= getattr(table, key) <= _MOST_PX:
                         raise InputError(f"{key} = {getattr(table, key)}: must be from 16 to {_MOST_PX}")
                     object.__setattr__(self, key, getattr(table, key))
             fov_deg = min(of_frame(table, self.width_px, self.height_px).fov_deg, _WIDEST_DEG)
         except InputError as error:
+            if unsized or (isinstance(error, SizeMissing) and not named):
+                return self  # it may hold in an image of one's own; a camera with the default size refuses it
             raise ValueError(f"calibration: {error}") from None
         if "fov_deg" in self.model_fields_set and not math.isclose(fov_deg, self.fov_deg, rel_tol=1e-9):
             raise ValueError(
@@ -306,6 +312,29 @@ class CameraTable(Table):
         object.__setattr__(self, "calibration", table)
         object.__setattr__(self, "fov_deg", fov_deg)
         return self
+
+    def of_image(self, width_px: int, height_px: int) -> CameraTable:
+        """Return the camera with images of another size: a focal length stays, and so does a calibration.
+
+        A calibration whose size was not given is of an image of this size. Raises InputError if one of another size
+        must not be scaled.
+        """
+        size: dict[str, Any] = {"width_px": width_px, "height_px": height_px}
+        if self.calibration is not None:
+            of_it = {key: size[key] for key in self.unsized_calibration}
+            size["calibration"] = self.calibration.model_copy(update=of_it)
+        camera = self.model_copy(update=size)
+        if self.calibration is not None or self.focal_length_mm is not None:
+            camera.model_fields_set.discard("fov_deg")
+        try:
+            return camera._field()  # type: ignore[operator]
+        except ValueError as error:
+            raise InputError(f"camera.{error}") from None
+
+    @property
+    def unsized_calibration(self) -> set[str]:
+        """Return the keys of its size that neither the calibration nor the camera gives; empty without one."""
+        return set() if self.calibration is None else _SIZE - self.calibration.model_fields_set
 
     @property
     def frame_calibration(self) -> Calibration | None:

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..calibration import COEFFICIENTS, Calibration
+from ..calibration import COEFFICIENTS, Calibration, SizeMissing
 from ..errors import InputError, in_file, shown
 from .user_files import read_input
 
@@ -239,7 +239,7 @@ def _opencv_size(nodes: Mapping[str, tuple[str, Any]]) -> tuple[float, float]:
     for name in ("imagesize", "size", "resolution"):
         if name in nodes and nodes[name][1].isSeq() and nodes[name][1].size() == 2:
             return nodes[name][1].at(0).real(), nodes[name][1].at(1).real()
-    raise InputError("has no image_width and image_height; give width_px and height_px beside the file")
+    raise SizeMissing("has no image_width and image_height; give width_px and height_px beside the file")
 
 
 def _mat(name: str, node: Any) -> NDArray[np.float64]:
