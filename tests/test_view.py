@@ -467,13 +467,14 @@ def test_one_sample_by_mouse_and_by_keys(page: Page, served: Served) -> None:
 @needs_browser
 def test_the_pointer_names_defects_and_reads_a_render_with_a_guard_band(page: Page, tmp_path: Path) -> None:
     """A render of 12 rows and 10 columns more than the frame begins 6 rows and 5 columns outside of it."""
-    spec = make_spec(layers=("defects", "scene_radiance"), rendered_shape=(36, 42))
+    spec = make_spec(layers=("defects", "scene_radiance", "flow"), rendered_shape=(36, 42))
     sample = fake_sample(spec, 0)
     defects = np.zeros((spec.height, spec.width), np.uint8)
     defects[7, 9], defects[8, 9] = 1, 8 | 16
     scene = np.arange(3 * 36 * 42, dtype=np.float16).reshape(3, 36, 42) % 2048
     store = st.create(tmp_path / "s.zarr", spec, 1)
-    layers = {**sample.layers, "defects": defects, "scene_radiance": scene}
+    flow = np.stack([np.full(defects.shape, 1.5), np.full(defects.shape, -2.5)], axis=-1).astype(np.float32)
+    layers = {**sample.layers, "defects": defects, "scene_radiance": scene, "flow": flow}
     st.write_samples(store, [dataclasses.replace(sample, layers=layers)])
     with contextlib.closing(Served(store)) as served:
         ready(page, served)
@@ -500,6 +501,8 @@ def test_the_pointer_names_defects_and_reads_a_render_with_a_guard_band(page: Pa
         assert pointed("defects", 9, 9).split(":")[1].split() == ["none"]
         shown = pointed("scene_radiance", 4, 3).replace("\u202f", "").split(":")[1].split()[:3]
         assert [float(value) for value in shown] == scene[:, 9, 9].tolist()
+        assert pointed("flow", 4, 3).split(":")[1].split() == ["1.5", "−2.5"]
+        page.wait("document.getElementById('scale').textContent.includes('component x')")  # the one that is painted
         assert page.errors == []
 
 

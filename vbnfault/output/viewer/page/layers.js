@@ -120,7 +120,7 @@ export function paint(layer, { data, shape }) {
       for (let c = 0; c < 3; c++) out[4 * k + c] = at < 0 ? [16, 18, 22][c] : table[3 * at + c];
       out[4 * k + 3] = 255;
     }
-    legend = { low, high, units: layer.units, table };
+    legend = { low, high, units: layer.units, table, note: step > 1 ? "component x; the pointer reads all" : "" };
   }
   context.putImageData(image, 0, 0);
   return { canvas, legend, photograph };
