@@ -8,14 +8,17 @@ import importlib
 import json
 import os
 import shutil
+import tarfile
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+import pyarrow.parquet
 import pytest
-from synthetic import filled
+from sequences_kit import sequences
+from synthetic import fake_sample, filled, make_spec
 from typer.testing import CliRunner
 
 from vbnfault import cli
@@ -449,6 +452,31 @@ def test_datasets_reads_the_parquet_files_with_their_features(
     assert sorted(seen) == list(range(SAMPLES))
 
 
+def test_rows_of_samples_have_their_times_and_what_their_distortion_means(tmp_path: Path) -> None:
+    data = sequences(tmp_path / "s.zarr", distortion_model="undistorting", skew_px=0.25)
+    for name in ("huggingface", "webdataset"):
+        export_store(data, tmp_path / name, name, progress=False)
+    lines = (tmp_path / "huggingface" / "samples.jsonl").read_text().splitlines()
+    rows = {row["sample"]: row for row in map(json.loads, lines)}
+    tables = map(pyarrow.parquet.read_table, sorted((tmp_path / "huggingface" / "data").iterdir()))
+    of_parquet = {row["sample"]: row for table in tables for row in table.to_pylist()}
+    of_tar: dict[int, Any] = {}
+    for path in (tmp_path / "webdataset").glob("*.tar"):
+        with tarfile.open(path) as tar:
+            members = [tar.extractfile(name) for name in tar.getnames() if name.endswith(".json")]
+            of_tar |= {row["sample"]: row for row in (json.load(member) for member in members if member)}
+    assert rows.keys() == of_parquet.keys() == of_tar.keys() == {*range(data.samples)}
+    for k, row in rows.items():
+        for key in ("sequence", "frame", "time_s", "julian_date", "distortion", "distortion_model", "skew_px"):
+            assert of_parquet[k][key] == of_tar[k][key] == row[key]
+        assert row["time_s"] == data.read("time_s", k, k + 1)[0]
+        assert (row["distortion_model"], row["skew_px"]) == ("undistorting", 0.25)
+    plain = tmp_path / "plain"  # a store without sequences and without a calibration
+    export_store(filled(tmp_path / "p.zarr"), plain, "huggingface", progress=False)
+    row = json.loads((plain / "samples.jsonl").read_text().splitlines()[0])
+    assert (row["distortion_model"], row["skew_px"]) == ("opencv", 0.0)
+
+
 def test_openexr_reads_radiance_by_wavelength_and_truth(exported: Any, data: st.Store) -> None:
     openexr = importlib.import_module("OpenEXR")
     splits = split_of(data)
@@ -464,6 +492,23 @@ def test_openexr_reads_radiance_by_wavelength_and_truth(exported: Any, data: st.
         assert np.array_equal(channels["depth.Z"], sample.layers["depth_m"])
         assert np.array_equal(channels["normal.Y"], sample.layers["normal"][..., 1])
         assert np.array_equal(channels["mask.straylight"] == 1, sample.layers["mask"][2])
+
+
+def test_the_render_with_its_guard_band_has_an_openexr_file_of_its_own(tmp_path: Path) -> None:
+    openexr = importlib.import_module("OpenEXR")
+    spec = make_spec(8, layers=("radiance", "scene_radiance"), rendered_shape=(12, 22))
+    data, rendered = st.create(tmp_path / "s.zarr", spec, 1), np.arange(3 * 12 * 22).reshape(3, 12, 22)
+    sample = fake_sample(spec, 0)
+    st.write_samples(
+        data, [replace(sample, layers={**sample.layers, "scene_radiance": rendered.astype(np.float16)})]
+    )
+    export_store(data, tmp_path / "e", "exr", progress=False)
+    for ending, layer, shape in (("", "radiance", (8, 16)), ("_scene_radiance", "scene_radiance", (12, 22))):
+        with openexr.File(str(tmp_path / "e" / "train" / f"000000{ending}.exr"), separate_channels=True) as file:
+            channels = {name: channel.pixels for name, channel in file.channels().items()}
+        for k, wavelength in enumerate(spec.wavelength_nm):
+            assert channels[f"radiance.{wavelength:.1f}nm"].shape == shape
+            np.testing.assert_array_equal(channels[f"radiance.{wavelength:.1f}nm"], data.read(layer)[0, k])
 
 
 def test_a_new_format_is_one_class(described_store: Path, tmp_path: Path) -> None:

@@ -151,6 +151,11 @@ def number_text(index: int, samples: int) -> str:
     return f"{index:0{max(6, len(str(samples - 1)))}d}"
 
 
+def of_distortion(spec: StoreSpec) -> dict[str, Any]:
+    """Return what the coefficients `distortion` and the `intrinsics` of a sample mean: model and skew in px."""
+    return {"distortion_model": spec.distortion_model or "opencv", "skew_px": spec.skew_px}
+
+
 def png_files(spec: StoreSpec, sample: Sample) -> Iterator[tuple[str, str, bytes]]:
     """Yield name of the layer, part of it and content of a PNG file of each image and mask of a sample.
 

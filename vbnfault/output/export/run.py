@@ -28,7 +28,7 @@ from ...dataset.lock import locked
 from ...dataset.progress import Progress
 from ...dataset.statistics import Statistics, statistics
 from ...store import EFFECT_RULE, MASK_RULES, SPLITS, STRATA, Store, Url, disk, mask_union, open_store
-from .contract import FPS, Closing, ExportPart, Finished, Format, formats
+from .contract import FPS, Closing, ExportPart, Finished, Format, formats, of_distortion
 from .folder import Folder
 
 SAMPLES = "samples.jsonl"
@@ -276,7 +276,7 @@ def _row(store: Store, sample: Sample) -> dict[str, Any]:
     row["injected"] = [f for f, on in zip(store.spec.faults, sample.scalars["injected"], strict=True) if on]
     row["stratum"] = STRATA[int(row["stratum"])]
     parsed = {name: store.table(sample.index, name, sample.scalars[name]) for name in _PARSED}
-    return {"sample": sample.index, **row, **plain(parsed)}
+    return {"sample": sample.index, **row, **of_distortion(store.spec), **plain(parsed)}
 
 
 # --- at the end ---------------------------------------------------------------------------------------------

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
@@ -33,6 +33,8 @@ class Exr(Format):
       camera's frame (x right, y down, z boresight), 0 on the sky. `semantic`: 0 sky, 1 body, 2 Sun, 3 spacecraft.
     - `flow.X`, `flow.Y`: motion in px to the next frame.
     - `mask.<fault>`: 1 where the mask is set. Any other layer of one number a pixel has its name in the store.
+    - `SPLIT/NUMBER_scene_radiance.exr`: the layer `scene_radiance`, if the store has it, in channels
+      `radiance.<wavelength>nm`. It may be larger than the image, which lies in its middle.
     """
 
     name = "exr"
@@ -47,24 +49,27 @@ class Exr(Format):
             for name, row in spec.pixel_layers.items()
             if name not in _SKIPPED
             and not name.startswith("without_")
-            and row.dims[-1] in ("x", "xyz", "xy", "channel")
+            and row.dims[-1] in ("x", "x_rendered", "xyz", "xy", "channel")
         ]
 
     def write_part(self, store: Store, part: ExportPart, samples: Iterable[Sample], folder: Folder) -> list[Entry]:
-        """Write one file for each sample."""
+        """Write one file for each sample, and one for its render where this may have a guard band."""
         entries = []
         for sample in samples:
-            name = f"{part.split}/{number_text(sample.index, store.samples)}.exr"
-            folder.put_with(name, partial(_write, store, sample))
-            entries.append(Entry(sample.index, name))
+            stem, layers = f"{part.split}/{number_text(sample.index, store.samples)}", dict(sample.layers)
+            rendered = {name: layers.pop(name) for name in ("scene_radiance",) if name in layers}
+            for name, of_file in ((stem, layers), (f"{stem}_scene_radiance", rendered)):
+                if of_file:
+                    folder.put_with(f"{name}.exr", partial(_write, store.spec, of_file))
+            entries.append(Entry(sample.index, f"{stem}.exr"))
         return entries
 
 
-def _write(store: Store, sample: Sample, path: Path) -> None:
-    """Write the file of one sample."""
+def _write(spec: StoreSpec, layers: Mapping[str, NDArray[Any]], path: Path) -> None:
+    """Write a file of layers."""
     channels: dict[str, NDArray[Any]] = {}
-    for name, layer in sample.layers.items():
-        channels |= _channels(store.spec, name, layer)
+    for name, layer in layers.items():
+        channels |= _channels(spec, name, layer)
     write_exr(path, channels)
 
 
@@ -73,7 +78,7 @@ def _channels(spec: StoreSpec, name: str, layer: NDArray[Any]) -> dict[str, NDAr
     if name == "image":
         scaled = (layer / np.float32(255)).astype(np.float16)
         return {channel: np.ascontiguousarray(scaled[..., k]) for k, channel in enumerate(CHANNELS)}
-    if name == "radiance":
+    if name in ("radiance", "scene_radiance"):
         return {f"radiance.{w:.1f}nm": band for w, band in zip(spec.wavelength_nm, layer, strict=True)}
     if name in ("mask", "mask_effect"):
         return {f"{name}.{f}": mask.astype(np.float16) for f, mask in zip(spec.faults, layer, strict=True)}

@@ -9,10 +9,12 @@ from typing import Any, ClassVar
 
 from ....core.quantities import Sample
 from ....store import STRATA, Store, StoreSpec
-from ..contract import Closing, Entry, ExportPart, Finished, Format, number_text, png_files
+from ..contract import Closing, Entry, ExportPart, Finished, Format, number_text, of_distortion, png_files
 from ..folder import Folder
 
-_NUMBERS = ("exposure_s", "sun_azimuth_deg", "sun_elevation_deg", "sun_distance_au", "sun_visible_fraction")
+_OF_SUN = ("sun_azimuth_deg", "sun_elevation_deg", "sun_distance_au", "sun_visible_fraction")
+_NUMBERS = ("exposure_s", *_OF_SUN, "julian_date")
+_OF_SEQUENCES: dict[str, type] = {"sequence": int, "frame": int, "time_s": float}
 _VECTORS = ("camera_position_T_m", "camera_from_T", "sun_direction_T", "intrinsics", "distortion")
 _ROWS_IN_MEMORY = 8
 
@@ -25,7 +27,8 @@ class HuggingFace(Format):
     - `image`, `clean`: R, G, B, 8 bits a channel; `intensity`: the intensity channel. `mask_<fault>` for every
       class, and `mask_any`: 8 bits, 255 where the mask is set.
     - `faults`: the classes in the pixels, as labels of a `ClassLabel` in the order of the table below.
-      `parameters`: every drawn parameter, as JSON. Pose, Sun and exposure are columns of numbers.
+      `parameters`: every drawn parameter, as JSON. Pose, Sun, date and exposure are columns of numbers, and in
+      a store with sequences also `sequence` (its index), `frame` and `time_s`.
     """
 
     name = "huggingface"
@@ -110,7 +113,14 @@ def _columns(spec: StoreSpec) -> dict[str, tuple[Any, dict[str, Any]]]:
         **dict.fromkeys(("sample", "site"), value(pa.int64())),
         "stratum": value(pa.string()),
         **dict.fromkeys(_NUMBERS, value(pa.float64())),
+        **{
+            name: value(pa.int64() if kind is int else pa.float64())
+            for name, kind in _OF_SEQUENCES.items()
+            if name in spec.scalars
+        },
         **dict.fromkeys(_VECTORS, sequence(*value(pa.float64()))),
+        "distortion_model": value(pa.string()),
+        "skew_px": value(pa.float64()),
         "parameters": value(pa.string()),
     }
 
@@ -130,6 +140,8 @@ def _row(store: Store, sample: Sample) -> dict[str, Any]:
         "site": int(scalars["site"]),
         "stratum": STRATA[int(scalars["stratum"])],
         **{name: float(scalars[name]) for name in _NUMBERS},
+        **{name: kind(scalars[name]) for name, kind in _OF_SEQUENCES.items() if name in scalars},
         **{name: scalars[name].tolist() for name in _VECTORS},
+        **of_distortion(store.spec),
         "parameters": scalars["parameters"],
     }

@@ -14,7 +14,7 @@ import numpy as np
 from ....core.files.whole_files import plain
 from ....core.quantities import Sample
 from ....store import Store, StoreSpec
-from ..contract import Entry, ExportPart, Format, number_text, png_files
+from ..contract import Entry, ExportPart, Format, number_text, of_distortion, png_files
 from ..folder import Folder
 
 _ARRAYS = ("depth_m", "normal")
@@ -84,5 +84,7 @@ def _scalars(store: Store, sample: Sample) -> dict[str, Any]:
     injected = dict(zip(store.spec.faults, sample.scalars["injected"].tolist(), strict=True))
     parsed = {name: store.table(sample.index, name, sample.scalars[name]) for name in ("parameters", "proposal")}
     scalars = {name: value for name, value in sample.scalars.items() if name not in parsed}
-    row: dict[str, Any] = plain({"sample": sample.index, **scalars, "injected": injected, **parsed})
+    row: dict[str, Any] = plain(
+        {"sample": sample.index, **scalars, **of_distortion(store.spec), "injected": injected, **parsed}
+    )
     return row
