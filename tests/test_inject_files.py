@@ -526,6 +526,7 @@ def test_a_store_of_images_keeps_the_focal_length(tmp_path: Path) -> None:
     np.testing.assert_allclose(data["intrinsics"][0, :2], 50.0 / 5.5e-3)
     assert data.attrs["scene"]["camera"]["fov_deg"] == pytest.approx(np.degrees(2 * np.arctan(48 * 5.5e-3 / 50)))
     assert not vbnfault.verify(tmp_path / "out" / "dataset.zarr").problems
+    assert data.attrs["licence"] == ""  # the images have one of their own
 
 
 def test_a_scene_without_a_plan_commands_every_class_in_every_image_and_says_what_came_of_it(

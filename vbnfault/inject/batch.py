@@ -401,7 +401,10 @@ def _build(batch: Batch, options: build.BuildOptions) -> None:
     height, width = first.numbers.shape[:2]
     camera = batch.scene.camera.of_image(width, height)
     layers = _LAYERS if first.depth_m is None else (*_LAYERS, "depth_m")
-    dataset = batch.scene.dataset.model_copy(update={"layers": layers})
+    known: dict[str, Any] = {"layers": layers}
+    if "licence" not in batch.scene.dataset.model_fields_set:
+        known["licence"] = ""  # that of rendered datasets is not that of images of one's own
+    dataset = batch.scene.dataset.model_copy(update=known)
     scene = batch.scene.model_copy(update={"camera": camera, "dataset": dataset})
     session = Session(scene)
     spec = store_spec(session, (len(batch.names),))
