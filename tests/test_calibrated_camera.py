@@ -410,6 +410,8 @@ def test_the_scene_of_a_store_holds_the_numbers(built: Path) -> None:
     kept = opened.attrs["scene"]["camera"]["calibration"]
     assert kept["fx"] == TABLES[kept["model"]]["fx"]
     assert kept["file"] == ""
+    lines = (built / "README.md").read_text().splitlines()  # a fisheye's field may be wider than fov_deg can be
+    assert sum("| of the calibration, at most 140 |" in line for line in lines if "camera.fov_deg" in line) == 1
 
 
 FILES = {"camera_info.yaml": (ROS, {}), "chain.yaml": (KALIBR, {"camera": "cam0"}), "cv.yml": (YAML_1_0, {})}

@@ -139,6 +139,8 @@ def _provenance(attributes: Mapping[str, Any]) -> Iterator[list[str]]:
             origin = f"packaged table of {packaged.name if packaged else ''}"
         elif key in defaults and json.dumps(defaults[key]) == json.dumps(value):
             origin = "default"
+        elif key == "camera.fov_deg" and scene["camera"].get("calibration"):
+            origin = "of the calibration, at most 140"
         else:
             origin = "set"
         text = json.dumps(value, ensure_ascii=False)
