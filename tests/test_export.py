@@ -164,6 +164,15 @@ def test_png_of_the_raw_mosaic_has_16_bits(finished_store: Path, tmp_path: Path)
     assert np.array_equal(raw, store.read_sample(0).layers["raw"])
 
 
+def test_png_of_the_defects_has_their_bits(tmp_path: Path) -> None:
+    spec, bits = make_spec(8, layers=("defects",)), np.arange(8 * 16, dtype=np.uint8).reshape(8, 16) % 64
+    data, sample = st.create(tmp_path / "s.zarr", spec, 1), fake_sample(spec, 0)
+    st.write_samples(data, [replace(sample, layers={**sample.layers, "defects": bits})])
+    export_store(data, tmp_path / "e", "png", progress=False)
+    found = cv2.imread(str(tmp_path / "e" / "train" / "defects" / "000000.png"), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(found, bits)
+
+
 def test_pycocotools_reads_instances_that_make_up_the_masks(exported: Any, data: st.Store) -> None:
     tool, masks = reader("pycocotools.coco"), reader("pycocotools.mask")
     splits, instances = split_of(data), 0

@@ -35,6 +35,8 @@ class Exr(Format):
     - `mask.<fault>`: 1 where the mask is set. Any other layer of one number a pixel has its name in the store.
     - `SPLIT/NUMBER_scene_radiance.exr`: the layer `scene_radiance`, if the store has it, in channels
       `radiance.<wavelength>nm`. It may be larger than the image, which lies in its middle.
+    - `point_T_m.X`, `.Y`, `.Z` are rounded to 32 bits. `clean`, `mask_any` and `without_<fault>` are left out: the
+      format `png` has them.
     """
 
     name = "exr"

@@ -9,7 +9,7 @@ from ....store import Store, StoreSpec
 from ..contract import Entry, ExportPart, Format, number_text, png_files
 
 _MASKS = ("mask", "mask_effect")
-_PLAIN = ("mask_any", "semantic", "raw")
+_PLAIN = ("mask_any", "semantic", "raw", "defects")
 
 
 class PngFolders(Format):
@@ -22,6 +22,7 @@ class PngFolders(Format):
     - `mask/<fault>`, `mask_effect/<fault>`, `mask_any`: 8 bits, 255 where the mask is set and 0 elsewhere.
     - `semantic`: 8 bits; 0 sky, 1 body, 2 Sun, 3 spacecraft.
     - `raw`: the mosaic of the analogue-to-digital converter, 16 bits, in DN and not scaled.
+    - `defects`: 8 bits, a sum of 1 hot, 2 dead, 4 stuck, 8 RTS, 16 RTS with a high level, 32 trap.
     - A layer that the store lacks has no folder. Depth, normals and radiance are floating-point numbers: export
       them as `exr`.
     """
