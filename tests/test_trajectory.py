@@ -462,6 +462,21 @@ def test_a_row_that_shows_the_rim_of_the_body_looks_not_past_it(
     assert ("1 of 1 rows look past the body" in text) == looks_past
 
 
+@pytest.mark.parametrize(("away_deg", "looks_past"), [(85.0, False), (115.0, True)])
+def test_a_fisheye_looks_past_the_body_only_beyond_its_image_circle(
+    away_deg: float, looks_past: bool, tmp_path: Path, sphere: str
+) -> None:
+    (w, x, y, z), half = (0.5, 0.5, 0.5, -0.5), np.radians(away_deg) / 2  # turned as in the test above
+    c, s = np.cos(half), np.sin(half)
+    turned = {"w": c * w - s * y, "x": c * x + s * z, "y": c * y + s * w, "z": c * z - s * x}
+    values = {f"camera_from_T_{name}": float(value) for name, value in turned.items()}
+    path = scene_file(tmp_path, sphere, [row("far", (30000.0, 0.0, 0.0), **values)])
+    calibration = {"model": "fisheye", "fx": 11.0, "cx": 19.5, "cy": 15.5, "circle_deg": 200.0}
+    scene = config.load_scene(path, {"camera": {"width_px": 40, "height_px": 32, "calibration": calibration}})
+    text = "\n".join(dataset.describe_scene(scene, source="flown"))
+    assert ("1 of 1 rows look past the body" in text) == looks_past
+
+
 @pytest.mark.parametrize(("radii", "is_inside"), [(0.98, True), (1.02, False)])
 def test_rows_inside_the_body_are_refused_before_a_build(
     radii: float, is_inside: bool, tmp_path: Path, sphere: str

@@ -273,6 +273,8 @@ def _rows_that_miss_the_body(session: Session, table: Trajectory, count: int) ->
     camera, body = session.scene.camera, session.body
     half_width = np.tan(np.radians(camera.fov_deg) / 2)
     half_diagonal = np.arctan(half_width * np.hypot(1, camera.height_px / camera.width_px))
+    if (calibration := camera.frame_calibration) is not None:
+        half_diagonal = np.radians(calibration.field_deg)
     radius_m = np.linalg.norm(body.vertices_m - body.centre_of_mass_T_m, axis=1).max()
     to_body_m = body.centre_of_mass_T_m - table.camera_position_T_m[:count]
     distance_m = np.maximum(np.linalg.norm(to_body_m, axis=1), radius_m)
