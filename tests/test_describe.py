@@ -40,6 +40,19 @@ def test_a_pixel_of_a_fisheye_is_that_of_its_focal_length(tmp_path: Path) -> Non
     assert "straight down: 0.0625 to 0.625 m a pixel" in "\n".join(described(scene=str(path)))
 
 
+@pytest.mark.parametrize(("circle_deg", "footprint"), [(170, ", footprint 229 to 2290 m across"), (200, "")])
+def test_the_footprint_of_a_fisheye_is_that_of_its_whole_field(
+    tmp_path: Path, circle_deg: int, footprint: str
+) -> None:
+    path = tmp_path / "fisheye.toml"
+    path.write_text(
+        'title = "fisheye"\n[geometry]\nheight_m = [10, 100]\n[camera]\nwidth_px = 512\nheight_px = 512\n'
+        f'[camera.calibration]\nmodel = "fisheye"\nfx = 140\ncx = 255.5\ncy = 255.5\ncircle_deg = {circle_deg}\n'
+    )
+    (line,) = [line for line in described(scene=str(path)) if line.startswith("straight down")]
+    assert line.partition(" m a pixel")[2] == footprint
+
+
 def test_describe_says_what_the_frame_shows() -> None:
     text = "\n".join(described("geometry.height_m=[10, 100]", "camera.fov_deg=90", "sun.distance_au=2"))
     # 90 degrees across: twice the height, over 512 pixels

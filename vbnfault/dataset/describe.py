@@ -128,7 +128,7 @@ def _small_body(session: Session) -> list[str]:
 def _geometry(session: Session) -> list[str]:
     """Return lines about the camera's positions and attitudes (or its SPICE trajectory) and about the Sun."""
     scene, table = session.scene, session.plan
-    geometry, camera = scene.geometry, scene.camera
+    geometry = scene.geometry
     if session.trajectory is not None:
         return _trajectory(session, session.trajectory)
     sun = f"Sun: {ephemeris.sun_distance_au(scene):.4g} au away"
@@ -143,13 +143,14 @@ def _geometry(session: Session) -> list[str]:
         return _aims(session, table.aim)
     low, high = geometry.height_m
     above = "the ground below the camera" if geometry.height_reference == "local_ground" else "the site"
-    across, pixel = 2 * np.tan(np.radians(camera.fov_deg) / 2), scene.camera.pixel_rad
+    field_deg, pixel = session.base_camera.fov_deg, scene.camera.pixel_rad
+    across = 2 * np.tan(np.radians(min(field_deg, 180)) / 2)
     # a pose is refused if a surface is closer than the clearance, so no camera is lower than the clearance
     nearest = max(low, min(geometry.clearance_m, high))
     lines = [
         f"heights: {low:g} to {high:g} m above {above}, x {_bounds(geometry.x_m)} m, y {_bounds(geometry.y_m)} m",
-        f"straight down: {_span(pixel * nearest, pixel * high)} m a pixel, "
-        f"footprint {_span(across * nearest, across * high)} m across",
+        f"straight down: {_span(pixel * nearest, pixel * high)} m a pixel"
+        + (f", footprint {_span(across * nearest, across * high)} m across" if field_deg < 180 else ""),
         f"{sun}, date {scene.sun.julian_date:.1f} TDB",
     ]
     if any(s.reference == "nadir" for k, s in enumerate(redraw.strata(scene)) if (table.stratum == k).any()):
