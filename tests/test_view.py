@@ -29,6 +29,7 @@ from vbnfault import store as st
 from vbnfault.core.errors import InputError
 from vbnfault.core.files import images
 from vbnfault.output.contact_sheet import overlay
+from vbnfault.output.report import write_report
 from vbnfault.output.viewer import Viewer, server
 from vbnfault.output.viewer.server import NOT_KNOWN, Listing
 from vbnfault.scene.names import STRATA
@@ -139,6 +140,15 @@ def test_small_images_show_the_masks_where_asked(served: Served) -> None:
     decoded = cv2.imdecode(np.frombuffer(plain, np.uint8), cv2.IMREAD_COLOR)
     assert decoded.shape == (32, 40, 3)  # not enlarged
     assert plain != masked
+
+
+def test_where_no_class_is_localised_none_is_shown_as_if_it_were(tmp_path: Path) -> None:
+    """A viewer tints masks of such classes less, and a report does not tick them."""
+    store = filled(tmp_path / "s.zarr", 4, faults=("vignetting",), mask_any_faults=(), layers=("clean",))
+    with contextlib.closing(Served(store)) as served:
+        assert [fault["localised"] for fault in served.json("/api/store")["faults"]] == [False]
+    write_report(store, tmp_path / "r.html")
+    assert 'id="show-m0">' in (tmp_path / "r.html").read_text()
 
 
 def test_brighter_images_are_the_square_root_and_their_masks_keep_their_colours(

@@ -141,9 +141,7 @@ def _values(store: Store, scalars: Scalars, shown_samples: int, read_samples: in
         "pixels": pixels,
         "cards": sheet,
         "strips": [strip for strip in strips if strip],
-        "coloured": [
-            (k, f, _colour(k), f in (spec.localised_faults or spec.faults)) for k, f in enumerate(spec.faults)
-        ],
+        "coloured": [(k, f, _colour(k), f in (spec.localised_faults or ())) for k, f in enumerate(spec.faults)],
         "splits": charts.legend(scalars.split_names),
         "balance": _balance(store, scalars, numbers) if spec.faults else None,
         "together": _together(store, scalars),
@@ -337,7 +335,7 @@ def _card(store: Store, scalars: Scalars, position: int, sample: Sample, side_px
     urls = {name: image_url(layers[name][..., :3], side_px) for name in ("image", "clean") if name in layers}
     for k, fault in enumerate(spec.faults):
         if layers["mask"][k].any():
-            is_localised = fault in (spec.localised_faults or spec.faults)
+            is_localised = fault in (spec.localised_faults or ())
             colour = COLOURS[k % len(COLOURS)]
             urls[f"mask m{k}"] = _mask_url(resized_mask(layers["mask"][k].astype(bool), size), colour, is_localised)
     faults = np.flatnonzero(scalars.injected[position]).tolist()

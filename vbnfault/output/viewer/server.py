@@ -160,7 +160,7 @@ class Viewer:
                     "name": fault,
                     "short": short[fault],
                     "colour": COLOURS[k % len(COLOURS)],
-                    "localised": fault in (spec.localised_faults or spec.faults),
+                    "localised": fault in (spec.localised_faults or ()),
                     "model": str(store.attributes.get("fault_models", {}).get(fault, "")),
                 }
                 for k, fault in enumerate(spec.faults)
@@ -262,7 +262,7 @@ class Viewer:
             rgb = _ROOTS[rgb]
         if masks and spec.faults:
             small = np.stack([resized_mask(mask, size) for mask in self.pixels("mask", index)])
-            localised = [fault in (spec.localised_faults or spec.faults) for fault in spec.faults]
+            localised = [fault in (spec.localised_faults or ()) for fault in spec.faults]
             rgb = overlay(rgb, small, [bool(mask.any()) for mask in small], localised)
         return images.encoded(rgb, ".jpg", _JPEG_QUALITY)
 
