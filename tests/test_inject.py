@@ -361,6 +361,8 @@ def test_a_calibration_without_a_size_is_that_of_the_first_image(tmp_path: Path,
     np.testing.assert_array_equal(found.intrinsics, [100, 100, 48, 36])
     with pytest.raises(InputError, match="is of an image of 96 x 72 px, and the camera has 48 x 36 px"):
         injector(small)
+    one_side = {**table, "calibration": UNSIZED, "width_px": 96}
+    assert vbnfault.inject(large, faults, camera=one_side).camera.lens.calibration == found
     # numbers with a size keep it, also where it is that of the camera
     size = {"width_px": 96, "height_px": 72}
     for sized in ({**table, **size, "calibration": UNSIZED}, {**table, "calibration": UNSIZED | size}):

@@ -291,7 +291,7 @@ class CameraTable(Table):
                 f"focal_length_mm = {self.focal_length_mm:g}: the calibration has its own; leave one out"
             )
         named = _SIZE & self.model_fields_set
-        unsized = _SIZE - table.model_fields_set if not (named or table.file) else set()
+        unsized = set() if table.file else _SIZE - table.model_fields_set - named
         try:
             table = table.in_numbers(self.width_px, self.height_px)
             table.model_fields_set.difference_update(unsized)
