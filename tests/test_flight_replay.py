@@ -98,19 +98,19 @@ def test_an_image_moves_by_whole_pixels_and_continues_as_its_mirror_image() -> N
     assert np.array_equal(fit_frames.shifted(image, (0, 0)), image)
 
 
-def test_raw_images_are_halved_and_stretched_by_a_root() -> None:
+def test_raw_images_are_stretched_by_a_root_and_halved() -> None:
     display = fit_replay.Display(bias_dn=100, top_dn=4195, stretch=0.5)
     raw = np.full((12, 12), 4200, dtype=np.uint16)  # above the top code
     raw[6:] = 104
-    # 255 √(4 / 4095) = 7.97; next to the edge a neighbour weighs 0.026 in a column, 0.036 in a row
-    for image, leak in ((raw, 0.026), (raw.T, 0.036)):
-        edge = [round(255 * (part + (1 - part) * 4 / 4095) ** 0.5) for part in (1 - leak, leak)]
+    # 255 √(4 / 4095) = 7.97; next to the edge a neighbour weighs 0.022 in a column, 0.026 in a row
+    for image, leak in ((raw, 0.022), (raw.T, 0.026)):
+        edge = [round(255 * part + 8 * (1 - part)) for part in (1 - leak, leak)]
         levels = display.developed(image, 2)
         lines = levels if image is raw else levels.T
         assert lines.tolist() == [[value] * 6 for value in (255, 255, *edge, 8, 8)]
-    # the mean of -2 and 10 DN is 4, too; stretched first, 0 and 12.6 would give 6
-    raw[0::2], raw[1::2] = 98, 110
-    assert display.developed(raw, 2)[2:-2].tolist() == [[8] * 6] * 2
+    # the mean of -2 and 12 DN is 5, of 9 levels; stretched first, they are levels 0 and 14
+    raw[0::2], raw[1::2] = 98, 112
+    assert display.developed(raw, 2)[2:-2].tolist() == [[7] * 6] * 2
     # a black 500 DN above the bias: 255 √(3594 / 4095) = 238.9, but the largest number is white
     raw[:] = 4194
     assert (display.developed(raw, 1, -500.0) == 239).all()

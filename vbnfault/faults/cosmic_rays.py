@@ -98,7 +98,10 @@ class Tracks(Fault):
         4000, limits=(1, 20_000), integer=True, doc="in one picture: what a larger draw has more is left out"
     )
     least_dn: float = number(
-        1.0, limits=(0.001, 255), unit="DN of 255", doc="pixels that gain less are left as they are"
+        1.0,
+        limits=(0.001, 255),
+        unit="DN of 255",
+        doc="pixels that gain less, before a stretch, are left as they are",
     )
 
     def draw(self, context: FaultContext, rng: np.random.Generator) -> Params:

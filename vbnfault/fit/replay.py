@@ -14,8 +14,8 @@ Pose, exposure, gain and black of a real frame are never known well enough, so e
   much of the image at 0.
 
 All else is of the scene. Frames that are smaller than the camera's image by a whole factor are means of as many
-pixels; the means are taken before the stretch. So are those of Rosetta's frames: single pixels of their sky are
-darker than the sky around by up to a half, which the mean of four stretched pixels, none below 0, cannot be.
+stretched pixels. So are Rosetta's: at 8 of 255 levels their noise changes as that of single pixels of few DN does
+(see the page of realism).
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from .frames import F32, Look, compare, look, shift_between, shifted, similarity
 _SEARCH_PX = 16  # largest shift, for frames of 512 px
 # A pixel of a halved frame also holds these fractions of the light of its neighbours: the first of each above and
 # below it, the second of each at its sides. Noise of neighbours in Rosetta's skies correlates by twice as much.
-_LEAKS = 0.026, 0.036
+_LEAKS = 0.022, 0.026
 # The exposure is metered on the first of these percentiles whose level is below the given one.
 _WHITE, _PERCENTILES = 250, (50.0, 40.0, 30.0, 20.0, 10.0)
 _MOST_BLACK = 1e-3  # of white: more is light. Of 32 frames of Rosetta's the black differs by 4e-4
@@ -96,15 +96,20 @@ class Display:
     step: float = 1.0
 
     def developed(self, raw: NDArray[Any], factor: int, black_dn: float = 0.0) -> F32:
-        """Return a raw image reduced by a whole factor, then stretched, in levels of 0 to 255, float32[y, x].
+        """Return a raw image stretched, then reduced by a whole factor, in levels of 0 to 255, float32[y, x].
 
         `black_dn` is how far the black of the frame lies below the bias. A pixel at the top code is white.
         """
         above = raw.astype(np.float32) - np.float32(self.bias_dn - black_dn)
         above[raw >= self.top_dn] = self.top_dn - self.bias_dn
-        of_white = np.clip(reduced(above, factor) / np.float32(self.top_dn - self.bias_dn), 0, 1)
+        of_white = np.clip(above / np.float32(self.top_dn - self.bias_dn), 0, 1)
+        levels = self._rounded(255 * of_white ** np.float32(self.stretch))
+        return levels if factor == 1 else self._rounded(reduced(levels, factor))
+
+    def _rounded(self, levels: F32) -> F32:
+        """Return levels as the frame tells them apart."""
         step = np.float32(self.step)
-        return step * np.floor(255 / step * of_white ** np.float32(self.stretch) + np.float32(0.5))
+        return np.asarray(step * np.floor(levels / step + np.float32(0.5)))
 
     def fraction(self, level: float) -> float:
         """Return the fraction of white that a level stands for."""
