@@ -22,6 +22,7 @@ from vbnfault.detector.three_colour import ThreeColourDetector
 from vbnfault.faults import registry
 from vbnfault.inject.injector import Injector
 from vbnfault.inject.response import Response
+from vbnfault.lens.straylight.total import SunStraylight
 from vbnfault.pipeline import Session
 from vbnfault.pipeline.development import take_images
 from vbnfault.pipeline.injection import inject_faults
@@ -411,6 +412,20 @@ def test_images_with_one_sun_share_its_straylight_and_have_the_bits_of_their_own
         assert result.injected.all()
         np.testing.assert_array_equal(Injector(scene)(image, number, sun=place).image, result.image)
     assert (results[0].image != results[2].image).any()
+
+
+def test_images_with_one_sun_and_one_state_of_the_lens_sum_its_straylight_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    made: list[float] = []
+    total = SunStraylight.total
+    monkeypatch.setattr(SunStraylight, "total", lambda light, s: made.append(s) or total(light, s))
+    image, tables = np.full((64, 96), 90, np.uint8), {"straylight": {"model": "traced"}}
+    scene = Scene.model_validate({"title": "inject", "camera": CAMERA, "faults": tables})
+    injector = Injector(scene, effects=False)
+    for number, state, y, count in ((0, 0, 20, 1), (1, 0, 20, 1), (2, 1, 20, 2), (3, None, 20, 3), (4, 0, 21, 4)):
+        injector(image, number, state=state, sun=(40, y))
+        assert len(made) == count
 
 
 @pytest.mark.parametrize("exposure_s", [0.3, 2.5e-4])

@@ -25,6 +25,7 @@ were the only ghost: `pair` (the reflecting rows of the prescription), `flux_fra
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -219,8 +220,10 @@ class _LensStraylight(LensFault):
         return np.zeros(context.shape, np.float32) if light is None else intensity_dn(light.added, context.camera)
 
     def _light(self, params: Params, context: FaultContext) -> AddedLight | None:
-        """Return the straylight of a sample."""
-        return self.added_light(params, context, _of_view(context))
+        """Return the straylight of a sample; samples of a view with the same lens in the same state share it."""
+        state = pickle.dumps((self, params)), context.camera, context.sun_visible_fraction, context.coating_loss
+        make = partial(self.added_light, params, context, _of_view(context))
+        return context.of_view.once("straylight", state, make)
 
     def added_light(
         self, params: Params, context: FaultContext, once: Once, *, spikes: tuple[int, int] = FINE_SPIKES

@@ -296,8 +296,8 @@ class _Surfaces:
         """
 
         def within(surface: int, most: float) -> float:
-            beta = np.geomspace(1e-6, most * (1 - 1e-9), _OFFSETS.size)
-            return float(np.trapezoid(beta**2 * self._bsdf(surface, beta), x=np.log(beta)))
+            beta, log_beta = _up_to(most)
+            return float(np.trapezoid(beta**2 * self._bsdf(surface, beta), x=log_beta))
 
         out = np.ones(len(self.stretch))
         for k in np.flatnonzero(self.stretch < 1):
@@ -310,6 +310,13 @@ class _Surfaces:
         """Return the sum of the TIS of all surfaces."""
         dust = particle_scatter_fraction(self.level, self.wavelength_nm) if self.dusty.any() else 0.0
         return sum(harvey.tis for harvey in self.roughness) + dust * int(self.dusty.sum())
+
+
+@lru_cache(maxsize=256)
+def _up_to(most: float) -> tuple[F64, F64]:
+    """Return values of β from 1e-6 to just below `most` and their logarithms, float64[sample]."""
+    beta = np.geomspace(1e-6, most * (1 - 1e-9), _OFFSETS.size)
+    return beta, np.log(beta)
 
 
 @lru_cache(maxsize=64)
