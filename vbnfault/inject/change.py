@@ -23,7 +23,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.process.llvm import backend, evaluated, flat, on_device
+from ..core.process.llvm import backend, empty, evaluated, flat, on_device
 from ..core.quantities import RGBI, Electrons
 from ..detector.mosaic import sample
 from ..detector.noise import codes_on_device, draw_normals, poisson, poisson_of_codes, poisson_quantile
@@ -49,6 +49,8 @@ def struck(
     """
     rng = development.rng
     before, optical = picture.electrons, acting_at(draws, "electrons")
+    inside, on_image = any(acting_at(draws, step) for step in MOSAIC_STEPS), bool(acting_at(draws, "rgbi"))
+    through_sensor = inside or (bool(optical) and development.exposure.camera.detector.mosaic is not None)
     if optical:
         shared = after = development.signal(draws, optical).merged.array
         change = picture.in_image(after - before.array)
@@ -59,18 +61,18 @@ def struck(
             made = of(light).signal(draws, optical).merged.array
             return cv2.subtract(made, shared).reshape(shared.shape)
 
-        below = picture.seen(picture.below) if picture.below.any() else None
+        below = None if picture.below is None else picture.seen(picture.below)
         of_below = None if below is None else picture.in_image(moved(below) - below.array)
         seen = change if of_below is None else change + of_below
         noise = _missing_noise(picture, seen, picture.collected(after), moved, rng)
-        change, after = change + noise, after + (picture.seen(noise).array if noise.any() else 0)
+        if (through_sensor or not on_image) and noise.any():
+            after = after + picture.seen(noise).array
+        change = np.add(change, noise, out=noise)
     else:
         after, change, of_below = before.array, np.zeros_like(picture.light), None
-    inside = any(acting_at(draws, step) for step in MOSAIC_STEPS)
-    if inside or (optical and development.exposure.camera.detector.mosaic is not None):
+    if through_sensor:
         change = picture.in_image(_through_sensor(picture, development, draws, after, rng))
     numbers = picture.with_change(change if of_below is None else change + of_below)
-    on_image = bool(acting_at(draws, "rgbi"))
     if on_image:
         shown = RGBI(array=levels(numbers, picture.response))
         numbers = picture.with_levels(numbers, shown, development.read_out(shown, draws))
@@ -97,10 +99,13 @@ def _missing_noise(picture: Picture, change: F32, after: F32, act: Callable[[Ele
     left = on_device(picture.in_image(act(picture.seen(probe)))) * white
     variance = left * left
     # a fault that acts on each pixel alone keeps the signs; a blur mixes them, and its variance varies slowly
-    turned = evaluated(be.UInt8(dr.select(left * signs < 0, be.UInt32(255), be.UInt32(0)))).reshape(shape)
-    if turned.any():
-        near = cv2.blur(turned, (_NEARBY_PX, _NEARBY_PX))
-        smooth = cv2.blur(evaluated(variance).reshape(shape), (_NEARBY_PX, _NEARBY_PX))
+    turned = be.UInt8(dr.select(left * signs < 0, be.UInt32(255), be.UInt32(0)))
+    dr.eval(variance, turned)
+    if evaluated(turned).any():
+        near, smooth = (
+            cv2.blur(evaluated(of).reshape(shape), (_NEARBY_PX, _NEARBY_PX), empty(shape, kind))
+            for of, kind in ((turned, np.uint8), (variance, np.float32))
+        )
         mixed = be.UInt8(flat(near)) > round(255 * _MIXED)
         variance = dr.select(mixed, on_device(smooth), variance)
     missing = dr.maximum(dr.maximum(on_device(after), 0) * white + read2 - variance, 0)

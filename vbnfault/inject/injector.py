@@ -20,6 +20,7 @@ from ..core.shared_results import SharedResults
 from ..detector import GreyDetector, ThreeColourDetector
 from ..faults import Fault, FaultContext
 from ..faults.contract import with_sensor
+from ..pipeline import masks
 from ..pipeline.development import Development, Draws, without
 from ..pipeline.exposure import reference_exposure_s
 from ..pipeline.injection import draw_faults, visible_draws
@@ -275,14 +276,14 @@ class Injector:
             }
         labels = self._labels(Injection(draws=draws, development=development))
         nothing = np.zeros(known.shape, dtype=bool)
-        effects = np.array([labels.effects.get(name, nothing) for name in self.faults], dtype=bool)
+        effects = [labels.effects.get(name, nothing) for name in self.faults] if self.effects else []
         return Injected(
             image=development.image(draws).array if result is None else result,
             clean=development.image({}).array if picture is None else picture.numbers,
             faults=tuple(self.faults),
             masks=labels.masks,
             mask_any=labels.mask_any,
-            mask_effect=effects.reshape(-1, *known.shape) if self.effects else None,
+            mask_effect=np.array(effects, dtype=bool).reshape(-1, *known.shape) if self.effects else None,
             injected=np.array([name in draws for name in self.faults], dtype=bool),
             parameters={name: {"model": draw.fault.model, **draw.params} for name, draw in sorted(draws.items())},
             left_out=left_out,
@@ -324,9 +325,7 @@ class Injector:
         if self.effects:
             return labels_of(self.faults, injection, members, ("mask_effect",))
         labels = labels_of(self.faults, injection, (), ())
-        united = [mask for name, mask in zip(self.faults, labels.masks, strict=True) if name in members]
-        nothing = np.zeros(injection.development.context.shape, dtype=bool)
-        return replace(labels, mask_any=np.any([nothing, *united], axis=0))
+        return replace(labels, mask_any=masks.union(labels.masks, self.faults, members))
 
     def _drawn(
         self, development: Development, drawing: _Drawing, commanded: Sequence[str] | None

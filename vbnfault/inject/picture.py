@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from ..camera import Camera
 from ..core.errors import InputError
-from ..core.process.llvm import backend, evaluated, flat, on_device
+from ..core.process.llvm import backend, empty, evaluated, flat, on_device
 from ..core.quantities import LUMINANCE, RGBI, Electrons
 from ..detector.demosaic import interpolate
-from ..detector.interface import with_luminance
 from ..detector.mosaic import channel_of, sample
 from ..detector.noise import draw_normals, normal_field, poisson
+from ..detector.three_colour import compiled_with_luminance
 from ..scene.instrument import ImageTable
 from .response import Response, read_table
 
@@ -43,9 +43,6 @@ class Picture:
         The image as given, [y, x] or [y, x, channel].
     light
         Light that the numbers stand for over that of white, float32[y, x, channel of the image], not below 0.
-    below
-        How far numbers lie below black, as light over that of white, float32[y, x, channel of the image], not above
-        0. It is noise, which faults dim and blur with the light.
     white_e
         Electrons at white, float32[channel of the image]. Grey images and raw mosaics have one channel, whose white
         is the full well over the gain.
@@ -63,7 +60,6 @@ class Picture:
 
     numbers: NDArray[Any]
     light: F32
-    below: F32
     white_e: F32
     response: Response
     camera: Camera
@@ -86,12 +82,12 @@ class Picture:
         top = min(response.white_dn, np.iinfo(numbers.dtype).max if numbers.dtype.kind in "ui" else np.inf)
         bottom = min(0, response.black_dn)
         lost = response.of_image(numbers, lambda n: ((n >= top) | (n <= bottom)).astype(np.uint8))
-        shown = np.atleast_3d(response.of_image(numbers, response.shown))
-        light = np.maximum(shown, _FAINT if response.black_dn > 0 else 0)
+        least = _FAINT if response.black_dn > 0 else np.float32(0)
+        light = response.of_image(numbers, lambda n: np.maximum(response.shown(n), least))
+        light = np.atleast_3d(light)
         return cls(
             numbers=numbers,
             light=light,
-            below=np.minimum(shown, 0),
             white_e=_white_e(light.shape[2], camera),
             response=response,
             camera=camera,
@@ -99,6 +95,17 @@ class Picture:
             unrecoverable=np.asarray(reduce(np.maximum, cv2.split(lost))).view(np.bool_),
             assumptions=assumptions,
         )
+
+    @cached_property
+    def below(self) -> F32 | None:
+        """Return how far numbers lie below black, as light over that of white; None if none does.
+
+        It is float32[y, x, channel of the image], not above 0: noise, which faults dim and blur with the light.
+        """
+        if self.numbers.dtype.kind == "u" and self.response.black_dn <= 0:
+            return None
+        below = self.response.of_image(self.numbers, lambda n: np.minimum(self.response.shown(n), 0))
+        return np.atleast_3d(below) if below.any() else None
 
     @cached_property
     def electrons(self) -> Electrons:
@@ -142,8 +149,9 @@ class Picture:
         """Return a change of the camera's electrons as one of the image's light, float32[y, x, channel]."""
         if self.raw:
             return sample(change_e, self.camera.mosaic.sensor.pattern)[..., None] / self.white_e
-        mixed = cv2.transform(change_e, self._mixing[1] / self.camera.detector.white_e)
-        return np.asarray(mixed).reshape(self.light.shape)
+        out = empty(self.light.shape)
+        cv2.transform(change_e, self._mixing[1] / self.camera.detector.white_e, out)
+        return out
 
     @cached_property
     def _mixing(self) -> tuple[F32, F32]:
@@ -232,7 +240,7 @@ def levels(numbers: NDArray[Any], response: Response) -> NDArray[np.uint8]:
     if eight.shape[2] == 1:
         eight = cv2.merge([eight] * 4)
     elif eight.shape[2] == 3:
-        eight = with_luminance(eight)
+        eight = compiled_with_luminance(eight)
     return np.ascontiguousarray(eight)
 
 

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..core.errors import InputError, in_file, under_key
 from ..core.files import user_files
+from ..core.process.llvm import empty
 from ..scene.instrument import ResponseCurve
 
 F64 = NDArray[np.float64]
@@ -47,7 +48,9 @@ class Response:
             return function(numbers)
         table = function(np.arange(np.iinfo(numbers.dtype).max + 1, dtype=numbers.dtype))
         if numbers.dtype == np.uint8:
-            return np.asarray(cv2.LUT(numbers, table)).reshape(numbers.shape)  # ten times as fast as numpy
+            out = empty(numbers.shape, table.dtype)
+            cv2.LUT(numbers, table, out)  # ten times as fast as numpy
+            return out
         return np.take(table, numbers)
 
     def light(self, numbers: ArrayLike) -> F64:

@@ -13,6 +13,7 @@ from __future__ import annotations
 import ctypes
 import functools
 import importlib.metadata
+import math
 import os
 import re
 import sys
@@ -23,7 +24,7 @@ from types import SimpleNamespace
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from ..errors import VbnfaultError
 
@@ -133,11 +134,18 @@ def flat(array: NDArray[T]) -> NDArray[T]:
     step = max(_ALIGNED_BYTES, _LANES * array.itemsize)
     if array.flags.c_contiguous and array.ctypes.data % step == 0:
         return array.reshape(-1)
-    memory = np.empty(array.nbytes + step, np.uint8)
-    start = -memory.ctypes.data % step
-    out: NDArray[T] = memory[start : start + array.nbytes].view(array.dtype)
+    out: NDArray[T] = empty((array.size,), array.dtype)
     out[...] = array.reshape(-1)
     return out
+
+
+def empty(shape: tuple[int, ...], dtype: DTypeLike = np.float32) -> NDArray[Any]:
+    """Return an array to write to which `flat` does not copy."""
+    size = np.dtype(dtype).itemsize * math.prod(shape)
+    step = max(_ALIGNED_BYTES, _LANES * np.dtype(dtype).itemsize)
+    memory = np.empty(size + step, np.uint8)
+    start = -memory.ctypes.data % step
+    return memory[start : start + size].view(dtype).reshape(shape)
 
 
 def on_device(array: NDArray[Any]) -> Any:
