@@ -308,7 +308,13 @@ class Device:
         scale = {
             name: full * float(gain) for name, gain in zip(sensor.pattern.channels, self.white_balance, strict=True)
         }
-        red, green, blue = (scale.get(colour, scale.get("W", full)) for colour in "RGB")
+        intensity = None
+        if "W" in scale:
+            unfiltered = interpolate(mosaic, sensor.pattern, "W")
+            intensity = self._levels(cv2.subtract(unfiltered, black), scale["W"])
+            if len(scale) == 1:
+                return RGBI(array=cv2.merge([intensity] * 4))
+        red, green, blue = (scale[colour] for colour in "RGB")
         noise_dn = sensor.readout.read_noise_e_rms * sensor.readout.system_gain_dn_per_e
         linear = demosaic(mosaic, sensor.pattern, sensor.method)
         if sensor.pattern.is_bayer and sensor.method != "bilinear":
@@ -319,13 +325,8 @@ class Device:
         above = cv2.subtract(linear, (black, black, black, 0.0))
         rgb = self._levels(above, (red, green, blue, 0.0))
         out = np.empty((*raw.shape, 4), dtype=np.uint8)
-        if "W" in sensor.pattern.channels:
-            unfiltered = interpolate(mosaic, sensor.pattern, "W")
-            intensity = self._levels(cv2.subtract(unfiltered, black), scale["W"])
-        else:
-            intensity = luminance(rgb)
-        intensity = intensity.reshape(*raw.shape, 1)
-        cv2.mixChannels([rgb, intensity], [out], [0, 0, 1, 1, 2, 2, 3, 3])
+        shown = luminance(rgb) if intensity is None else intensity
+        cv2.mixChannels([rgb, shown.reshape(*raw.shape, 1)], [out], [0, 0, 1, 1, 2, 2, 3, 3])
         return RGBI(array=out)
 
     def _levels(self, above: Any, scale: Any) -> NDArray[np.uint8]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -19,7 +19,7 @@ from pydantic import Field
 from scipy.special import ndtr, stdtrit
 
 from ..core.errors import InputError
-from ..core.process.llvm import backend, evaluated, on_device
+from ..core.process.llvm import backend, empty, evaluated, on_device
 from ..core.tables import table_class
 from .noise import normal_field
 
@@ -368,8 +368,9 @@ def clip_full_well(electrons: F32, full_well_e: float) -> F32:
     return np.minimum(electrons, np.float32(full_well_e))
 
 
+@lru_cache(maxsize=1)
 def banding_e(shape: tuple[int, int], spec: ReadoutSpec) -> F32:
-    """Return the interference in electrons, float32[y, x]: A sin(2π f t + φ) at the time t of each pixel."""
+    """Return the interference in electrons, float32[y, x], read-only: A sin(2π f t + φ) at each pixel's time t."""
     # sin(a + b) of the line's and the pixel's phase is a sum of two products [y] × [x]: no sine per pixel is needed
     line_s, pixel_s = readout_time_s(shape, spec)
     turn = 2 * math.pi * spec.banding_frequency_hz
@@ -377,8 +378,9 @@ def banding_e(shape: tuple[int, int], spec: ReadoutSpec) -> F32:
     wave = (spec.banding_seen_e * np.stack([np.sin(line), np.cos(line)])).astype(np.float32)
     across = np.stack([np.cos(pixel), np.sin(pixel)]).astype(np.float32)
     # BLAS is avoided: its sums may depend on the shape
-    out: F32 = wave[0][:, None] * across[0]
+    out: F32 = np.multiply(wave[0][:, None], across[0], out=empty(shape))
     out += wave[1][:, None] * across[1]
+    out.flags.writeable = False
     return out
 
 

@@ -139,7 +139,7 @@ class PacketTransmission(Fault):
 def _arrived(raw: Raw, params: Params) -> tuple[Raw, Mask]:
     """Return the mosaic that arrives, and its pixels that were lost or had bits flipped, bool[y, x]."""
     order = _order(raw.shape, params["nodes"])
-    stream, hit = raw.ravel()[order], np.zeros(raw.size, dtype=np.bool_)
+    stream, hit = np.array(raw.ravel()[order]), np.zeros(raw.size, dtype=np.bool_)
     damaged, lost = (_positions(params[packets], params["packet_px"]) for packets in ("damaged", "lost"))
     # the number of variates depends neither on the signal nor on the rate
     rng, flips = np.random.default_rng(params["seed"]), np.zeros(damaged.shape, dtype=np.uint16)
@@ -188,8 +188,10 @@ def _positions(packets: ArrayLike, packet_px: int) -> NDArray[np.intp]:
 
 
 @lru_cache(maxsize=2)
-def _order(shape: tuple[int, int], nodes: int) -> NDArray[np.intp]:
-    """Return the order of transmission, computed once; read-only."""
+def _order(shape: tuple[int, int], nodes: int) -> NDArray[np.intp] | slice:
+    """Return the order of transmission, computed once; read-only. One node sends row by row."""
+    if nodes == 1:
+        return slice(None)
     order = transmission_order(shape, nodes)
     order.flags.writeable = False
     return order

@@ -134,9 +134,9 @@ def flat(array: NDArray[T]) -> NDArray[T]:
     step = max(_ALIGNED_BYTES, _LANES * array.itemsize)
     if array.flags.c_contiguous and array.ctypes.data % step == 0:
         return array.reshape(-1)
-    out: NDArray[T] = empty((array.size,), array.dtype)
-    out[...] = array.reshape(-1)
-    return out
+    out: NDArray[T] = empty(array.shape, array.dtype)
+    out[...] = array
+    return out.reshape(-1)
 
 
 def empty(shape: tuple[int, ...], dtype: DTypeLike = np.float32) -> NDArray[Any]:
