@@ -308,25 +308,6 @@ def test_cti_of_slow_traps_is_the_sum_over_all_clouds(rows: int) -> None:
     np.testing.assert_allclose(got, expected, rtol=0, atol=1e-3)
 
 
-def test_remembered_steps_run_once_for_equal_planes_and_give_copies() -> None:
-    calls = []
-
-    def double(plane: np.ndarray, *, offset: float) -> np.ndarray:
-        calls.append(offset)
-        return 2 * plane + np.float32(offset)
-
-    step, plane = charge.remembered(double), scene(7)
-    first = step(plane, offset=1.0)
-    first[:] = 0  # a later step may change it
-    np.testing.assert_array_equal(step(plane.copy(), offset=1.0), 2 * plane + 1)
-    assert calls == [1.0]
-    plane[0, 0] += 1
-    assert step(plane, offset=1.0)[0, 0] == 2 * plane[0, 0] + 1
-    step(plane.reshape(1, -1), offset=1.0)
-    step(plane, offset=2.0)
-    assert calls == [1.0, 1.0, 1.0, 2.0]
-
-
 def test_cti_of_one_bright_row_by_hand() -> None:
     image = np.zeros((60, 1), np.float32)
     image[9] = 20_000.0

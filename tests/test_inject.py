@@ -18,6 +18,7 @@ from vbnfault.camera import Camera
 from vbnfault.core.errors import InputError
 from vbnfault.core.files import resources
 from vbnfault.core.registry import forget
+from vbnfault.detector.effects import transfer
 from vbnfault.detector.three_colour import ThreeColourDetector
 from vbnfault.faults import registry
 from vbnfault.inject.injector import Injector
@@ -438,6 +439,20 @@ def test_light_of_a_flare_smears_in_the_image_as_in_its_mask(exposure_s: float) 
     assert 0.1 < mask.mean() < 0.9
     assert (changed != mask).mean() < 0.05  # levels that noise moves across a rounding, at the edge of the flare
     assert (mask.all(axis=0).mean() > 0.2) == (exposure_s < 0.01)
+
+
+def test_images_that_differ_in_the_readout_alone_share_the_charge_before_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    overflown: list[object] = []
+    bloom = transfer.bloom
+    monkeypatch.setattr(transfer, "bloom", lambda charge, **how: overflown.append(how) or bloom(charge, **how))
+    camera = {**CAMERA, "detector": "rosetta_navcam"}
+    camera = {key: value for key, value in camera.items() if key not in ("full_well_e", "read_noise_e_rms")}
+    tables = {"title": "inject", "camera": camera, "faults": {"cti": {}, "banding": {}, "adc": {}}}
+    result = Injector(Scene.model_validate(tables), effects=False)(np.full((64, 96), 90, np.uint8))
+    assert result.masks.any(axis=(1, 2)).all()
+    assert len(overflown) == 2  # with the traps and without
 
 
 def test_images_of_one_state_share_what_lasts_and_differ_in_what_happens_in_an_exposure() -> None:

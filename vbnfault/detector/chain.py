@@ -11,8 +11,8 @@ pixel always shows its own level.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass, fields, replace
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -197,19 +197,38 @@ class Device:
 
         Without `noise` the result is noise-free. `acts` are the changes that faults make, by the names of `STEPS`.
         """
-        numbers: Raw = self._run(photo_e, exposure_s, noise, acts)
+        return self.read(self.collected_e(photo_e, exposure_s, noise, acts), exposure_s, noise, acts)
+
+    def read(self, collected_e: F32, exposure_s: float, noise: MosaicNoise | None, acts: Acts) -> Raw:
+        """Return raw DN, uint16[y, x], of the charge at the output, as `collected_e` gives it."""
+        numbers: Raw = self._run(collected_e, exposure_s, noise, acts, start="full_well")
         return numbers
 
     def _run(
-        self, signal: Any, exposure_s: float, noise: MosaicNoise | None, acts: Acts, before: str | None = None
+        self,
+        signal: Any,
+        exposure_s: float,
+        noise: MosaicNoise | None,
+        acts: Acts,
+        start: str | None = None,
+        before: str | None = None,
     ) -> Any:
-        """Return the signal after the effects of the chain, up to but without the one named `before`."""
+        """Return the signal after the effects of the chain from `start` up to but without `before`, by name."""
         exposure = Exposure(device=self, exposure_s=exposure_s, noise=noise, acts=acts)
-        for effect in self.chain:
-            if effect.name == before:
-                break
+        names = [effect.name for effect in self.chain]
+        for effect in self.chain[start and names.index(start) : before and names.index(before)]:
             signal = _checked(effect, signal, effect.apply(signal, exposure))
         return signal
+
+    @cached_property
+    def charge_key(self) -> Hashable:
+        """Return a key of all of the device on which `collected_e` depends."""
+        sensor = self.sensor
+        readout: Hashable = sensor.readout
+        if all(is_packaged(type(effect)) for effect in self.chain):  # those of others may use all of it
+            readout = sensor.readout.nodes, sensor.readout.full_well_e
+        rest = (getattr(sensor, f.name) for f in fields(sensor) if f.name != "readout" and f.hash is not False)
+        return *rest, readout, self.seed, self.shape, self.temperature_K, self.direction
 
     # --- raw DN to image ------------------------------------------------------------------------------------------
 

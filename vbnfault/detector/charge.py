@@ -11,9 +11,8 @@ A direction ("up", "down", "left", "right") says where the charge moves. "up" ha
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Sequence
-from functools import lru_cache, partial
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -473,35 +472,6 @@ def parasitic_light(
 
 
 # ---------------------------------------------------------------------------------------------------- helpers
-
-
-class _Plane:
-    """Hold a plane of electrons, float32[y, x], that equals others with the same bits."""
-
-    def __init__(self, array: F32) -> None:
-        self.array = array
-        bits = hashlib.sha1(np.ascontiguousarray(array).data, usedforsecurity=False)
-        self._key = array.shape, bits.digest()
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Plane) and self._key == other._key
-
-    def __hash__(self) -> int:
-        return hash(self._key)
-
-
-def remembered(step: Callable[..., F32]) -> Callable[..., F32]:
-    """Return a function that keeps its last four results, for images that share the charge before a step.
-
-    `step` takes a plane of electrons, float32[y, x], and options that can be hashed.
-    """
-
-    @lru_cache(maxsize=4)
-    def made(plane: _Plane, **options: Any) -> F32:
-        array, plane.array = plane.array, np.empty((0, 0), np.float32)  # the plane itself is not kept
-        return step(array, **options)
-
-    return lambda signal_e, **options: made(_Plane(signal_e), **options).copy()
 
 
 def _facing(image: F32, direction: str, *, back: bool = False) -> F32:

@@ -109,13 +109,9 @@ class MosaicDetector(Detector):
         """
         return self.device.raw(sample(expected.array, self.sensor.pattern), exposure_s, noise, acts or {})
 
-    def held_e(self, expected: Electrons, exposure_s: float, noise: Any, acts: Acts) -> F32:
-        """Return the electrons that each pixel collects, at most its full well, float32[y, x].
-
-        Arguments are as in `raw`.
-        """
-        collected = self.device.collected_e(sample(expected.array, self.sensor.pattern), exposure_s, noise, acts)
-        return np.minimum(collected, np.float32(self.full_well_e))
+    def collected_e(self, expected: Electrons, exposure_s: float, noise: Any, acts: Acts) -> F32:
+        """Return the charge at the output, float32[y, x] in e, before the full well; arguments are as in `raw`."""
+        return self.device.collected_e(sample(expected.array, self.sensor.pattern), exposure_s, noise, acts)
 
     def develop(
         self,

@@ -16,13 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from ..detector.charge import bloom, remembered
+from ..detector.charge import bloom
 from .context import FaultContext, Params
 from .contract import Fault
 from .fields import Interval, Severity, bounds
-
-# the images without single faults that act later overflow alike
-_overflown = remembered(bloom)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,5 +59,5 @@ class Overflow(Fault):
         """Return the collected electrons after the overflow."""
         if not params:
             return quantity
-        charge = _overflown(np.ascontiguousarray(quantity.array), **params)
+        charge = bloom(np.ascontiguousarray(quantity.array), **params)
         return quantity.with_array(np.maximum(charge, np.float32(0)))

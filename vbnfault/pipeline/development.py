@@ -24,6 +24,8 @@ Draws = Mapping[str, Draw]
 Keys = tuple[tuple[str, int], ...]
 Mask = NDArray[np.bool_]
 
+_BEFORE_FULL_WELL = ("electrons", "light", "pixels", "charge")  # steps at which faults may change the charge
+
 
 def acting_at(draws: Draws, step: str) -> list[str]:
     """Return the drawn faults that act at a step, in physical order."""
@@ -72,6 +74,7 @@ class Development:
         self._contexts: dict[Keys, FaultContext] = {(): context}
         self._signals: dict[Any, Electrons] = {}
         self._images: dict[Any, RGBI] = {}
+        self._charges: dict[Any, NDArray[np.float32]] = {}
         self._raws: dict[Any, NDArray[np.uint16]] = {}
         self._effects: dict[Any, Mask] = {}
 
@@ -241,20 +244,36 @@ class Development:
         key = self._image_key(draws, noisy)
         raw = self._raws.get(key)
         if raw is None:
-            camera = self.camera_with(draws)
-            signal = self.signal(draws, acting_at(draws, "electrons"), keep=keep).merged
-            noise = self.noise if noisy else None
-            raw = camera.mosaic.raw(signal, camera.exposure_s, noise, self.acts(draws))
+            camera, noise = self.camera_with(draws), self.noise if noisy else None
+            charge = self._charge(draws, noisy=noisy, keep=keep)
+            raw = camera.mosaic.device.read(charge, camera.exposure_s, noise, self.acts(draws))
             if keep:
                 self._raws[key] = raw
         return raw
+
+    def _charge(self, draws: Draws, *, noisy: bool = True, keep: bool = True) -> NDArray[np.float32]:
+        """Return the charge at the output of a mosaic's sensor, float32[y, x] in e, before the full well.
+
+        Images whose faults differ in the readout alone share it. It is kept as `raw` is.
+        """
+        camera = self.camera_with(draws)
+        names = [name for step in _BEFORE_FULL_WELL for name in acting_at(draws, step)]
+        key = camera.mosaic.device.charge_key, camera.exposure_s, self._instrument(draws), noisy
+        key = *key, _acting_keys(draws, names)
+        charge = self._charges.get(key)
+        if charge is None:
+            signal = self.signal(draws, acting_at(draws, "electrons"), keep=keep).merged
+            noise = self.noise if noisy else None
+            charge = camera.mosaic.collected_e(signal, camera.exposure_s, noise, self.acts(draws))
+            if keep:
+                self._charges[key] = charge
+        return charge
 
     def left_behind(self, draws: Draws) -> FrameBefore:
         """Return what the exposure leaves behind for the next frame of its sequence."""
         camera, held_e = self.camera_with(draws), None
         if camera.detector.mosaic is not None:
-            light = self.signal(draws, acting_at(draws, "electrons")).merged
-            held_e = camera.mosaic.held_e(light, camera.exposure_s, self.noise, self.acts(draws))
+            held_e = np.minimum(self._charge(draws), np.float32(camera.detector.full_well_e))
         return FrameBefore(
             image=self.image(draws),
             light=self.signal(draws, []).merged,

@@ -5,11 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 
-from ..charge import ChargeCloud, TrapSpecies, along_columns, along_registers, bloom, capture, cti, remembered
+from ..charge import ChargeCloud, TrapSpecies, along_columns, along_registers, bloom, capture, cti
 from .contract import F32, Effect, Exposure
-
-# the images without single faults of the readout have the same charge before it
-_delayed = remembered(cti)
 
 
 class Blooming(Effect):
@@ -88,4 +85,4 @@ def _delay(exposure: Exposure, species: tuple[TrapSpecies, ...], transfer_s: flo
     cloud = sensor.transfer.cloud
     if cloud is None:
         cloud = ChargeCloud(full_well_e=sensor.readout.full_well_e)
-    return partial(_delayed, species=species, cloud=cloud, transfer_s=transfer_s)
+    return partial(cti, species=species, cloud=cloud, transfer_s=transfer_s)
