@@ -216,7 +216,8 @@ class Device:
         """Return the signal after the effects of the chain from `start` up to but without `before`, by name."""
         exposure = Exposure(device=self, exposure_s=exposure_s, noise=noise, acts=acts)
         names = [effect.name for effect in self.chain]
-        for effect in self.chain[start and names.index(start) : before and names.index(before)]:
+        first, last = (names.index(name) if name else None for name in (start, before))
+        for effect in self.chain[first:last]:
             signal = _checked(effect, signal, effect.apply(signal, exposure))
         return signal
 

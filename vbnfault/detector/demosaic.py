@@ -193,6 +193,8 @@ def footprint(mask: Mask, pattern: Pattern, method: Method = "bilinear") -> Mask
     kernels. The methods of Malvar and Menon, with `bounded_at_edges`, choose by the signal. For them the result is
     the union over all choices, up to 2 and 8 pixels away; a single image shows a part of this.
     """
+    if pattern.channels == ("W",):
+        return mask.copy()
     ones = np.ascontiguousarray(mask, dtype=np.float32)
     if method != "bilinear" and pattern.is_bayer:
         return cv2.dilate(np.ascontiguousarray(mask, dtype=np.uint8), _support(method)).view(np.bool_)

@@ -257,9 +257,8 @@ class Development:
         Images whose faults differ in the readout alone share it. It is kept as `raw` is.
         """
         camera = self.camera_with(draws)
-        names = [name for step in _BEFORE_FULL_WELL for name in acting_at(draws, step)]
-        key = camera.mosaic.device.charge_key, camera.exposure_s, self._instrument(draws), noisy
-        key = *key, _acting_keys(draws, names)
+        acting = _acting_keys(draws, [name for step in _BEFORE_FULL_WELL for name in acting_at(draws, step)])
+        key = camera.mosaic.device.charge_key, camera.exposure_s, self._instrument(draws), acting, noisy
         charge = self._charges.get(key)
         if charge is None:
             signal = self.signal(draws, acting_at(draws, "electrons"), keep=keep).merged
