@@ -4,9 +4,10 @@
     python benchmarks/inject_speed.py --only "detector: all"
 
 The first table has the time of one image after set-up: the six faults of the paper, the faults of the sensor
-together and each alone, traced straylight with a new Sun and with the same one, and `vbnfault.torch.Inject` on
-batches of 256×256 pixels. The arms take turns, round by round; the table gives medians. A line says how much of the
-machine's processor time other programs took meanwhile: wall times count only where that is little.
+together and each alone, traced straylight with a new Sun, with the same one, and also with the lens in the same
+state, as in a sequence, and `vbnfault.torch.Inject` on batches of 256×256 pixels. The arms take turns, round by
+round; the table gives medians. A line says how much of the machine's processor time other programs took meanwhile:
+wall times count only where that is little.
 
 The second table (`benchmarks/inject_beside.py`) needs `pip install imagecorruptions 'albumentations<2.1'` and is
 left out without them. `--only beside` measures it alone.
@@ -43,6 +44,7 @@ TARGETS_MS = {
     "detector: all": 120,
     "traced, a new Sun": 400,
     "traced, the same Sun": 60,
+    "traced, the same Sun and lens": 60,
 }
 
 
@@ -51,12 +53,17 @@ def arms(size_px: int) -> Iterator[tuple[str, Callable[[], Arm]]]:
     sun = (0.68 * size_px, 0.3 * size_px)
 
     def of(
-        faults: Mapping[str, Any], channels: int = 1, *, moves: bool = False, **camera: Any
+        faults: Mapping[str, Any],
+        channels: int = 1,
+        *,
+        moves: bool = False,
+        state: int | None = None,
+        **camera: Any,
     ) -> Callable[[], Arm]:
         def set_up() -> Arm:
             run, image = injector(faults, **camera), textured(size_px, channels)
             shift = 0.11 * float(moves)
-            return lambda k: run(image, k, sun=(sun[0] + shift * k, sun[1] - shift * k))
+            return lambda k: run(image, k, state=state, sun=(sun[0] + shift * k, sun[1] - shift * k))
 
         return set_up
 
@@ -69,6 +76,7 @@ def arms(size_px: int) -> Iterator[tuple[str, Callable[[], Arm]]]:
     traced = {"straylight": {"model": "traced"}}
     yield "traced, a new Sun", of(traced, 3, moves=True, fov_deg=20.0)
     yield "traced, the same Sun", of(traced, 3, fov_deg=20.0)
+    yield "traced, the same Sun and lens", of(traced, 3, state=0, fov_deg=20.0)
     yield f"torch.Inject, {SMALL_PX} px", batches
 
 
@@ -86,10 +94,10 @@ def batches() -> Arm:
 
 def table(turns: Turns, targets_ms: Mapping[str, float]) -> str:
     """Return the table of the times."""
-    lines = [f"{'ms an image':<28}{'wall':>8}{'CPU':>8}{'target':>8}{'ratio':>8}"]
+    lines = [f"{'ms an image':<30}{'wall':>8}{'CPU':>8}{'target':>8}{'ratio':>8}"]
     for name, wall in turns.wall_ms.items():
         count = BATCH if name.startswith("torch") else 1
-        line = f"{name:<28}{wall / count:8.1f}{turns.processor_ms[name] / count:8.1f}"
+        line = f"{name:<30}{wall / count:8.1f}{turns.processor_ms[name] / count:8.1f}"
         if name in targets_ms:
             line += f"{targets_ms[name]:8.0f}{wall / targets_ms[name]:8.2f}"
         lines.append(line)
