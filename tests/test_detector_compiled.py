@@ -9,7 +9,7 @@ import pytest
 from test_detector import draw
 
 from vbnfault.core.process.llvm import backend
-from vbnfault.core.quantities import RGBI, Electrons
+from vbnfault.core.quantities import Electrons
 from vbnfault.detector import GreyDetector, Noise, ThreeColourDetector
 from vbnfault.detector.noise import NormalField, draw_normals, variates_by_code
 
@@ -133,33 +133,9 @@ def test_arrays_in_any_order_and_place_in_memory_give_the_same_image() -> None:
 
 def test_shapes_that_differ_are_refused() -> None:
     detector = ThreeColourDetector()
-    light, other = (
-        Electrons(array=np.ones((*s, 3), np.float32), white_e=detector.white_e) for s in ((4, 6), (6, 4))
-    )
+    light = Electrons(array=np.ones((4, 6, 3), np.float32), white_e=detector.white_e)
     with pytest.raises(ValueError, match="noise has the shape"):
         detector.develop(light, EXPOSURE_S, draw(1, (6, 4)))
-    with pytest.raises(ValueError, match="base has the shape"):
-        detector.develop(light, EXPOSURE_S, None, base=(other, detector.develop(other, EXPOSURE_S, None)))
-
-
-@pytest.mark.parametrize("noisy", [True, False])
-def test_values_of_the_same_signal_are_taken_from_the_other_image(noisy: bool) -> None:
-    detector, shape = ThreeColourDetector(), (70, 50)
-    noise = draw(5, shape) if noisy else None
-    known, signal = sky(shape, 0.7), sky(shape, 0.7)
-    signal[20:60, 3:40] *= np.float32(1.5)
-    one, other = (Electrons(array=a, white_e=detector.white_e) for a in (signal, known))
-    of_other = detector.develop(other, EXPOSURE_S, noise)
-    image = detector.develop(one, EXPOSURE_S, noise, base=(other, of_other)).array
-    np.testing.assert_array_equal(image, detector.develop(one, EXPOSURE_S, noise).array)
-    marked = RGBI(array=255 - of_other.array)  # what is taken shows this
-    image = detector.develop(one, EXPOSURE_S, noise, base=(other, marked)).array
-    taken = signal == known
-    if noise is not None:
-        taken.reshape(-1, 3)[noise.outermost_pixels] = False  # they are developed in any case
-    assert 0.1 < taken.mean() < 0.9
-    np.testing.assert_array_equal(image[..., :3][taken], marked.array[..., :3][taken])
-    np.testing.assert_array_equal(image[..., :3][~taken], stepwise(detector, one, noise)[..., :3][~taken])
 
 
 @pytest.mark.parametrize("noisy", [True, False])
@@ -200,7 +176,7 @@ def test_exposures_and_variates_share_kernels() -> None:
 
 @pytest.mark.parametrize("noisy", [False, True])
 @pytest.mark.parametrize("width", [64, 33])
-def test_a_grey_detector_has_the_bits_of_its_steps_and_reuses_an_image(width: int, noisy: bool) -> None:
+def test_a_grey_detector_has_the_bits_of_its_steps(width: int, noisy: bool) -> None:
     detector = GreyDetector(width_px=width, height_px=40)
     assert detector.white_e.tolist() == [detector.full_well_e]  # white reaches the full well
     signal = sky((40, width), 0.6)[..., :1].copy()
@@ -209,7 +185,3 @@ def test_a_grey_detector_has_the_bits_of_its_steps_and_reuses_an_image(width: in
     expected = Electrons(array=signal, white_e=detector.white_e)
     image = detector.develop(expected, EXPOSURE_S, noise)
     assert (image.array == image.array[..., :1]).all()
-    brighter = expected.with_array(np.where(np.arange(width)[None, :, None] < 9, signal * 2, signal))
-    reused = detector.develop(brighter, EXPOSURE_S, noise, base=(expected, image)).array
-    np.testing.assert_array_equal(reused, detector.develop(brighter, EXPOSURE_S, noise).array)
-    assert (reused != image.array).any()

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-from collections import Counter
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -16,9 +13,8 @@ from conftest import ALL_FAULTS, recorded_calls, small_scene
 
 from vbnfault import pipeline
 from vbnfault.core import frames
-from vbnfault.detector import ThreeColourDetector
-from vbnfault.pipeline import Session, injection, masks
-from vbnfault.pipeline.development import Development, acting_at, without
+from vbnfault.pipeline import Session, masks
+from vbnfault.pipeline.development import without
 from vbnfault.pipeline.record import to_sample
 from vbnfault.pipeline.resolve import resolve
 from vbnfault.pipeline.spec import Frame
@@ -439,81 +435,6 @@ def test_the_effect_by_rows_equals_the_effect_of_whole_pictures(frames_: list[Fr
         for name in draws:
             other = development.image(without(draws, name), noisy=False).array
             assert np.array_equal(development.effect(draws, name), (whole != other).any(axis=-1))
-
-
-def test_a_fault_that_some_rows_show_changes_the_whole_image(frames_: list[Frame]) -> None:
-    counts: Counter[str] = Counter()
-    for frame in frames_:
-        development, draws = frame.injection.development, frame.injection.draws
-        for name in injection._seen_on_some_rows(development, draws):
-            least_dn = max(draws[name].fault.effect_level_dn, 2.0)
-            assert development.effect(draws, name, least_dn).any()
-            counts[name] += 1
-        # every eighth row of frames of 48 rows and more shows any fault that darkens the frame as a whole
-        assert "vignetting" not in draws or "vignetting" in injection._seen_on_some_rows(development, draws)
-    assert len(counts) >= 3
-
-
-@contextlib.contextmanager
-def counted_pixels(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
-    """Give a list to which each development of an image adds the number of pixels that no other image gives it."""
-    developed: list[int] = []
-    develop = ThreeColourDetector.develop
-
-    def counted(self: Any, expected: Any, *more: Any, base: Any = None) -> Any:
-        *first, known = (*more, base) if len(more) < 4 else more
-        differs = True if known is None else (expected.array != known[0].array).any(axis=2)
-        developed.append(np.count_nonzero(np.broadcast_to(differs, expected.array.shape[:2])))
-        return develop(self, expected, *first, base=known)
-
-    with monkeypatch.context() as patched:
-        patched.setattr(ThreeColourDetector, "develop", counted)
-        yield developed
-
-
-def test_a_twin_takes_the_pixels_that_its_fault_does_not_change(
-    frames_: list[Frame], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A twin has the bits of the image without its fault, and takes no more pixels than the fault changes."""
-    tried = 0
-    for frame in frames_:
-        for name in set(frame.drawn) & {"dust_on_optics", "straylight"}:
-            draws, given = frame.injection.draws, frame.injection.development
-            own = Development(exposure=given.exposure, context=given.context, rng=frame.spec.rng)
-            own.image(draws)
-            expected = own.image(without(draws, name)).array
-            fresh = Development(exposure=given.exposure, context=given.context, rng=frame.spec.rng)
-            fresh.image(draws)
-            with counted_pixels(monkeypatch) as developed:
-                twin = fresh.twin(draws, name)
-            np.testing.assert_array_equal(twin.array, expected)
-            assert fresh.image(without(draws, name)).array is twin.array, "the twin is kept"
-            lit = [own.signal(d, acting_at(d, "electrons")).merged.array for d in (draws, without(draws, name))]
-            assert developed == [np.count_nonzero((lit[0] != lit[1]).any(axis=2))]
-            tried += 0 < developed[0] < 96 * 80
-    assert tried > 2
-
-
-def test_an_image_takes_the_pixels_of_the_clean_one_that_do_not_differ(
-    frames_: list[Frame], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    few = 0
-    for frame in frames_:
-        draws, given = frame.injection.draws, frame.injection.development
-        optical = acting_at(draws, "electrons")
-        alone, after = (
-            Development(exposure=given.exposure, context=given.context, rng=frame.spec.rng) for _ in range(2)
-        )
-        after.image({})
-        with counted_pixels(monkeypatch) as developed:
-            image = after.image(draws)
-        np.testing.assert_array_equal(image.array, alone.image(draws).array)
-        lit = [after.signal(draws, names).merged.array for names in ([], optical)]
-        changed = np.count_nonzero((lit[0] != lit[1]).any(axis=2))
-        if optical:  # without optical faults the image before readout is the clean one
-            assert developed == [changed]
-            few += 0 < changed < 96 * 80
-    assert few > 2
 
 
 def test_clean_twin_differs_only_where_faults_are(frames_: list[Frame]) -> None:

@@ -47,10 +47,6 @@ class Detector(Protocol):
         """Return the detector itself if it has a colour mosaic, with its device and raw DN; else None."""
 
     @property
-    def local(self) -> bool:
-        """Return whether each pixel of the image depends on the light on this pixel alone."""
-
-    @property
     def optics_key(self) -> Any:
         """Return a hashable key of all on which the expected electrons depend."""
 
@@ -120,19 +116,11 @@ class Detector(Protocol):
     def draw_noise(self, shape: tuple[int, int], rng: Callable[[str], np.random.Generator]) -> Any:
         """Draw the variates of one exposure. `rng` returns the random generator for a name."""
 
-    def develop(
-        self,
-        expected: Electrons,
-        exposure_s: float,
-        noise: Any,
-        acts: Acts | None = None,
-        base: tuple[Electrons, RGBI] | None = None,
-    ) -> RGBI:
+    def develop(self, expected: Electrons, exposure_s: float, noise: Any, acts: Acts | None = None) -> RGBI:
         """Return the 8 bit image of the expected photo-electrons.
 
         `noise` comes from `draw_noise`; None gives a noise-free image. `acts` are the changes that faults make at
-        the steps of `effects.STEPS`, for a detector with a colour mosaic. `base` is another signal with its image
-        for the same exposure and noise, from which a `local` detector takes the pixels with this signal.
+        the steps of `effects.STEPS`, for a detector with a colour mosaic.
         """
 
 

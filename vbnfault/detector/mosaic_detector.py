@@ -9,7 +9,7 @@ import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,9 +40,6 @@ class MosaicDetector(Detector):
     width_px: int = 1024
     height_px: int = 1024
     direction: str = "up"
-
-    # demosaicing makes a pixel of the image depend on other pixels
-    local: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         sensor = self.sensor
@@ -113,15 +110,8 @@ class MosaicDetector(Detector):
         """Return the charge at the output, float32[y, x] in e, before the full well; arguments are as in `raw`."""
         return self.device.collected_e(sample(expected.array, self.sensor.pattern), exposure_s, noise, acts)
 
-    def develop(
-        self,
-        expected: Electrons,
-        exposure_s: float,
-        noise: Any,
-        acts: Acts | None = None,
-        base: tuple[Electrons, RGBI] | None = None,
-    ) -> RGBI:
-        """Return the 8 bit image of the expected photo-electrons. Arguments are as in `raw`; `base` is not used."""
+    def develop(self, expected: Electrons, exposure_s: float, noise: Any, acts: Acts | None = None) -> RGBI:
+        """Return the 8 bit image of the expected photo-electrons. Arguments are as in `raw`."""
         return self.rgbi(self.raw(expected, exposure_s, noise, acts), exposure_s)
 
     def rgbi(self, raw: NDArray[np.uint16], exposure_s: float) -> RGBI:

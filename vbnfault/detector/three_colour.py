@@ -90,8 +90,6 @@ class ThreeColourDetector(Detector):
     response: str = "nikon_5100"
     quantum_efficiency_peak: float = 0.5
 
-    # each pixel of the image is independent of the others
-    local: ClassVar[bool] = True
     channels: ClassVar[tuple[str, ...]] = ("R", "G", "B")
 
     def __post_init__(self) -> None:
@@ -147,31 +145,20 @@ class ThreeColourDetector(Detector):
             "gain_dn_per_e": self.gain_dn_per_e,
         }
 
-    def develop(
-        self,
-        expected: Electrons,
-        exposure_s: float,
-        noise: Any,
-        acts: Any = None,
-        base: tuple[Electrons, RGBI] | None = None,
-    ) -> RGBI:
+    def develop(self, expected: Electrons, exposure_s: float, noise: Any, acts: Any = None) -> RGBI:
         """Return the 8 bit image of the expected photo-electrons, with the bits of the single steps.
 
-        `noise` comes from `draw_noise`; None gives a noise-free image. `base` is another signal with its image for
-        the same exposure and noise: pixels with this signal are taken from it, which saves time. Raises ValueError
-        if the shapes of signal, noise and base differ.
+        `noise` comes from `draw_noise`; None gives a noise-free image. Raises ValueError if the shapes of signal
+        and noise differ.
         """
         shape = expected.array.shape
         if not expected.array.size:
             return RGBI(array=np.zeros((*shape[:2], 4), dtype=np.uint8))
-        for name, other in (("noise", noise and noise.codes[..., 0]), ("base", base and base[0].array)):
-            if other is not None and other.shape != shape:
-                raise ValueError(
-                    f"{name} has the shape {other.shape}, and the signal {shape}: they must be the same"
-                )
-        image = _curve(self, float(exposure_s)).image(
-            expected.array, noise and noise.codes, base and (base[0].array, base[1].array)
-        )
+        if noise is not None and noise.codes.shape[:-1] != shape:
+            raise ValueError(
+                f"noise has the shape {noise.codes.shape[:-1]}, and the signal {shape}: they must be the same"
+            )
+        image = _curve(self, float(exposure_s)).image(expected.array, noise and noise.codes)
         if noise is not None and len(noise.outermost_pixels):
             beyond = noise.outermost_pixels[None]
             shot, read = (field.of_pixels(beyond).values() for field in (noise.shot, noise.read))
@@ -244,7 +231,7 @@ class _Curve:
         # electrons of an unlit value by the code of its shot noise
         self._dark_counts = be.Float(flat(counts_of_one_mean(float(dark), variates_by_code())))
 
-    def image(self, signal: F32, codes: NDArray[np.uint16] | None, base: tuple[F32, U8] | None) -> U8:
+    def image(self, signal: F32, codes: NDArray[np.uint16] | None) -> U8:
         """Return the 8 bit levels of R, G and B, and the luminance as I, uint8[y, x, 4].
 
         Parameters
@@ -254,26 +241,12 @@ class _Curve:
         codes
             Codes of the variates of shot noise and of read noise, uint16[y, x, channel, 2]; None for no noise. The
             two outermost codes stand for variates that no table holds; here they are the medians of their bins.
-        base
-            Another signal, float32[y, x, channel], and its image with the same variates, uint8[y, x, 4]. Where a
-            value of the signal is the same, its level is taken from this image.
         """
         be = backend()
         dr, level = be.dr, self._noise_free_level if codes is None else self._level
-        channels = signal.shape[2]
         words = be.UInt32(0) if codes is None else be.UInt32(flat(codes).view(np.uint32))
-        given = be.Float(flat(signal)), dr.arange(be.UInt32, signal.size), words
-        if base is None:
-            found = level(*given)
-        else:
-            of_base = be.UInt32(flat(base[1]).view(np.uint32))
-
-            def known(_: Any, place: Any, __: Any) -> Any:
-                pixel = place // channels
-                return dr.gather(be.UInt32, of_base, pixel) >> 8 * (place - channels * pixel) & 0xFF
-
-            found = dr.if_stmt(given, given[0] != be.Float(flat(base[0])), level, known)
-        if channels == 1:
+        found = level(be.Float(flat(signal)), dr.arange(be.UInt32, signal.size), words)
+        if signal.shape[2] == 1:
             return evaluated(found * 0x01010101).view(np.uint8).reshape(*signal.shape[:2], 4)
         return compiled_with_luminance(evaluated(be.UInt8(found)).reshape(signal.shape))
 

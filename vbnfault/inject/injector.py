@@ -337,7 +337,7 @@ class Injector:
         possible = [name for name in names if name not in left_out]
         if not self.effects:
             return draw_faults(drawing, development, possible, {}, 0), left_out
-        draws = visible_draws(drawing, development, possible, stored=True)
+        draws = visible_draws(drawing, development, possible)
         unseen = {name: _UNSEEN for name in possible if name not in draws}
         return draws, {**left_out, **unseen}
 

@@ -100,10 +100,6 @@ class Development:
             self._cameras[key] = camera
         return self._cameras[key]
 
-    def leaves_camera(self, draws: Draws) -> bool:
-        """Return whether the drawn faults leave the camera unaltered."""
-        return self.camera_with(draws) == self.exposure.camera
-
     def context_of(self, fault: Fault, draws: Draws) -> FaultContext:
         """Return the context in which a fault acts beside the drawn ones."""
         informing = _informing(fault, draws)
@@ -192,32 +188,9 @@ class Development:
                 self._images[key] = camera.mosaic.rgbi(raw, camera.exposure_s)
             else:
                 signal = self.signal(draws, acting_at(draws, "electrons"), keep=keep_signals).merged
-                noise, clean = self.noise if noisy else None, self._clean(draws, noisy)
-                self._images[key] = camera.detector.develop(signal, camera.exposure_s, noise, base=clean)
+                noise = self.noise if noisy else None
+                self._images[key] = camera.detector.develop(signal, camera.exposure_s, noise)
         return self._images[key]
-
-    def _clean(self, draws: Draws, noisy: bool) -> tuple[Electrons, RGBI] | None:
-        """Return the clean signal and image, if they exist and images of the same camera may be made from them."""
-        image = self._images.get((*self._image_key({}, noisy), ()))
-        if image is None or not (self.exposure.camera.detector.local and self.leaves_camera(draws)):
-            return None
-        return self.signal({}, []).merged, image
-
-    def twin(self, draws: Draws, name: str) -> RGBI:
-        """Return `image` without one drawn fault; only the pixels that this fault changes are developed for it."""
-        others = without(draws, name)
-        key = (*self._image_key(others, True), ())
-        if key not in self._images and self.is_local(draws, name):
-            self._images[key] = self._lacking(draws, name, noisy=True)
-        return self.image(others)
-
-    def _lacking(self, draws: Draws, name: str, *, noisy: bool) -> RGBI:
-        """Return the image without one fault of a local detector, before the faults that act on finished images."""
-        part, camera = self._part(draws, name), self.exposure.camera
-        if not noisy:  # each level takes less time than to compare its signal
-            return camera.detector.develop(part, camera.exposure_s, None)
-        whole = self.signal(draws, acting_at(draws, "electrons")).merged, self._before_readout(draws, noisy)
-        return camera.detector.develop(part, camera.exposure_s, self.noise, base=whole)
 
     def read_out(self, image: RGBI, draws: Draws) -> RGBI:
         """Return the image with the drawn faults that act on the finished image."""
@@ -299,7 +272,9 @@ class Development:
         """
         key = (frozenset(_keys(draws, draws)), name, max(1.0, least_dn))
         if key not in self._effects:
-            self._effects[key] = self._effect(draws, name, least_dn)
+            with_it = self.image(draws, noisy=False).array
+            lacking = self.image(without(draws, name), noisy=False, keep_signals=name in self._twins).array
+            self._effects[key] = masks.effect(with_it, lacking, least_dn)
         return self._effects[key]
 
     def joint_effect(self, draws: Draws, names: Collection[str]) -> Mask:
@@ -307,44 +282,9 @@ class Development:
 
         A pixel that two faults turn into the same value, such as white, is in the effect of neither, but in this.
         """
-        if len(names) == 1:
-            return self.effect(draws, next(iter(names)))
         others = {name: draw for name, draw in draws.items() if name not in names}
         lacking = self.image(others, noisy=False, keep_signals=False)
         return masks.effect(self.image(draws, noisy=False).array, lacking.array)
-
-    def _effect(self, draws: Draws, name: str, least_dn: float) -> Mask:
-        """Return `effect`, computed anew."""
-        others = without(draws, name)
-        if not self.is_local(draws, name):
-            with_it = self.image(draws, noisy=False).array
-            lacking = self.image(others, noisy=False, keep_signals=name in self._twins).array
-            return masks.effect(with_it, lacking, least_dn)
-        with_it = self.image(draws, noisy=False).array
-        before = self._lacking(draws, name, noisy=False)
-        return masks.effect(with_it, self.read_out(before, others).array, least_dn)
-
-    def effects_on(self, rows: slice, draws: Draws, least_dn: Mapping[str, float]) -> dict[str, Mask]:
-        """Return `effect` of local faults on some rows, bool[row, x], before the faults that act on the image."""
-        whole, camera = self.signal(draws, acting_at(draws, "electrons")).merged, self.exposure.camera
-        signals = [whole, *(self._part(draws, name) for name in least_dn)]
-        stacked = whole.with_array(np.concatenate([signal.array[rows] for signal in signals]))
-        developed = camera.detector.develop(stacked, camera.exposure_s, None).array
-        with_all, *lacking = np.split(developed, len(signals))
-        return {
-            name: masks.effect(with_all, image, least_dn[name])
-            for name, image in zip(least_dn, lacking, strict=True)
-        }
-
-    def _part(self, draws: Draws, name: str) -> Electrons:
-        """Return the expected electrons without one drawn fault."""
-        optical = acting_at(draws, "electrons")
-        return self.signal(without(draws, name), [n for n in optical if n != name], keep=name in self._twins).merged
-
-    def is_local(self, draws: Draws, name: str) -> bool:
-        """Return whether a drawn fault changes only those pixels whose expected electrons it changes."""
-        detector = self.exposure.camera.detector
-        return "electrons" in draws[name].fault.steps and self.leaves_camera(draws) and detector.local
 
 
 def _altering(draws: Draws) -> list[str]:
@@ -390,7 +330,7 @@ def take_images(spec: SampleSpec, injection: Injection) -> Images:
     return Images(
         image=image,
         clean=development.image({}),
-        without={name: development.twin(draws, name) if name in draws else image for name in twins},
+        without={name: development.image(without(draws, name)) for name in twins},
         raw=development.raw(draws) if "raw" in layers else None,
         defects=development.defects(draws) if "defects" in layers else None,
     )

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..faults import FaultContext, FrameBefore
-from .development import Development, Draws, acting_at, informs
+from .development import Development, Draws, informs, without
 from .spec import Draw, Drawing, Injection, Pose, Rendering, SampleSpec, SceneExposure, is_state, stored_layers
 
 _DRAW_TRIES = 8
@@ -50,26 +50,22 @@ def inject_faults(
     if redrawn and asking_for_another_view(spec, in_vain):
         return Injection(draws={}, development=development, in_vain=in_vain)
     commanded = [name for name in commanded if name not in in_vain]
-    stored = "mask_effect" in stored_layers(spec.scene, spec.faults)
-    draws = visible_draws(spec, development, commanded, views, stored=stored)
-    development.image(draws)  # while its signals are in the processor's cache
+    draws = visible_draws(spec, development, commanded, views)
     return Injection(draws=draws, development=development, in_vain=in_vain)
 
 
 def visible_draws(
-    spec: Drawing, development: Development, commanded: Sequence[str], views: int = 1, *, stored: bool = False
+    spec: Drawing, development: Development, commanded: Sequence[str], views: int = 1
 ) -> dict[str, Draw]:
     """Return draws of the faults that each change the image; a fault that none of a few draws shows is left out.
 
-    `stored` says that all effects will be needed. `views` is as for `inject_faults`.
+    `views` is as for `inject_faults`.
     """
     # every view uses new draws: a draw that is invisible in one view is not tried again in the next
     attempt = (views - 1) * _DRAW_TRIES
     last = attempt + _DRAW_TRIES - 1
-    development.image({})  # pixels of the other images are taken from the clean one
     draws = draw_faults(spec, development, commanded, {}, attempt)
-    _prepare_signals(development, draws)
-    while invisible := _invisible(development, draws, stored=stored):
+    while invisible := _invisible(development, draws):
         draws = {name: draw for name, draw in draws.items() if name not in invisible}
         attempt += 1
         if attempt <= last:
@@ -135,53 +131,18 @@ def draw_faults(
     return complete
 
 
-def _prepare_signals(development: Development, draws: Draws) -> None:
-    """Compute the signals that image and labels need in any case."""
-    optical = acting_at(draws, "electrons")
-    development.signal(draws, optical)
-    for name in optical:
-        if draws[name].fault.effect_mask:
-            development.signal(draws, [n for n in optical if n != name])
-
-
 # --- visibility --------------------------------------------------------------------------------------------
 
 
-def _invisible(development: Development, draws: Draws, *, stored: bool) -> list[str]:
-    """Return the drawn faults without any effect on the noise-free image, or on the one with noise.
-
-    `stored` is True if the scene stores all effects. They are then computed anyway, and no row is tried first.
-    """
-    seen = set() if stored else _seen_on_some_rows(development, draws)
-    doubtful = [name for name in draws if name not in seen]
-    if not doubtful:
-        return []
-    development.image(draws, noisy=False)  # all effects need it
+def _invisible(development: Development, draws: Draws) -> list[str]:
+    """Return the drawn faults without any effect on the noise-free image, or on the one with noise."""
     # without a fault that informs others, their light is computed anew, with much memory
     last = [name for name in draws if informs(draws[name].fault)]
-    invisible = [name for name in doubtful if name not in last and _is_invisible(development, draws, name)]
+    invisible = [name for name in draws if name not in last and _is_invisible(development, draws, name)]
     if last:
         development.forget_steps(draws)
-        invisible += [name for name in last if name in doubtful and _is_invisible(development, draws, name)]
+        invisible += [name for name in last if _is_invisible(development, draws, name)]
     return invisible
-
-
-def _seen_on_some_rows(development: Development, draws: Draws) -> set[str]:
-    """Return drawn faults that every eighth row of the noise-free image shows clearly; others may be seen, too."""
-    rows = slice(development.context.shape[0] // 32, None, 8)
-    overwritten = np.zeros(development.context.shape, bool)[rows]
-    for name in acting_at(draws, "rgbi"):
-        footprint = draws[name].fault.footprint(draws[name].params, development.context)
-        if footprint is None:
-            return set()
-        overwritten |= footprint[rows]
-    least_dn = {
-        name: max(draws[name].fault.effect_level_dn, _MORE_THAN_ROUNDING_DN)
-        for name in acting_at(draws, "electrons")
-        if development.is_local(draws, name) and not informs(draws[name].fault)
-    }
-    effects = development.effects_on(rows, draws, least_dn) if least_dn else {}
-    return {name for name, effect in effects.items() if (effect & ~overwritten).any()}
 
 
 def _is_invisible(development: Development, draws: Draws, name: str) -> bool:
@@ -192,4 +153,4 @@ def _is_invisible(development: Development, draws: Draws, name: str) -> bool:
         return pixels == 0
     if development.effect(draws, name, _MORE_THAN_ROUNDING_DN).any():
         return False
-    return np.array_equal(development.image(draws).array, development.twin(draws, name).array)
+    return np.array_equal(development.image(draws).array, development.image(without(draws, name)).array)
