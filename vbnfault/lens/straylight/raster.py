@@ -36,8 +36,6 @@ EDGE_LOW, EDGE_HIGH = -1.0, 5.0  # range of the profile of a soft edge, in width
 _EDGE_NODES = 2049
 _UNLIKE = 0.05  # ratio of neighbouring areas below which a fold is near
 _SMOOTH = 0.5  # change of irradiance over a pixel that still looks smooth
-_NEIGHBOURS = 16384  # lanes that follow each other, mostly cells side by side, whose pixels share the cache
-_ONE = np.float32(1).view(np.uint32)  # the bits of the number, as an integer
 _NARROW_PX = 1.5  # cells narrower than this are drawn by points
 _POINTS = 64  # largest number of points along each side of a cell
 _WANDER = 1.0  # largest distance of a cell's points beyond its corners, in sizes of the cell
@@ -135,12 +133,11 @@ class Sums:
     def draw(self, spots: Spots, placement: BundleDrawing, azimuth_rad: float) -> None:
         """Add bundles of rays on lattices, turned to the Sun's azimuth."""
         lattice = _Lattice(self.canvas, _Traced(spots), placement, azimuth_rad)
-        number, folds = (v.numpy() for v in lattice.cells().pixels())
-        filled, folded = np.flatnonzero(number), np.flatnonzero(folds)
+        filled, folded = (np.flatnonzero(v.numpy()) for v in lattice.cells().drawn())
         if len(filled):
-            self._fill(lattice.shared_out(filled, number[filled]))
+            self._fill(lattice.cells(filled))
         if len(folded):
-            self._splat(lattice.shared_out(folded, lattice.cells(folded).points().numpy()))
+            self._splat(lattice.cells(folded))
 
     def _fill(self, cells: _Cells) -> None:
         """Draw cells as pairs of triangles; add small cells to the pixels nearest to their middle."""
@@ -148,7 +145,7 @@ class Sums:
         dr, Float, Int32, UInt32 = be.dr, be.Float, be.Int32, be.UInt32
         ends = cells.ends()
         densities, factors, offsets, _ = ends
-        first, last, _ = cells.pixel_rows(ends)
+        first, last = cells.pixel_rows(ends)
         a, b, c, d = (
             (x, y, density, margin, factor, offset)
             for (x, y, _, margin), density, factor, offset in zip(
@@ -273,22 +270,6 @@ class Sums:
             for level in range(LEVELS)
         ]
         return summed(canvas, levels, 1 / _UNITS)
-
-
-def _shared_out(work: NDArray[np.uint32]) -> NDArray[np.intp]:
-    """Return an order of lanes that balances their work, intp[lane]; `work` holds a value for each lane.
-
-    Lanes with nearly equal work are neighbours, because neighbours in the vector unit wait for one another. Among
-    those, neighbouring cells follow each other, because their pixels share the cache. Groups of such lanes are
-    scattered so that every thread gets some of the large ones.
-    """
-    # the exponent and the first four bits of a number in single precision
-    sizes = (np.maximum(work, 1).astype(np.float32).view(np.uint32) - _ONE >> 19).astype(np.uint16)
-    lanes = np.argsort(sizes, kind="stable")  # of 16 bits, which numpy sorts fastest
-    groups = len(lanes) // _NEIGHBOURS
-    golden = np.argsort(np.arange(groups) * ((np.sqrt(5) - 1) / 2) % 1)
-    whole, rest = np.split(lanes, [groups * _NEIGHBOURS])
-    return np.concatenate([whole.reshape(groups, _NEIGHBOURS)[golden].ravel(), rest])
 
 
 class _Triangle:
@@ -425,10 +406,6 @@ class _Lattice:
         """Return all cells, or those at an index."""
         return _Cells(self, None if index is None else backend().UInt32(index.astype(np.uint32)))
 
-    def shared_out(self, index: NDArray[np.intp], work: NDArray[np.uint32]) -> _Cells:
-        """Return the cells at an index in an order that shares out their work, such as pixels to draw."""
-        return self.cells(index[_shared_out(work)])
-
 
 class _Cells:
     """Hold some cells, one in each lane: corners (x, y, fraction, margin), area, and values of their bundle."""
@@ -478,25 +455,16 @@ class _Cells:
         dtype = np.float32 if kind is be.Float else np.uint32
         return be.dr.gather(kind, kind(np.ascontiguousarray(values, dtype=dtype)), self.bundle)
 
-    def pixels(self) -> tuple[Any, Any]:
-        """Return approximately how many pixels a cell covers, and whether the cell is drawn by points instead.
+    def drawn(self) -> tuple[Any, Any]:
+        """Return which cells are drawn as triangles, and which by points.
 
-        The number is 0 for cells without light in the part that is drawn, and for those drawn by points. Only cells
-        whose light may reach the frame are drawn by points.
+        Cells without light in the part that is drawn are neither. Only cells whose light may reach the frame are
+        drawn by points.
         """
-        dr, ends = backend().dr, self.ends()
-        number, folds = self.pixel_rows(ends)[2], ends[3] & self._near_and_lit(ends[1])
-        dr.eval(number, folds)
-        return number, folds
-
-    def points(self) -> Any:
-        """Return the number of points that stand for each cell, for cells that are drawn by points."""
-        be = backend()
-        dr = be.dr
-        across, down = self.points_along()
-        number = be.UInt32(across * down)
-        dr.eval(number)
-        return number
+        ends = self.ends()
+        filled, folds = self.pixel_rows(ends)[1] >= 0, ends[3] & self._near_and_lit(ends[1])
+        backend().dr.eval(filled, folds)
+        return filled, folds
 
     def _near_and_lit(self, factors: list[Any]) -> Any:
         """Return which cells have light in the drawn part that may reach the frame if it is drawn by points."""
@@ -545,14 +513,13 @@ class _Cells:
 
         return light_at
 
-    def pixel_rows(self, ends: tuple[Any, ...]) -> tuple[Any, Any, Any]:
-        """Return the first and last row of pixels whose centres may lie in a cell, and its approximate pixel count.
+    def pixel_rows(self, ends: tuple[Any, ...]) -> tuple[Any, Any]:
+        """Return the first and last row of pixels whose centres may lie in a cell.
 
         The last row is -1 for cells without light in the part that is drawn, and for those that fold.
         """
         _, factors, offsets, folds = ends
-        be = backend()
-        dr = be.dr
+        dr = backend().dr
         margins = [corner[3] for corner in self.corners]
         # beyond the fringes of an edge its profile is 1, so that only the sum of factor and offset counts
         plain = _least(*margins) > EDGE_HIGH
@@ -566,9 +533,7 @@ class _Cells:
         last = dr.select(self.small, start + 1, dr.floor(self.high[1] - 0.5))
         start, last = dr.maximum(start, 0), dr.minimum(last, self.height - 1)
         lit &= last >= start
-        wide = dr.minimum(self.high[0], self.width) - dr.maximum(self.low[0], 0)
-        about = (last - start + 1) * (1 + dr.minimum(wide, self.area / (self.high[1] - self.low[1] + 1)))
-        return start, dr.select(lit, last, -1), be.UInt32(dr.select(lit, dr.minimum(about, 60000), 0))
+        return start, dr.select(lit, last, -1)
 
     def columns(self, row: Any) -> tuple[Any, Any]:
         """Return the first and last column whose pixel centres may lie in a cell, in a row of pixels."""
