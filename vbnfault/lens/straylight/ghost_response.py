@@ -336,10 +336,10 @@ class _Tracing:
         shape = len(route), _COARSE, _COARSE
         rays = self._bundles(route, box, slope)
         spots = self.tracer.trace(rays, _COARSE, centred=True, halved=False)
-        x, y, radius = (v.numpy().reshape(shape) for v in (spots.x_mm, spots.y_mm, spots.radius))
         # a rim may lie between two rays, and so may the whole sensor, but not where the light is very thin
-        passes = radius < 2
-        spacing = _spacing(x, y, passes)
+        passes = spots.radius < 2
+        arrays = spots.x_mm, spots.y_mm, passes, _spacing(spots, passes, _COARSE)
+        x, y, passes, spacing = (v.numpy().reshape(shape) for v in arrays)
         margin = np.minimum(spacing, _THIN * _median(spacing, passes)[:, None, None])
         near = passes & (np.hypot(x, y) - margin < self.rings * self.cells.ring_mm)
         seen = near.any(axis=(1, 2))
@@ -386,7 +386,7 @@ class _Tracing:
             return dr.gather(Float, Float(np.ascontiguousarray(values, dtype=np.float32)), bundle)
 
         per_ring = dr.opaque(Float, 1 / self.cells.ring_mm)
-        apart = dr.maximum(_lit_spacing(spots, light, across), of_bundle(move)) * per_ring
+        apart = dr.maximum(_spacing(spots, light > 0, across), of_bundle(move)) * per_ring
         level = dr.clip(dr.ceil(dr.log2(dr.maximum(apart, 1e-9))), 0, _LEVELS - 1)
         radius = dr.sqrt(spots.x_mm * spots.x_mm + spots.y_mm * spots.y_mm) * per_ring - 0.5
         chosen = (light > 0) & (radius < self.rings - 1)
@@ -459,11 +459,15 @@ class _Sources:
     spacing: float
 
 
-def _lit_spacing(spots: Spots, light: Any, across: int) -> Any:
-    """Return the distance of each ray from its lit neighbours as `_spacing` does, a device array."""
+def _spacing(spots: Spots, lit: Any, across: int) -> Any:
+    """Return the distance of each ray from its lit neighbours, a device array; 0 where there are none.
+
+    It is the mean over both neighbours in the row or in the column, the larger of both. In a caustic the rays of a
+    ghost are much closer than elsewhere.
+    """
     be = backend()
     dr = be.dr
-    each = dr.arange(be.UInt32, dr.width(light))
+    each = dr.arange(be.UInt32, dr.width(spots.x_mm))
     row = each // across
     ix, iy = each - row * across, row % across
     apart: Any = 0.0
@@ -471,32 +475,11 @@ def _lit_spacing(spots: Spots, light: Any, across: int) -> Any:
         total: Any = 0.0
         count: Any = 0.0
         for has, neighbour in ((node > 0, each - step), (node < across - 1, each + step)):
-            both = has & (light > 0) & (dr.gather(be.Float, light, neighbour, has) > 0)
+            both = has & lit & dr.gather(type(lit), lit, neighbour, has)
             dx, dy = (v - dr.gather(be.Float, v, neighbour, has) for v in (spots.x_mm, spots.y_mm))
             total = total + dr.select(both, dr.sqrt(dx * dx + dy * dy), 0)
             count = count + dr.select(both, 1.0, 0.0)
         apart = dr.maximum(apart, total / dr.maximum(count, 1))
-    return apart
-
-
-def _spacing(x: F32, y: F32, lit: NDArray[np.bool_]) -> F64:
-    """Return the distance of each ray from its lit neighbours, float64[ghost, y, x]; 0 where there are none.
-
-    It is the mean over both neighbours in the row or in the column, the larger of both. In a caustic the rays of a
-    ghost are much closer than elsewhere.
-    """
-    apart = np.zeros(x.shape)
-    for axis in (1, 2):
-        before, behind = (
-            tuple(slice(n, n - 1 or None) if k == axis else slice(None) for k in range(3)) for n in (0, 1)
-        )
-        both = lit[before] & lit[behind]
-        step = np.where(both, np.hypot(x[behind] - x[before], y[behind] - y[before]), 0)
-        total, count = np.zeros(x.shape), np.zeros(x.shape)
-        for part in (before, behind):
-            total[part] += step
-            count[part] += both
-        apart = np.maximum(apart, total / np.maximum(count, 1))
     return apart
 
 
