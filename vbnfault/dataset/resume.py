@@ -255,13 +255,9 @@ def versions_made_now(
     now
         Versions with which `samples` are about to be made.
     """
-    entries = [(entry["versions"], _samples(entry) - set(samples)) for entry in _entries(attributes)]
-    if now != attributes.get("versions", {}):
-        made = next((made for versions, made in entries if versions == now), None)
-        if made is None:
-            entries.append((dict(now), made := set()))
-        made.update(samples)
-    return [{"versions": versions, "samples": store_module.runs(made)} for versions, made in entries if made]
+    entry = {"versions": dict(now), "samples": store_module.runs(samples)}
+    made = {} if now == attributes.get("versions", {}) else {VERSIONS_OF_SAMPLES: [entry]}
+    return joined_versions(attributes, [(made, samples)])
 
 
 def joined_versions(

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from .. import store as stores
 from ..core.errors import VbnfaultError
 from ..scene.events import commanded_in_time
-from ..store import SPLITS, STRATA, FaultCounts, Store
+from ..store import STRATA, FaultCounts, Store, aligned
 from .identity import plan_numbers, stored_plan
 
 # scalars of one number a sample whose ranges are reported
@@ -140,8 +140,7 @@ class Statistics:
     @property
     def splits(self) -> list[str]:
         """Return the splits that have samples, in their usual order."""
-        known = [name for name in SPLITS if name in self.counts.samples]
-        return [*known, *sorted(set(self.counts.samples) - set(known))]
+        return self.counts.splits
 
     def plain(self) -> dict[str, Any]:
         """Return the statistics as JSON-able data."""
@@ -247,17 +246,6 @@ def _described(values: _Parameter) -> list[str]:
         common = ", ".join(f"{word} {count}" for word, count in sorted(values.words.items())[:_MOST_WORDS])
         return [common, "", "", ""]
     return [str(values.numbers.count), *(_numbers(values.numbers) if values.numbers.count else ("", "", ""))]
-
-
-def aligned(table: list[list[str]]) -> list[str]:
-    """Return the rows of a table as lines; columns of numbers are aligned to the right, others to the left."""
-    columns = list(zip(*table, strict=True))
-    adjusted = []
-    for column in columns:
-        width = max(map(len, column))
-        is_text = any(cell[:1].isalpha() for cell in column[1:])
-        adjusted.append([cell.ljust(width) if is_text else cell.rjust(width) for cell in column])
-    return ["  ".join(row).rstrip() for row in zip(*adjusted, strict=True)]
 
 
 def statistics(path: str | os.PathLike[str] | Store) -> Statistics:

@@ -26,6 +26,7 @@ from .check import (
     Problem,
     Report,
     SampleDigests,
+    aligned,
     count_faults,
     digest,
     examine,

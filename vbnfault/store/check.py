@@ -68,6 +68,12 @@ class FaultCounts:
         differences = {f: self.planned(f) - self.realised(f) for f in self.faults}
         return {fault: n for fault, n in differences.items() if n}
 
+    @property
+    def splits(self) -> list[str]:
+        """Return the splits that have samples, in their usual order."""
+        known = [name for name in SPLITS if name in self.samples]
+        return [*known, *sorted(set(self.samples) - set(known))]
+
     def missing_text(self) -> str:
         """Return `missing` as a sentence."""
         few = ", ".join(f"{name} {count}" for name, count in self.missing.items())
@@ -77,8 +83,7 @@ class FaultCounts:
         """Return a text table: for each fault class the planned and realised samples, in all and by split."""
         if not self.faults or not self.samples:
             return []
-        known = [s for s in SPLITS if s in self.samples]
-        splits = [*known, *sorted(set(self.samples) - set(known))]
+        splits = self.splits
         head = ["fault", "planned", "realised", *splits]
         if not self._has_plan:
             head.remove("planned")
@@ -92,12 +97,18 @@ class FaultCounts:
             table.append(row if self._has_plan else [row[0], *row[2:]])
         totals = ["samples", *[""] * (len(head) - len(splits) - 2), str(self.samples.total())]
         table.append([*totals, *(str(self.samples[s]) for s in splits)])
-        widths = [max(len(row[k]) for row in table) for k in range(len(head))]
-        lines = []
-        for row in table:
-            cells = [row[0].ljust(widths[0]), *(c.rjust(w) for c, w in zip(row[1:], widths[1:], strict=True))]
-            lines.append("  ".join(cells).rstrip())
-        return lines
+        return aligned(table)
+
+
+def aligned(table: list[list[str]]) -> list[str]:
+    """Return the rows of a table as lines; columns of numbers are aligned to the right, others to the left."""
+    columns = list(zip(*table, strict=True))
+    adjusted = []
+    for column in columns:
+        width = max(map(len, column))
+        is_text = any(cell[:1].isalpha() for cell in column[1:])
+        adjusted.append([cell.ljust(width) if is_text else cell.rjust(width) for cell in column])
+    return ["  ".join(row).rstrip() for row in zip(*adjusted, strict=True)]
 
 
 class Problem(NamedTuple):
