@@ -25,13 +25,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..core.errors import InputError, shown
+from ..core.errors import InputError
 from ..faults import registry
 from ..scene.keyed_random import keyed_uniform
 from ..store import Store, open_store
 from ..train import Columns
 from ..train.datasets import BatchDataset, SampleDataset
 from ..train.loader import Loader
+from ..train.selection import known_classes
 from .severity_labels import severity_labels
 
 Batch = dict[str, Any]
@@ -285,13 +286,8 @@ def _classes(stores: Sequence[Store], asked: Sequence[str] | None) -> tuple[str,
         if not shared:
             raise InputError(f"{stores[0].path}: has no fault class that all datasets have")
         return tuple(shared)
-    if not asked or len(set(asked)) < len(asked):
-        raise InputError(f"classes = {shown(list(asked))}: must name at least one class, and none twice")
+    if not asked:
+        raise InputError("classes = []: must name at least one class, and none twice")
     for store in stores:
-        for name in asked:
-            if name not in store.spec.faults:
-                raise InputError(
-                    f"classes: {shown(name)} is no fault class of {store.path}; "
-                    f"known: {', '.join(store.spec.faults)}"
-                )
+        known_classes(store, asked, "classes")
     return tuple(asked)

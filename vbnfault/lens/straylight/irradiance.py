@@ -70,6 +70,7 @@ _SPREAD_SHARP = 4.0  # upper bound of the same in estimates of sharpness
 # Upper bound of the width of an edge on the sensor, in widths of the edge that limits the ghost. With a larger one,
 # a ramp would lie within a cell, and the lattice of rays would show.
 _WIDEST = 3.0
+_ACROSS = 48  # rays along each side of a ghost whose figures are computed
 _LEAST = 1e-10  # irradiance over the Sun's below which a ghost is omitted
 
 
@@ -506,12 +507,10 @@ class FlareModel:
             flux |= _by_name(made, rays, by_band)
         return flux
 
-    def ghosts(
-        self, sun_deg: float, azimuth_deg: float = 0.0, *, across: int = 48, most: int | None = None
-    ) -> tuple[Ghost, ...]:
+    def ghosts(self, sun_deg: float, azimuth_deg: float = 0.0, *, most: int | None = None) -> tuple[Ghost, ...]:
         """Return the ghosts of a point Sun that reach the frame, each the mean of all bands.
 
-        The peak is the largest of the cells between `across` rays along each side. With `most`, only so many ghosts
+        The peak is the largest of the cells between 48 rays along each side. With `most`, only so many ghosts
         with the highest peaks are returned.
         """
         turn = float(np.radians(azimuth_deg))
@@ -522,7 +521,7 @@ class FlareModel:
             return ()
         weights = _by_name(made, rays, spectra.weights(_SUBDIVISIONS).mean(axis=2))
         nodes = range(0, len(self._fine), _SUBDIVISIONS)
-        by_name = _at_nodes(made, [(rays, across, across)], nodes, weights, (sun_deg, turn))
+        by_name = _at_nodes(made, [(rays, _ACROSS, _ACROSS)], nodes, weights, (sun_deg, turn))
         peak = {name: sum(part * g.peak_irradiance_fraction for part, g in of) for name, of in by_name.items()}
         highest = sorted(sorted(by_name), key=lambda name: -peak[name])[:most]
         return tuple(mean_ghost(by_name[name]) for name in sorted(highest))

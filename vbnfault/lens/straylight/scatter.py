@@ -115,15 +115,15 @@ class Harvey:
         wide = np.log1p(self.L**-2)
         return float(np.pi * self.b0 * self.L**2 * wide * exprel((self.S / 2 + 1) * wide))
 
-    def at(self, wavelength_nm: float, *, known_at_nm: float = REFERENCE_NM) -> Harvey:
-        """Return the model of the same surface at another wavelength: L ∝ λ, b0 ∝ λ⁻⁴, and S does not change.
+    def at(self, wavelength_nm: float) -> Harvey:
+        """Return the model at another wavelength than `REFERENCE_NM`: L ∝ λ, b0 ∝ λ⁻⁴, and S does not change.
 
         The change of the refractive index is not included. The BSDF of a smooth surface is (2π Δn)² λ⁻⁴ PSD(β/λ),
         and the PSD does not depend on λ (generalised Harvey-Shack theory: Krywonos, Harvey & Choi 2011, JOSA A 28,
         1121). Hence TIS ∝ λ⁻² σ², where σ is the roughness up to the frequency 1/λ. If S is well below -2, TIS is
         proportional to λ⁻²; if S is above -2, TIS is nearly proportional to λ^-(4+S).
         """
-        ratio = wavelength_nm / known_at_nm
+        ratio = wavelength_nm / REFERENCE_NM
         return Harvey(b0=self.b0 / ratio**4, L=self.L * ratio, S=self.S)
 
 

@@ -209,8 +209,6 @@ class SceneInLens:
         float64[n]: transmittance of the path that forms the image, as `DirectPath.transmittance`.
     around
         Grids of the renders around that of the scene.
-    rings
-        Largest number of rings of sources and of the sensor, and of azimuths, of the cells of ghosts.
     diffraction
         Whether the stop diffracts light of the scene beyond the point spread.
     """
@@ -224,7 +222,6 @@ class SceneInLens:
     settings: StraylightSettings
     passed: F64
     around: tuple[RenderGrid, ...] = ()
-    rings: tuple[int, int, int] = (SOURCE_RINGS, SENSOR_RINGS, AZIMUTHS)
     diffraction: bool = False
 
     def straylight(
@@ -343,7 +340,7 @@ class SceneInLens:
         # cells are no finer than half a pixel
         corner_px = float(np.hypot(*self.sensor.shape)) / 2
         most = 2 * int(np.ceil(corner_px)), 2 * int(np.ceil(corner_px)), 2 << int(np.log2(2 * np.pi * corner_px))
-        sources, rings, azimuths = (min(pair) for pair in zip(self.rings, most, strict=True))
+        sources, rings, azimuths = map(min, (SOURCE_RINGS, SENSOR_RINGS, AZIMUTHS), most)
         slopes = np.linspace(0, float(np.hypot(x, y).max()), sources).tolist()
         farthest = max((float(np.hypot(*grid.slopes).max()) for grid in self.around), default=0.0)
         while slopes[-1] < farthest:
