@@ -32,7 +32,7 @@ from vbnfault.lens.straylight.scene import PointSources, RenderGrid, SceneInLens
 from vbnfault.lens.straylight.scene_convolution import POINT_SPREAD_PX, starburst_of_source, wing_fraction
 from vbnfault.lens.straylight.settings import Baffle, DirectPath, SensorGrid, StraylightSettings, SunSource
 from vbnfault.lens.straylight.starburst import StarburstFrame
-from vbnfault.lens.straylight.total import SunInLens
+from vbnfault.lens.straylight.total import SpreadLight, SunInLens, SunStraylight, ghosts
 from vbnfault.lens.thin import Halo
 from vbnfault.pipeline.record import to_sample
 from vbnfault.scene import config
@@ -126,6 +126,18 @@ def ghosts_of_every_pixel(
     return out.reshape(bands, height, width) / pitch**2
 
 
+def but_for_ghosts(light: SunInLens) -> SunStraylight:
+    """Straylight of a Sun whose ghosts, which take most of the time, are left out."""
+
+    def once(function: Any, *arguments: Any) -> Any:
+        if function is not ghosts:
+            return function(*arguments)
+        bands, sensor = light.bands, light.sensor
+        return SpreadLight.of(np.zeros((len(bands), *sensor.shape), np.float32), np.zeros(len(bands)), sensor)
+
+    return light.straylight(once=once)
+
+
 def scattered_of_every_pixel(
     scene: SceneInLens, radiance: F32, within: int = 2, grid: RenderGrid | None = None
 ) -> tuple[F64, F64]:
@@ -145,9 +157,10 @@ def scattered_of_every_pixel(
             sun=sun,
             settings=scene.settings,
             path=DirectPath(transmittance=scene.passed, admitted_mm2=1.0),
-        ).straylight()
-        glare += irradiance[:, None, None] * light.parts()["glare"]
-        veil += irradiance[:, None, None] * light.parts()["veil"]
+        )
+        parts = but_for_ghosts(light).parts()
+        glare += irradiance[:, None, None] * parts["glare"]
+        veil += irradiance[:, None, None] * parts["veil"]
     return glare, veil
 
 
@@ -191,7 +204,9 @@ def wings_of(scene: SceneInLens, points: list[tuple[float, float, F64]], width_p
             radius_rad=float(np.pi**-0.5 * width_px / scene.render.focal_px),
         )
         path = DirectPath(transmittance=scene.passed, admitted_mm2=1.0)
-        light = SunInLens(lens=scene.lens, bands=scene.bands, sensor=scene.sensor, sun=sun, path=path).straylight()
+        light = but_for_ghosts(
+            SunInLens(lens=scene.lens, bands=scene.bands, sensor=scene.sensor, sun=sun, path=path)
+        )
         shorter = 1 / np.sqrt(1 + x * x + y * y)
         away = np.hypot(side * cosine - x * shorter, side[:, None] * cosine - y * shorter)
         fade = np.clip((away * efl_mm / pitch - POINT_SPREAD_PX + 1) / 2, 0, 1)
@@ -208,6 +223,11 @@ def test_the_stop_diffracts_light_of_every_lit_pixel(blades: int, within: float)
     expected = wings_of(scene, points(scene.render, radiance, 1))
     assert np.abs(made - expected).sum() < within * expected.sum()
     assert made.sum() == pytest.approx(expected.sum(), rel=0.005)
+
+
+def test_what_the_stop_diffracts_is_part_of_the_straylight(singlet: Prescription) -> None:
+    scene = replace(behind(singlet, 48, 35.0), diffraction=True)
+    radiance = disc(scene.render.shape, 0.55, 0.45, 0.05)
     assert (
         scene.straylight(radiance, np.eye(1)).total.sum()
         > replace(scene, diffraction=False).straylight(radiance, np.eye(1)).total.sum()
