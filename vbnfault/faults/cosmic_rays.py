@@ -62,7 +62,7 @@ class Tracks(Fault):
         limits=(0.01, 1e7),
         unit="1/(cm² s)",
         doc="of protons from all directions that reach the sensor, drawn evenly in its logarithm; in quiet time "
-        "4.67, 22 in frames of Rosetta's, thousands in a storm of the Sun",
+        "4.67, 23 in frames of Rosetta's, thousands in a storm of the Sun",
     )
     energy_MeV: Interval = bounds(
         50.0, 1000.0, limits=(1, 1e5), unit="MeV", doc="kinetic energies: slower protons leave more charge"
