@@ -352,7 +352,7 @@ def test_tracks_in_a_navigation_camera() -> None:
         # the number whose mean signal over their figures reaches five times the noise
         fault = make("particles", density_per_m3=per_m3, least_noise=5.0)
         tracks.append(np.mean([fault.draw(c, rng(seed))["count"] for seed in range(4)]))
-    assert noise_e == 1.6
+    assert noise_e == 2.2
     assert 10 < tracks[0] < 100
     assert tracks[1] < 6
 

@@ -20,6 +20,7 @@ from vbnfault.core.errors import InputError
 from vbnfault.core.shared_results import SharedResults
 from vbnfault.dataset.identity import scene_identity, store_spec
 from vbnfault.detector import MosaicDetector
+from vbnfault.detector.chain import Device
 from vbnfault.pipeline import Session, injection, resolve, stages
 from vbnfault.pipeline.exposure import exposure_factor
 from vbnfault.pipeline.record import to_sample
@@ -378,11 +379,11 @@ def test_stars_and_raw_numbers_are_computed_once(monkeypatch: pytest.MonkeyPatch
         plan={"faulty_fraction": 0.0},
     )
     starred = recorded_calls(monkeypatch, assemble, "visible_stars")
-    developed = recorded_calls(monkeypatch, MosaicDetector, "raw")
+    developed = [recorded_calls(monkeypatch, *of) for of in ((MosaicDetector, "collected_e"), (Device, "read"))]
     own = Session(config.parse_scene(scene, source="test"))
     frames = [own.frame(k) for k in range(4)]
     assert len(starred) == frames[0].views == 1
-    assert len(developed) == 4  # the raw numbers of an image are those that are stored
+    assert [len(calls) for calls in developed] == [4, 4]  # the raw numbers of an image are those that are stored
     assert all(frame.images.raw is not None for frame in frames)
     assert len({frame.images.raw.tobytes() for frame in frames}) == 4
     rates = [frame.exposure.rate.array for frame in frames]
