@@ -19,6 +19,7 @@ from vbnfault.core.errors import InputError
 from vbnfault.detector.chain import Device, MosaicNoise
 from vbnfault.detector.measured import smooth_surface
 from vbnfault.detector.sensor import load_sensor
+from vbnfault.fit import ordinary
 from vbnfault.fit.exposures import (
     Exposure,
     count_estimate,
@@ -28,6 +29,7 @@ from vbnfault.fit.exposures import (
     rounded_moments,
     variance_estimate,
 )
+from vbnfault.fit.replay import Display
 from vbnfault.fit.sensor_file import sensor_text
 from vbnfault.fit.sensor_fit import HOT_POWER, Bend, Darks, fit_sensor
 
@@ -166,6 +168,27 @@ def test_the_gain_is_that_of_a_characterisation() -> None:
     gains = [one.result.gain_dn_per_e for one in found.values()]
     assert fit.estimates["readout.gain_dn_per_e"].value == pytest.approx(np.mean(gains), rel=0.015)
     assert fit.estimates["readout.full_well_e"].value == pytest.approx(made.readout.white_e, rel=0.02)
+
+
+def test_frames_that_were_stretched_and_halved_tell_the_gain(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Six skies of other gradients by a sensor of 0.8 of the full well of its file, so 1.25 times its gain.
+
+    Warm pixels and smear, which the simulated sky lacks, move the gain by some 5 %; twice that.
+    """
+    monkeypatch.setattr(ordinary, "_SIMULATED_PX", 128)  # a quarter of the time
+    made = load_sensor("rosetta_navcam")
+    hidden = replace(made, readout=replace(made.readout, full_well_e=0.8 * made.readout.full_well_e))
+    device, readout = Device(hidden, 1), made.readout
+    display = Display(bias_dn=readout.bias_dn, top_dn=readout.top_dn, stretch=0.5)
+    y, x = np.indices(device.shape, dtype=np.float32) / device.shape[0]
+    frames = []
+    for number in range(6):
+        sky_dn = 60 * (0.02 + np.abs(math.cos(number) * (x - 0.5) + math.sin(number) * (y - 0.5))) ** 2
+        light_e = (sky_dn / hidden.readout.system_gain_dn_per_e).astype(np.float32)
+        noise = MosaicNoise.draw(device.shape, *(np.random.default_rng([number, k]) for k in range(3)))
+        frames.append(frame("frame", display.developed(device.raw(light_e, 0.43, noise), 2).astype(np.uint8)))
+    gain = fit_sensor(frames, "rosetta_navcam", 0.5).estimates["readout.gain_dn_per_e"]
+    assert gain.value == pytest.approx(hidden.readout.system_gain_dn_per_e, rel=0.1)
 
 
 def test_the_command_writes_a_sensor_that_loads_and_says_what_it_could_not_fit(taken: Any, tmp_path: Path) -> None:

@@ -159,6 +159,9 @@ class SkyModel:
     def __init__(self, show: Callable[[F32], F32], sensor: Sensor, black_dn: float, factor: int) -> None:
         self.show, self.black_dn, self.top_dn = show, black_dn, sensor.readout.top_dn
         self.is_raw = show is _as_it_is
+        # noise of stretched numbers rises and falls with the level: a search must begin near the sensor's own
+        own = sensor.readout.system_gain_dn_per_e, sensor.readout.read_noise_e_rms, sensor.individual.dsnu_e
+        self.start = (self.top_dn / 5e4, 5.0, 3.0) if self.is_raw else np.maximum(own, (1e-4, 0.5, 0.5))
         rng, size = np.random.default_rng(0), (_SIMULATED_PX * factor,) * 2
         self.noise = [
             (draw_normals(size, rng), draw_normals(size, rng).values()) for _ in range(2)
@@ -231,7 +234,8 @@ def fit_ordinary(
     model = SkyModel(show, sensor, black_dn + offset_dn * (stretch is not None), factor)
     highest = max((float(one.level.max()) for one in planes if len(one.level)), default=0.0)
     most_dn = highest - black_dn if stretch is None else display.fraction(highest) * (display.top_dn - black_dn)
-    signals = np.concatenate([[0.0], np.geomspace(0.3, max(1.5 * most_dn, 3.0), 12)])
+    count = 12 if stretch is None else 30
+    signals = np.concatenate([[0.0], np.geomspace(0.3, max(1.5 * most_dn, 3.0), count)])
     found, transfer = _fitted_noise(planes, model, signals, len(frames))
     out |= found
     if transfer is not None and len(planes) == 1:
@@ -274,7 +278,7 @@ def _fitted_noise(
         out = np.concatenate([(noise - variance) / error, ((fixed - shared) / shared_error)[paired]])
         return np.nan_to_num(out, nan=_UNLIKE)
 
-    start = np.log([model.top_dn / 5e4, 5.0, 3.0])
+    start = np.log(model.start)
     best = optimize.least_squares(off, start, diff_step=0.05, x_scale=0.3, loss="soft_l1", ftol=1e-3, xtol=1e-3)
     simulated = expected(best.x)[0]
     if np.isnan(simulated).any():
