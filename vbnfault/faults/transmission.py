@@ -189,7 +189,7 @@ def _positions(packets: ArrayLike, packet_px: int) -> NDArray[np.intp]:
 
 @lru_cache(maxsize=2)
 def _order(shape: tuple[int, int], nodes: int) -> NDArray[np.intp] | slice:
-    """Return the order of transmission, computed once; read-only. One node sends row by row."""
+    """Return the order in which pixels are sent, read-only; one node sends them row by row."""
     if nodes == 1:
         return slice(None)
     order = transmission_order(shape, nodes)

@@ -14,8 +14,8 @@ Pose, exposure, gain and black of a real frame are never known well enough, so e
   much of the image at 0.
 
 All else is of the scene. Frames that are smaller than the camera's image by a whole factor are means of as many
-stretched pixels. So are Rosetta's: at 8 of 255 levels their noise changes as that of single pixels of few DN does
-(see the page of realism).
+stretched pixels. So are Rosetta's: between 6 and 7 of 255 levels the variance of their noise falls as that of
+single pixels of few DN does.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from ..scene.trajectory import FlownPose, Trajectory
 from .frames import F32, Look, compare, look, shift_between, shifted, similarity_between
 
 _SEARCH_PX = 16  # largest shift, for frames of 512 px
-# A pixel of a halved frame also holds these fractions of the light of its neighbours: the first of each above and
+# A pixel of a halved frame also holds these fractions of the levels of its neighbours: the first of each above and
 # below it, the second of each at its sides. Noise of neighbours in Rosetta's skies correlates by twice as much.
 _LEAKS = 0.022, 0.026
 # The exposure is metered on the first of these percentiles whose level is below the given one.
@@ -107,7 +107,7 @@ class Display:
         return levels if factor == 1 else self._rounded(reduced(levels, factor))
 
     def _rounded(self, levels: F32) -> F32:
-        """Return levels as the frame tells them apart."""
+        """Return levels rounded to the steps that the frame tells apart."""
         step = np.float32(self.step)
         return np.asarray(step * np.floor(levels / step + np.float32(0.5)))
 

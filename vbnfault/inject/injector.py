@@ -427,7 +427,7 @@ class Injector:
 
 
 def of_first_image(scene: Scene, width_px: int, height_px: int) -> Scene:
-    """Return a scene whose calibration, where its size is not given, is that of an image of this size."""
+    """Return a scene whose calibration, if it states no size, holds for images of this width and height."""
     if not scene.camera.unsized_calibration:
         return scene
     return scene.model_copy(update={"camera": scene.camera.of_image(width_px, height_px)})

@@ -333,7 +333,7 @@ class CameraTable(Table):
 
     @property
     def unsized_calibration(self) -> set[str]:
-        """Return the keys of its size that neither the calibration nor the camera gives; empty without one."""
+        """Return the keys of a calibration's size that neither it nor the camera gives; empty without one."""
         return set() if self.calibration is None else _SIZE - self.calibration.model_fields_set
 
     @property

@@ -55,7 +55,7 @@ class Exr(Format):
         ]
 
     def write_part(self, store: Store, part: ExportPart, samples: Iterable[Sample], folder: Folder) -> list[Entry]:
-        """Write one file for each sample, and one for its render where this may have a guard band."""
+        """Write a file for each sample, and another for its render, which may be larger than the image."""
         entries = []
         for sample in samples:
             stem, layers = f"{part.split}/{number_text(sample.index, store.samples)}", dict(sample.layers)
